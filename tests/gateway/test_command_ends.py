@@ -20,7 +20,7 @@ from multidrop import Bus, InvtCHE, Plant, Stopped, Unconfirmed
 from multidrop.control import CommandResult, Ledger, Seen
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
-from multidrop.gateway.live.views import look_at
+from multidrop.gateway.live.views import drive_view
 
 CALLER = Caller("anna", "http", "10.0.0.7", Right.WRITE)
 MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
@@ -205,6 +205,6 @@ def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:
         side_reads=SimpleNamespace(look=lambda plant, name: {"of": name}),
         recent=SimpleNamespace(drive=lambda line, name: None),
     )
-    found = asyncio.run(look_at(gateway, "Lu\u0308fter"))
+    found = asyncio.run(drive_view(gateway, "Lu\u0308fter"))
     assert found["drive"] == "L\u00fcfter"
     assert found["values"] == {"of": "L\u00fcfter"}

@@ -1,4 +1,4 @@
-"""Clock: the times by which the gateway judges ages, which nobody sets, and the time of day."""
+"""Clocks: monotonic times for ages, and the time of day."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ import time
 if hasattr(time, "CLOCK_MONOTONIC"):
 
     def monotonic_ns() -> int:
-        """Return the time of CLOCK_MONOTONIC, as rows have it."""
+        """Return the time of CLOCK_MONOTONIC, the clock of rows."""
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 else:
 
     def monotonic_ns() -> int:
-        """Return the time of the clock that never steps, as rows have it."""
+        """Return the monotonic time, the clock of rows."""
         return time.monotonic_ns()
 
 
 if hasattr(time, "CLOCK_BOOTTIME"):
 
     def boottime_ns() -> int:
-        """Return the time of CLOCK_BOOTTIME, which runs on while the machine sleeps."""
+        """Return the time of CLOCK_BOOTTIME, which includes sleep."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
-else:  # on macOS and Windows the other one runs on, too
+else:  # on macOS and Windows the monotonic clock includes sleep
     boottime_ns = monotonic_ns
 
 
 def now_and_slept_ns() -> tuple[int, int]:
-    """Return the present time, and for how long the machine slept so far.
+    """Return the present time, and how long the machine has slept so far.
 
-    Read in this order, that is never too much where a pause comes in between.
+    The order of the two reads ensures that a pause between them never counts as sleep.
     """
     booted_ns = boottime_ns()
     now_ns = monotonic_ns()

@@ -1,4 +1,4 @@
-"""Gateway: opens a plant's ports, polls and serves, until the last batch is handed out."""
+"""Gateway: polls a plant and serves it to browsers and other programs."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
-TAKE_S = 0.1  # between looks for new rows: half of the time between two frames
-LOOK_S = 0.2  # between looks for faults and silence; frames are made then, of what was just seen
-TICK_S = 1.0  # between readings of the statistics
-LOG_S = 60.0  # between log lines of a part that goes on failing
-RESTORE_S = 2.0  # for which the alarms of earlier runs are waited for
-MOST_ASKED = 16  # requests past a register table at the same time
-ASKED_S = 30.0  # that one of them may take
-END_S = 4.0  # that the end may take, stops included
-GRACE_S = 1  # of it, in which requests under way may be answered
+TAKE_S = 0.1  # interval of taking rows: half of that of frames
+LOOK_S = 0.2  # interval of checking for alarms; a frame follows each check
+TICK_S = 1.0  # interval of reading statistics
+LOG_S = 60.0  # interval of log lines about a part that keeps failing
+RESTORE_S = 2.0  # how long to wait for the alarms of earlier runs
+MOST_ASKED = 16  # concurrent requests for registers outside the drives' tables
+ASKED_S = 30.0  # time limit of one of these
+END_S = 4.0  # time limit of shutdown, stops included
+GRACE_S = 1  # part of END_S for finishing requests in flight
 
 _log = logging.getLogger("multidrop.gateway")
 
 
 class Gateway:
-    """A plant that is polled, and all ways in to it.
+    """A polled plant and its interfaces.
 
-    Raises ValueError or OSError when something of it cannot be opened; then nothing is left open. A line
-    whose port is not there does not keep the others waiting: it is lost, and tried again.
+    Raises ValueError or OSError if an interface cannot be opened, and leaves none open. A missing port of a
+    line is no error: the line counts as lost, and its port is retried.
     """
 
     clock = staticmethod(time.monotonic)
@@ -67,20 +67,20 @@ class Gateway:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
-        self.revision = secrets.randbits(32)  # of the plant: no page takes another process's for ours
+        self.revision = secrets.randbits(32)  # of the plant; random, to differ from other processes
         self.failures: dict[str, int] = {}
         self.audit = settings.audit
-        self.unaudited = ""  # why no write is noted in the audit log
+        self.unaudited = ""  # why the audit log is not written
         self.parts = LiveParts(self)
         self.feeds = self.parts.feeds
         self.guard_clock: Callable[[], float] = self.clock
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
         self._looked = 0.0
-        self._has_news = False  # for a frame
+        self._has_news = False  # a frame is due
         self.ledger = ledger or Ledger()
-        self.poller: Poller | None = None  # once it polls
-        self._made: Poller | None = None  # the same, from its making on
+        self.poller: Poller | None = None  # while polling
+        self._made: Poller | None = None  # the same object, set before it polls
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
@@ -103,20 +103,19 @@ class Gateway:
             lambda: self.plant, self.bus, self._is_there, lambda: self.note_failure("identities")
         )
 
-    # ---- life ----
+    # ---- start and end ----
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Poll and serve until `end` is called; then return within END_S, whatever hangs.
+        """Poll and serve until `end` is called; then return within END_S, even if a disk hangs.
 
-        If this is interrupted, nothing is polled when it raises. Raises RuntimeError if the web server ends
-        by itself.
+        If interrupted, end polling before raising. Raises RuntimeError if the web server ends by itself.
         """
         try:
             await self._run(on_ready)
         except BaseException:
             self.listener.close()
             if self._made is not None:
-                with suppress(Exception):  # one that hangs was logged, and so were its other failures
+                with suppress(Exception):  # logged already
                     in_time("polling", END_S, self._made.close)
             raise
 
@@ -131,7 +130,7 @@ class Gateway:
             built = await self.parts.build(self.settings.parts)
             await self._find_audit()
             poller = self._made = Poller(nothing, ledger=self.ledger, audit=self.audit)
-            self.poller = poller.__enter__()  # it is left in a thread: that may take its time
+            self.poller = poller.__enter__()  # left in a thread, because that may take long
             adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
             either: set[asyncio.Future[Any]] = {end, adopting}
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
@@ -157,7 +156,7 @@ class Gateway:
             await self._close(server)
 
     async def _close(self, server: _Server) -> None:
-        """End all in END_S at most; what hangs is left behind, and logged."""
+        """Shut down within END_S; log and abandon work that hangs."""
         ends = self.clock() + END_S
 
         def left_s(kept_s: float) -> float:
@@ -172,7 +171,7 @@ class Gateway:
             closing = supervisor().within("polling", END_S, self.poller.close)
             await self._end_of("polling", left_s(1.0), closing)
             await supervisor().release("polling", "statistics", "identities")
-            self.guarded("hub", self.hand_out, self.poller)  # what came while it closed
+            self.guarded("hub", self.hand_out, self.poller)  # rows received during shutdown
         await self._end_of("parts", left_s(0.2), self.parts.close(left_s(0.4)))
         if self.alarm_file is not None:
             await self._end_of(
@@ -180,7 +179,7 @@ class Gateway:
             )
         self.listener.close()
         for name in dict.fromkeys(supervisor().under_way):
-            _log.error("%s goes on at the end, and is not waited for", name)
+            _log.error("%s is still running at shutdown, and is abandoned", name)
 
     async def _end_server(self, server: _Server) -> None:
         server.should_exit = True
@@ -191,21 +190,21 @@ class Gateway:
         try:
             await asyncio.wait_for(work, seconds)
         except TimeoutError:
-            _log.error("%s has not ended in its time", name)
-        except Exception:  # the others end all the same
-            _log.exception("%s did not end in good order", name)
+            _log.error("%s did not end in time", name)
+        except Exception:  # the others are ended nevertheless
+            _log.exception("ending %s failed", name)
 
     async def _find_audit(self) -> None:
-        """Note the audit log if it can be opened now: polling would wait for a disk that does not answer."""
+        """Set the audit log if its disk answers now; polling would wait for a disk that hangs."""
         self.audit, path = self.settings.audit, self.settings.audit
         if path is None:
             return
         try:
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, path))
         except Hung as failure:
-            self.audit, self.unaudited = None, f"{failure} A restart tries it again"
+            self.audit, self.unaudited = None, f"{failure} Restart to try again"
             self.commands.withheld = self.unaudited
-            _log.error("nothing but stops is written: %s", self.unaudited)
+            _log.error("only stops are sent: %s", self.unaudited)
 
     def end(self) -> None:
         """Let `run` come to its end. Call it in the loop."""
@@ -217,7 +216,7 @@ class Gateway:
             Watched(make_app(self), self.connections),
             backlog=BACKLOG,
             http=WatchedProtocol,
-            h11_max_incomplete_event_size=MOST_HEAD,  # what is longer and does not come at once is cut off
+            h11_max_incomplete_event_size=MOST_HEAD,  # limit of a head that arrives in pieces
             ws="none",
             lifespan="off",
             log_config=None,
@@ -238,13 +237,13 @@ class Gateway:
                 if self.poller is not None:
                     self.hand_out(self.poller)
                 dead.pop("polling", None)
-            except Exception as failure:  # of a poller that has ended, again each time; or a want of memory
+            except Exception as failure:  # the poller has ended, or memory is short
                 dead["polling"] = f"{type(failure).__name__}: {failure}"
                 self.note_failure("polling")
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch to the hub and to all parts; amid a reload, what is of the plant of before."""
+        """Give each batch to the hub and to all parts; during a reload only rows of the previous plant."""
         while self.newcomers.has_room and (batch := poller.take()):
             self._has_news = True
             self.feed(batch if self.plant_coming is None else self.newcomers.keep(batch, self.plant, poller))
@@ -256,7 +255,7 @@ class Gateway:
                 self.guarded("frames", self.frames.note_news)
 
     def feed(self, batch: Batch) -> None:
-        """Give a batch to the hub and to all parts; where one fails, the others get it all the same."""
+        """Give a batch to the hub and to all parts, even if one of them fails."""
         self.guarded("hub", self.hub.take, batch)
         for name, feed in self.feeds.items():
             self.guarded(name, feed.take, batch)
@@ -274,10 +273,10 @@ class Gateway:
             if lost is None and any(self.hub.seen_at(polled.drive.name) for polled in line.drives):
                 self.alarms.note_there(line.name)
             if lost is None and self.hub.taken:
-                self.hub.unopened.pop(line.name, None)  # should it go again, that has another reason
+                self.hub.unopened.pop(line.name, None)  # a later loss has another reason
 
     def _restore_alarms(self) -> bool:
-        """Take the alarms of earlier runs, once they are read; a disk that hangs is not waited for long."""
+        """Take over the alarms of earlier runs once they are read, or give up after RESTORE_S."""
         past = self.alarm_file.past if self.alarm_file is not None else []
         if past is None and self.clock() - self.begun < RESTORE_S:
             return False
@@ -288,7 +287,7 @@ class Gateway:
         return True
 
     def _note_alarm(self, alarm: Alarm) -> None:
-        """Log an alarm that began, ended or changed, and keep it."""
+        """Log and save an alarm that started, ended or changed."""
         where = alarm.drive or f"line {alarm.line}"
         if alarm.ended is not None:
             _log.info("alarm of %s is over: %s: %s", where, alarm.kind, alarm.text)
@@ -301,21 +300,21 @@ class Gateway:
             self.alarm_file.note(alarm)
 
     def forget(self, name: str) -> None:
-        """End the alarms of a drive or a line that is no longer there."""
+        """End the alarms of a drive or a line that was removed."""
         self.alarms.forget(name, utc_ms())
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
             work(*arguments)
-        except (Exception, SystemExit):  # whatever it is, also of a user's class, polling and stops go on
+        except (Exception, SystemExit):  # also from a user's class; polling and stops continue
             self.note_failure(name)
 
     def note_failure(self, name: str) -> None:
-        """Count what a part raised just now, and log it from time to time."""
+        """Count the exception being handled, and log it every LOG_S."""
         self.count_failure(name)
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()
-            _log.exception("%s failed, %d times so far; the others go on", name, self.failures[name])
+            _log.exception("%s failed, %d times so far; the others continue", name, self.failures[name])
 
     def count_failure(self, name: str) -> None:
         self.failures[name] = self.failures.get(name, 0) + 1
@@ -328,7 +327,7 @@ class Gateway:
                 self.guarded("statistics", self._read_statistics, self.poller)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
-            self._has_news = True  # a frame's time is how a page knows that we live
+            self._has_news = True  # pages see from its time that the gateway is alive
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)
@@ -338,27 +337,27 @@ class Gateway:
         self.hub.unopened |= {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
-        """Log and keep the lines whose ports are not there, and why."""
+        """Log and remember the lines whose ports are missing, and why."""
         for line, failure in failures.items():
-            _log.warning("line %s is lost, and tried again: %s", line, failure)
+            _log.warning("line %s is lost and will be retried: %s", line, failure)
         there = [line.name for line in self.plant.lines]
         before = {line: why for line, why in self.hub.unopened.items() if line in there}
         self.hub.unopened = before | {line: str(failure) for line, failure in failures.items()}
 
     @property
     def status(self) -> str:
-        """Return what the service manager shows."""
+        """The status line for the service manager."""
         lost = len(self.hub.unopened)
         return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
 
     @property
     def plant_now(self) -> Plant:
-        """The plant as it is polled at this moment, amid a reload too."""
+        """The plant as polled now, also during a reload."""
         return self.plant if self.poller is None or self.plant_coming is None else self.poller.plant
 
     @property
     def plant_coming(self) -> Plant | None:
-        """The plant that drives are on their way to; None where all are there."""
+        """The plant of a reload in progress; None otherwise."""
         return self.reload.coming
 
     # ---- for commands, parts and pages ----
@@ -367,13 +366,13 @@ class Gateway:
         return self.hub.state(drive) != SILENT
 
     def bus(self, line: str) -> Bus:
-        """Return a line's bus. Raises ValueError for an unknown line, or before polling has begun."""
+        """Return a line's bus. Raises ValueError for an unknown line, or before polling starts."""
         if self.poller is None:
-            raise ValueError("polling has not begun yet")
+            raise ValueError("polling has not started yet")
         return self.poller.bus(line)
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
-        """Return words, or bits, that a drive has at any addresses; see `Drive.read_raw`."""
+        """Return words or bits of a drive at any addresses; see `Drive.read_raw`."""
         _, known = self.plant.find_drive(drive)
         work = partial(known.read_raw, function, start, count, expiry=expiry_s)
         data = await supervisor().within("passed requests", ASKED_S, work, most=MOST_ASKED)

@@ -1,4 +1,4 @@
-"""The historian: a feed that records all rows; where it fails, all else goes on."""
+"""The historian: the part `history`, which records all rows and answers queries about them."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from multidrop.recording import parse_age, parse_size
 from multidrop.supervisor import supervisor
 
 MS_NS = 1_000_000
-LOOK_S = 1.0  # between looks at the thread that writes
-CLOSING_S = 3.0  # that the last rows may take
-QUERY_S = 30.0  # that an answer may take, and that one may wait for others
-MOST_QUERIES = 2  # at the same time
-PIECE = 1 << 16  # bytes of an export
-UNFINISHED = ".export-"  # begins the names of exports' own folders
-MOST_BUCKETS = 200_000  # of an answer: the page's 24 series on a screen of 8000 px, and 5 MB
+LOOK_S = 1.0  # between checks of the writing thread
+CLOSING_S = 3.0  # time limit for writing the last rows
+QUERY_S = 30.0  # time limit of a query, and of its wait for others
+MOST_QUERIES = 2  # concurrent queries
+PIECE = 1 << 16  # bytes of an export read at a time
+UNFINISHED = ".export-"  # prefix of temporary folders of exports
+MOST_BUCKETS = 200_000  # in an answer: the page's 24 series on a screen of 8000 px, 5 MB
 
 
 @dataclass(frozen=True)
 class HistorySettings:
-    """The table `[serve.history]`. Raises ValueError with all that is wrong in it, a line each."""
+    """The table `[serve.history]`. Raises ValueError with a line for each mistake."""
 
     folder: str = "history"
     keep: str = "30 days"
@@ -57,26 +57,20 @@ Settings = HistorySettings
 
 
 def build(settings: HistorySettings, context: PartContext) -> Historian:
-    """Return the historian of a gateway; a relative folder is beside its plant file.
-
-    DuckDB is loaded here, before polling begins, and not while the first viewer waits.
-    """
+    """Return the historian of a gateway. Loads DuckDB now, so that the first viewer need not wait."""
     with suppress(ImportError):
         import_module("duckdb")
     folder = context.folder / settings.folder
     try:
         return Historian(context.plant, folder, settings)
     except OSError as failure:
-        if failure.filename is None:  # it is a sentence
+        if failure.filename is None:  # already a sentence
             raise
         raise OSError(f"folder {folder} cannot be written: {failure.strerror}") from failure
 
 
 class Historian:
-    """Records what it takes, and answers questions of the page about it.
-
-    Raises as HistoryWriter does, when it begins.
-    """
+    """Records rows and answers queries. Raises the errors of HistoryWriter when it is made."""
 
     def __init__(self, plant: Plant, folder: Path, settings: HistorySettings) -> None:
         self._writer = HistoryWriter(
@@ -86,26 +80,26 @@ class Historian:
             keep=parse_age(settings.keep),
             most=parse_size(settings.most),
         )
-        for left in folder.glob(f"{UNFINISHED}*"):  # by a process that was killed; nobody else records here
+        for left in folder.glob(f"{UNFINISHED}*"):  # left by a killed process; no other one records here
             rmtree(left, ignore_errors=True)
         self.history = History(folder)
         self._is_closed = False
 
-    # ---- a feed ----
+    # ---- part of the gateway ----
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows, within microseconds; another thread writes them."""
+        """Copy the rows within microseconds; another thread writes them."""
         self._writer.take(batch)
 
     async def run(self) -> None:
-        """Watch the thread that writes. Raises RuntimeError if that ends before it is closed."""
+        """Watch the writing thread. Raises RuntimeError if it ends before `close`."""
         while self._writer.is_alive:
             await asyncio.sleep(LOOK_S)
         if not self._is_closed:
-            raise RuntimeError("the thread that writes has ended")
+            raise RuntimeError("the writing thread has ended")
 
     async def close(self) -> None:
-        """Write what waits. Raises Hung if the disk does not answer."""
+        """Write the pending rows. Raises Hung if the disk does not answer."""
         self._is_closed = True
         await supervisor().within("history", CLOSING_S, self._close)
 
@@ -114,11 +108,11 @@ class Historian:
         self.history.close()
 
     def adopt(self, plant: Plant) -> None:
-        """Go on with another plant file: the next segment has its metadata."""
+        """Use another plant: the next segment has its metadata."""
         self._writer.begin(plant.metadata())
 
     def health(self) -> str:
-        """Return why nothing is recorded now; "" is well."""
+        """Return why recording fails now; "" if it works."""
         trouble = self.state.trouble
         return f"nothing is recorded: {trouble}" if trouble else ""
 
@@ -134,15 +128,15 @@ class Historian:
 
     @property
     def state(self) -> HistoryState:
-        """Rows written, rows lost, and what is wrong now."""
+        """Rows written, rows lost, and the present problem."""
         return self._writer.state()
 
-    # ---- questions; times are UTC in ms ----
+    # ---- queries; times are UTC in ms ----
 
     async def series(self, names: Sequence[str], begin: int, end: int, points: int) -> bytes:
-        """Return the buckets of each series as JSON, made beside the loop, which may have a stop to send.
+        """Return the buckets of each series as JSON, made in a thread to keep the loop free for stops.
 
-        Raises ValueError, OSError, which Hung is too, and ImportError.
+        Raises ValueError, OSError (including Hung) and ImportError.
         """
         names = list(dict.fromkeys(names))
         if len(names) * points > MOST_BUCKETS:
@@ -157,17 +151,17 @@ class Historian:
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return a file of these series, or of all, piece by piece: "csv" or "parquet".
+        """Return a file of these series, or of all, in pieces; `kind` is "csv" or "parquet".
 
-        Raises as `series`, before the first piece where the series or the times are wrong. To be called, and
-        gone through, in threads: it reads files.
+        Call and iterate it in threads, because it reads files. Raises the errors of `series`, those of wrong
+        arguments before the first piece.
         """
         series, begin_ns, end_ns = names or None, begin * MS_NS, end * MS_NS
         if kind not in ("csv", "parquet"):
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
             return self.history.csv(series, begin_ns, end_ns)
-        self.history.read(series, begin_ns, end_ns)  # a mistake is told before the first piece
+        self.history.read(series, begin_ns, end_ns)  # reports mistakes before the first piece
         return self._parquet(series, begin_ns, end_ns)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:
@@ -180,7 +174,7 @@ class Historian:
 
 
 def as_json(made: Buckets) -> dict[str, Any]:
-    """Return buckets as JSON can have them: a float's infinity is null there."""
+    """Return buckets for JSON, with None in place of infinity."""
     return {
         "time": [time // MS_NS for time in made.times],
         "least": _finite(made.least),

@@ -1,6 +1,6 @@
-"""Metrics: the plant as families of samples. Pure.
+"""The plant as Prometheus metric families. Pure.
 
-A drive that is silent has no values: its series vanish, and nobody takes an old value for the present one.
+A silent drive has no values: its series disappear, so an old value never looks current.
 """
 
 from __future__ import annotations
@@ -25,30 +25,32 @@ class Figures(NamedTuple):
     frames: int
     dropped: int  # rows
     failures: Mapping[str, int]  # of parts, by name
-    parts: Sequence[MetricFamily]  # what they say of themselves
+    parts: Sequence[MetricFamily]  # of the parts
 
 
 def families_of(
     hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures
 ) -> Iterator[MetricFamily]:
-    """Yield all there is to be scraped."""
+    """Yield all families."""
     yield MetricFamily(
         "multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)]
     )
     yield MetricFamily(
-        "multidrop_value", "gauge", "Newest values of polled registers, in their unit.", _values(hub)
+        "multidrop_value", "gauge", "Newest values of polled registers, in their units.", _values(hub)
     )
     yield MetricFamily("multidrop_drive_state", "stateset", "State of each drive.", _states(hub))
     yield MetricFamily(
-        "multidrop_line_up", "gauge", "1 while a line's port is there, 0 while it is lost.", _ups(hub)
+        "multidrop_line_up", "gauge", "1 while a line's port is present, 0 while it is lost.", _ups(hub)
     )
     yield from _line_families(statistics)
     yield from _drive_families(statistics)
-    yield counter("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped)
+    yield counter(
+        "multidrop_rows_dropped", "Rows dropped because they were not taken in time.", figures.dropped
+    )
     yield counter("multidrop_frames", "Frames made for viewers.", figures.frames)
-    yield MetricFamily("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)])
+    yield MetricFamily("multidrop_viewers", "gauge", "Waiting viewers.", [("", {}, figures.viewers)])
     failures = [("_total", {"part": name}, float(n)) for name, n in figures.failures.items()]
-    yield MetricFamily("multidrop_part_failures", "counter", "Failures of each part.", failures)
+    yield MetricFamily("multidrop_part_failures", "counter", "Failures by part.", failures)
     yield from figures.parts
 
 
@@ -80,10 +82,10 @@ def _ups(hub: Hub) -> Iterator[Sample]:
 
 def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:
     counters: dict[str, tuple[str, Callable[[LineStatistics], float]]] = {
-        "multidrop_line_exchanges": ("Requests that left.", lambda line: line.exchanges),
-        "multidrop_line_samples": ("Values that came.", lambda line: line.samples),
+        "multidrop_line_exchanges": ("Requests sent.", lambda line: line.exchanges),
+        "multidrop_line_samples": ("Values received.", lambda line: line.samples),
         "multidrop_line_used_seconds": (
-            "Time that answered exchanges had to take of the line.",
+            "Line time of answered exchanges.",
             lambda line: line.used_s,
         ),
     }
@@ -103,7 +105,7 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Metric
         for labels, drive in drives
         for reason, n in drive.misses.items()
     ]
-    yield MetricFamily("multidrop_misses", "counter", "Values that are missing, by reason.", misses)
+    yield MetricFamily("multidrop_misses", "counter", "Missing values by reason.", misses)
     delays: list[Sample] = []
     for labels, drive in drives:
         found = drive.delays
@@ -112,7 +114,10 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Metric
                 delays.append(("", {**labels, "quantile": quantile}, value))
         delays.append(("_count", labels, float(found.replies)))
     yield MetricFamily(
-        "multidrop_response_delay_seconds", "summary", "From a request's end to its reply's begin.", delays
+        "multidrop_response_delay_seconds",
+        "summary",
+        "Time from the end of a request to the start of its reply.",
+        delays,
     )
 
 

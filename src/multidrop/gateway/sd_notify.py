@@ -1,4 +1,4 @@
-"""Notify the service manager, as sd_notify(3) says: ready, alive, reloading, and about to end."""
+"""Messages to the service manager by sd_notify(3): ready, alive, reloading, stopping."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from contextlib import suppress
 
 
 class Notifier:
-    """The manager's socket; without one nothing is told."""
+    """The service manager's socket; without one all calls do nothing."""
 
     def __init__(self, address: str | None = None) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
 
     @property
     def watchdog_s(self) -> float | None:
-        """Seconds within which the manager expects a sign of life; None where it expects none."""
+        """Seconds within which the manager expects WATCHDOG=1; None if it expects none."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
 
     def tell_reloading(self) -> None:
-        """Say that a reload begins now; READY=1 ends it. Its time shows that it is no older one."""
+        """Report the start of a reload, with its time; READY=1 ends it."""
         self.tell("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def tell(self, *lines: str) -> None:
-        """Send lines such as READY=1. What the manager does not take is lost."""
+        """Send lines such as READY=1, without waiting; they are lost if the manager does not take them."""
         if not self._address:
             return
         abstract = self._address.startswith("@")

@@ -1,4 +1,4 @@
-"""Settings: the table `[serve]` of a plant file; all mistakes in it are found before anything is done."""
+"""The table `[serve]` of a plant file. All its mistakes are reported before the gateway starts."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from multidrop.supervisor import Hung, in_time
 from multidrop.toml_check import Key, TomlPlace
 
 LISTEN = "127.0.0.1:8750"
-AUDIT_S = 2.0  # within which the disk of the audit log must answer
+AUDIT_S = 2.0  # time limit for the disk of the audit log
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
-EXAMPLES = {  # of a part's values, by their type
+EXAMPLES = {  # example values in error messages, by type
     bool: "true",
     int: "10",
     float: "1.5",
@@ -55,13 +55,13 @@ _MAY = {
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """All that `[serve]` says, checked."""
+    """The checked settings of `[serve]`."""
 
     host: str = "127.0.0.1"
     port: int = 8750
     names: tuple[str, ...] = ()
     tls: ssl.SSLContext | None = None
-    certificate: str = ""  # digest of its file and of the key's: they may be renewed in place
+    certificate: str = ""  # digest of both files, which may be renewed in place
     behind_proxy: bool = False
     tokens: tuple[Token, ...] = ()
     may: May = May()  # noqa: RUF009 (it cannot change)
@@ -73,7 +73,7 @@ class ServeSettings:
 
     @property
     def page(self) -> str:
-        """The page's address; "" where the gateway listens on all addresses, and no name of it is known."""
+        """The page's address; "" if the gateway listens on all addresses and has no name."""
         if self.behind_proxy:
             return f"https://{self.names[0]}" if self.names else ""
         host = self.names[0] if self.names else f"[{self.host}]" if ":" in self.host else self.host
@@ -82,9 +82,9 @@ class ServeSettings:
 
 
 class Folders:
-    """Folders in which files are found: the service manager's credentials, and then the plant file's own.
+    """The folders of named files: the service manager's credentials, then the plant file's folder.
 
-    What is written goes to the service's state folder, or else beside the plant file.
+    Output goes to the service's state folder, or else beside the plant file.
     """
 
     def __init__(self, plant: Path, environment: Mapping[str, str]) -> None:
@@ -95,14 +95,14 @@ class Folders:
         self.state = Path(state) if state else self._beside
 
     def find(self, name: str) -> Path:
-        """Return the path of a file to be read, whether or not it is there."""
+        """Return the path of an input file, which may be missing."""
         if self._credentials and not Path(name).is_absolute() and (self._credentials / name).exists():
             return self._credentials / name
         return self._beside / name
 
 
 def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tuple[Plant, ServeSettings]:
-    """Return a plant and what its `[serve]` says. Raises PlantError with all mistakes in both."""
+    """Return a plant and its `[serve]` settings. Raises PlantError with all mistakes in both."""
     try:
         plant = load()
     except PlantError as wrong:
@@ -117,9 +117,9 @@ def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tup
 
 
 def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings:
-    """Return what `[serve]` of a plant says. Raises PlantError with all mistakes in it.
+    """Return the `[serve]` settings of a plant. Raises PlantError with all mistakes.
 
-    In a plant without lines no name of a drive or a line is looked up.
+    In a plant without lines, names of drives and lines are not checked.
     """
     place = TomlPlace(plant.path, ("[serve]",))
     folders = Folders(plant.path, environment)
@@ -132,7 +132,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     may = _may(given.get("may", {}), usual, plant, place.of_file(plant.path, "[serve.may]"))
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
-        place.wrong('look = "token" of [serve.may] needs tokens: nobody could look; add tokens = "tokens"')
+        place.wrong('look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
     is_safe = behind_proxy or (tokens and tls)
     if not is_loopback(host) and not is_safe and "listen" in given and not _has_begun(given):
         place.wrong(
@@ -156,7 +156,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
 
 
 def _has_begun(given: Mapping[str, Any]) -> bool:
-    """Return True where all keys that an open listener needs are given; their mistakes are told apart."""
+    """Return True if all keys of a network listener are given; mistakes in them are reported elsewhere."""
     return {"tokens", "certificate", "key"} <= given.keys()
 
 
@@ -164,20 +164,22 @@ def _address(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":")
     host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     if not colon or not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
-        raise ValueError(f'listen = "{text}" is no address and port; write listen = "{LISTEN}"')
+        raise ValueError(f'listen = "{text}" is not an address and port; write listen = "{LISTEN}"')
     return host, int(port)
 
 
 def _name(name: object) -> str:
     if not isinstance(name, str) or not HOST.fullmatch(name):
-        raise ValueError(f'names: {name!r} is no host name; write names = ["plant.example"], without a port')
+        raise ValueError(
+            f'names: {name!r} is not a host name; write names = ["plant.example"], without a port'
+        )
     return name
 
 
 def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SSLContext | None:
     paths = {key: folders.find(given[key]) for key in ("certificate", "key") if key in given}
     if len(paths) == 1:
-        place.wrong(f"{next(iter(paths))} needs the other one of certificate and key too")
+        place.wrong(f"{next(iter(paths))} alone is not enough: give certificate and key")
     for key, path in paths.items():
         place.attempt(_check_readable, f"{key} {path}", path)
     if len(paths) < 2 or not all(map(_can_be_read, paths.values())):
@@ -188,7 +190,11 @@ def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SS
         context.load_cert_chain(paths["certificate"], paths["key"], password="")
     except (ssl.SSLError, ValueError) as failure:
         mismatch = getattr(failure, "reason", "") == "KEY_VALUES_MISMATCH"
-        why = "do not belong together" if mismatch else "are no certificate and key in PEM, without password"
+        why = (
+            "do not belong together"
+            if mismatch
+            else "must be a certificate and a key in PEM, without password"
+        )
         place.wrong(f"certificate {paths['certificate']} and key {paths['key']} {why}")
         return None
     return context
@@ -203,16 +209,18 @@ def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> lis
     try:
         found, wrong = read_tokens(path.read_text("utf-8"))
     except UnicodeDecodeError:
-        found, wrong = [], ["it is no text"]
+        found, wrong = [], ["it is not UTF-8 text"]
     for sentence in wrong:
         place.wrong(f"tokens {path}: {sentence}")
     if not found and not wrong:
-        place.wrong(f"tokens {path} has none; `multidrop serve --new-token stop --for anna` makes one")
+        place.wrong(
+            f"tokens {path} is empty; `multidrop serve --new-token stop --for anna` makes a line for it"
+        )
     return found
 
 
 def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
-    """Return the rights that the table gives; `look` is who may look if it does not say so."""
+    """Return the rights in the table; `look` is the default of its key `look`."""
     given = place.check(table, _MAY)
     for key in ("look", "stop"):
         if given.get(key, "anyone") not in ("anyone", "token"):
@@ -283,7 +291,7 @@ def _digest(paths: Iterable[Path]) -> str:
 
 
 def _check_audit(path: Path) -> bool:
-    """Check that it can be written; a disk that does not answer is no mistake of the file."""
+    """Check that the file can be written; a disk that hangs is not a mistake in the plant file."""
     with suppress(Hung):
         in_time("audit log", AUDIT_S, partial(check_writable, path))
     return True

@@ -15,7 +15,7 @@ from gateways import written
 from multidrop.core import Counters, Status
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.live.recent_statistics import MINUTES, RecentStatistics
-from multidrop.gateway.live.views import look_at_lines
+from multidrop.gateway.live.views import line_views
 from multidrop.gateway.metrics import Figures, families_of
 from multidrop.transport.statistics import LineStatistics, line_statistics
 
@@ -68,7 +68,7 @@ def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp
     assert recent.line("hall")["p99"] is None
     plant = written(tmp_path)
     gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), recent=recent)
-    drive = look_at_lines(gateway)["hall"]["drives"]["pump-1"]
+    drive = line_views(gateway)["hall"]["drives"]["pump-1"]
     assert (drive["p50"], drive["p99"]) == (None, None)
     families = families_of(gateway.hub, recent.newest, Figures("0", 0, 0, 0, {}, []))
     (delays,) = [one for one in families if one.name == "multidrop_response_delay_seconds"]

@@ -14,7 +14,7 @@ from peers import require_module
 from tables import table
 
 from multidrop.gateway.mqtt.home_assistant import discovery_topic
-from multidrop.gateway.mqtt.json_topics import MOST_DISCOVERY, MOST_KEPT, LeftBehind
+from multidrop.gateway.mqtt.json_topics import MOST_DISCOVERY, MOST_KEPT, RetainedTopics
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
 
@@ -24,7 +24,7 @@ THERE = {"pump-1"}
 
 def heard(*messages: tuple[str, bytes], prefix: str = "works") -> list[str]:
     """Return what is taken back after these were kept, by a gateway of one pump."""
-    left_behind = LeftBehind(prefix, home_assistant=True)
+    left_behind = RetainedTopics(prefix, home_assistant=True)
     return [topic for message in messages for topic in left_behind.hear(*message, THERE)]
 
 
@@ -48,7 +48,7 @@ def test_what_is_kept_of_drives_that_are_there_stays() -> None:
         ("homeassistant/device/works-pump-1/config", configuration("works/pump-1")),
     ]
     assert heard(GATEWAY, *mine) == []
-    back = LeftBehind("works", home_assistant=True)
+    back = RetainedTopics("works", home_assistant=True)
     assert back.hear("works/old/available", b"offline", THERE) == []
     assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # it was adopted meanwhile
 
@@ -96,7 +96,7 @@ def test_no_topic_but_those_of_drives_of_this_prefix_is_taken_back(topic: str, p
 def test_a_broker_without_end_is_heard_for_a_while() -> None:
     drives = [(f"works/{number}/available", b"online") for number in range(10 * MOST_KEPT)]
     assert len(heard(GATEWAY, *drives)) == 2 * MOST_KEPT
-    left_behind = LeftBehind("works", home_assistant=True)
+    left_behind = RetainedTopics("works", home_assistant=True)
     for topic, payload in [*drives, *drives]:
         left_behind.hear(topic, payload, THERE)
     assert len(left_behind.hear(*GATEWAY, THERE)) == 2 * MOST_KEPT

@@ -1,8 +1,8 @@
-"""Connections: how many may be open, how long one may take over its request, and whose turn it is.
+"""HTTP connections: their number, time limits, and the order of requests.
 
-Clients that are slow, silent or greedy do not delay the others. If there are too many connections, one of
-theirs is closed, and a new one, which may bring a stop, always gets in. Requests are answered one at a time;
-those that may stop a drive come first.
+Slow, silent or greedy clients do not delay others. At the limit one of their connections is closed, so that a
+new one, which may bring a stop, is always accepted. Requests are answered one at a time, possible stops
+first.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from multidrop.gateway.http.messages import JsonResponse
 
-MOST_OPEN = 256  # a process has 1024 descriptors as a rule, and lines and files need some
-FIRST_S = 10.0  # for a TLS handshake and the whole first request
-AGAIN_S = 40.0  # for a later one; the server itself closes a silent connection after 30 s
-FRESH_S = 1.0  # in which a new connection's first request should be there
-MOST_FRESH = 64  # such connections that are closed after all others
-STALLED_S = 10.0  # for which a client may take none of its answers
+MOST_OPEN = 256  # a process usually has 1024 descriptors, and lines and files need some
+FIRST_S = 10.0  # time limit for a TLS handshake and the first request
+AGAIN_S = 40.0  # time limit for a later request; the server closes an idle connection after 30 s
+FRESH_S = 1.0  # a new connection should send its first request within this time
+MOST_FRESH = 64  # fresh connections protected from being closed
+STALLED_S = 10.0  # a client that reads none of its answers for this long is closed
 
-ENDS = "the gateway ends: it is not known what became of this"
+ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
-STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may stop a drive, too
+STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may be a stop too
 
 
 class Rank(IntEnum):
-    """The order in which connections are closed if there are too many; of one rank the oldest goes first."""
+    """The order in which connections are closed at the limit; within a rank the oldest goes first."""
 
-    GREEDY = 0  # its client sends requests before it has its answers, or takes none
+    GREEDY = 0  # the client sends requests ahead of its answers, or reads none
     IDLE = 1
     BUSY = 2
-    FRESH = 3  # it is new, and its first request is not here yet
-    STOPS = 4  # its request may be a stop
+    FRESH = 3  # new, and still without a request
+    STOPS = 4  # the request may be a stop
 
 
 class _Open:
@@ -51,7 +51,7 @@ class _Open:
 
     def __init__(self, peer: socket.socket, now: float) -> None:
         self.peer = peer
-        self.ends = now + FIRST_S  # unless its next request is complete by then
+        self.ends = now + FIRST_S  # deadline for its next request
         self.fresh_until = now + FRESH_S
         self.is_busy = self.is_stop = False
         self.is_greedy = False
@@ -67,21 +67,21 @@ class _Open:
         return Rank.FRESH if now < self.fresh_until else Rank.IDLE
 
     def end(self) -> None:
-        """Let the server see its end, and close it."""
-        with suppress(OSError):  # it is gone already
+        """Shut the socket down; the server then closes the connection."""
+        with suppress(OSError):  # closed already
             self.peer.shutdown(socket.SHUT_RDWR)
 
 
 class Connections:
-    """The open connections by the client's address, the one that was idle for longest first."""
+    """The open connections by client address, the longest idle first."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._open: dict[tuple[str, int], _Open] = {}
-        self.ended = 0  # so far
+        self.ended = 0  # connections closed here so far
 
     def add(self, peer: socket.socket, address: Any) -> None:
-        """Note a new connection, and close another one where there are too many."""
+        """Note a new connection, and close another one if there are too many."""
         self._forget_closed()
         self._open.pop(address[:2], None)
         now = self._clock()
@@ -93,7 +93,7 @@ class Connections:
             self._end(fresh[0] if is_flood else min(ranks, key=lambda client: ranks[client]))
 
     def sweep(self) -> None:
-        """Close those that took too long."""
+        """Close the connections that exceeded a time limit."""
         self._forget_closed()
         now = self._clock()
         for client, one in [*self._open.items()]:
@@ -107,9 +107,9 @@ class Connections:
             self._open[client].is_busy = True
 
     def is_stop(self, client: tuple[str, int] | None, path: str) -> bool:
-        """Return, and note, whether a new request counts as a stop.
+        """Return, and note, whether a new request may be a stop.
 
-        One of a verb is not while its client sends others ahead of its answers.
+        A verb does not count while its client sends requests ahead of its answers.
         """
         found = self._open.get(client) if client else None
         is_stop = path in STOP_PATHS or (path == VERB_PATH and not (found and found.is_greedy))
@@ -118,19 +118,19 @@ class Connections:
         return is_stop
 
     def note_greed(self, client: tuple[str, int] | None, *, is_greedy: bool) -> None:
-        """Note whether more requests came than were answered."""
+        """Note whether the client sends requests ahead of its answers."""
         if client in self._open:
             self._open[client].is_greedy = is_greedy
 
     def note_stall(self, client: tuple[str, int] | None, *, is_stalled: bool) -> None:
-        """Note whether answers wait for a client that does not take them."""
+        """Note whether answers are pending because the client does not read."""
         if client in self._open:
             self._open[client].stalled_since = self._clock() if is_stalled else None
 
     def finish(self, client: tuple[str, int] | None) -> None:
         """Note that a request was answered."""
         if client in self._open:
-            found = self._open[client] = self._open.pop(client)  # the last one in order
+            found = self._open[client] = self._open.pop(client)  # now last in order
             found.is_busy = found.is_stop = False
             found.fresh_until, found.ends = 0.0, self._clock() + AGAIN_S
 
@@ -147,7 +147,7 @@ class Connections:
 
 
 class CountingSocket(socket.socket):
-    """A listening socket that notes each connection in `connections`."""
+    """A listening socket that adds each connection to `connections`."""
 
     connections: Connections | None = None
 
@@ -160,9 +160,9 @@ class CountingSocket(socket.socket):
 
 
 class Turns:
-    """Turns of requests: one in each round of the loop, those in `stops` first.
+    """Starts one request in each round of the event loop, those in `stops` first.
 
-    The loop reads the sockets in each round, so a stop waits for one request instead of all.
+    The loop reads all sockets in each round, so a stop waits for one request at most.
     """
 
     def __init__(self) -> None:
@@ -171,7 +171,7 @@ class Turns:
         self._is_taken = False  # in this round
 
     async def wait(self, waiting: deque[asyncio.Future[None]]) -> None:
-        """Wait for a turn behind those that wait here."""
+        """Wait for a turn in this queue."""
         loop = asyncio.get_running_loop()
         if self._is_taken:
             turn: asyncio.Future[None] = loop.create_future()
@@ -185,14 +185,14 @@ class Turns:
         self._is_taken = False
         while not self._is_taken and (waiting := self.stops or self.others):
             turn = waiting.popleft()
-            if not turn.done():  # its request was cancelled
+            if not turn.done():  # else its request was cancelled
                 turn.set_result(None)
                 self._is_taken = True
                 asyncio.get_running_loop().call_soon(self._give)
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that reports clients that send requests ahead of their answers, or do not read these."""
+    """A connection that notes if its client sends requests ahead of its answers, or does not read them."""
 
     @property
     def _connections(self) -> Connections:
@@ -224,9 +224,9 @@ class WatchedProtocol(H11Protocol):
 
 
 class Watched:
-    """An application that notes in `connections` when a request is complete and when it is answered.
+    """An application that notes the start and end of requests in `connections`.
 
-    Each request waits for its turn; one that may be a stop is before all others.
+    Each request waits for its turn; possible stops go first.
     """
 
     def __init__(self, app: ASGIApp, connections: Connections) -> None:
@@ -254,31 +254,33 @@ class Watched:
         try:
             await self._turns.wait(self._turns.stops if is_stop else self._turns.others)
             await self._app(scope, receive_and_note, send_and_note)
-        except asyncio.CancelledError:  # the server ends, and waits for it no longer
+        except asyncio.CancelledError:  # the server is shutting down
             if not has_begun:
                 await JsonResponse({"error": ENDS}, 503)(scope, receive, send)
         finally:
             self._connections.finish(client)
 
 
-BACKLOG = 64  # connections that wait, and that are taken at once: their descriptors are not bounded yet
+BACKLOG = 64  # pending connections: all are accepted at once, before MOST_OPEN applies
 
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
-    errno.EACCES: "this user may not",
-    errno.EADDRNOTAVAIL: "it is no address of this machine",
+    errno.EACCES: "this user has no permission",
+    errno.EADDRNOTAVAIL: "this machine does not have this address",
 }
 
 
 def listen(host: str, port: int) -> CountingSocket:
-    """Return a listening socket. Raises OSError with a sentence where the port cannot be had."""
+    """Return a listening socket. Raises OSError with a sentence if the port cannot be opened."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except socket.gaierror as failure:
-        raise OSError(f"listen: {host} is no address of this machine: {failure.strerror}") from failure
-    # With its protocol named asyncio sets TCP_NODELAY: else each frame waits 40 ms.
+        raise OSError(
+            f"listen: this machine does not have the address {host}: {failure.strerror}"
+        ) from failure
+    # asyncio sets TCP_NODELAY only if the protocol is named; without it each frame waits 40 ms.
     listener = CountingSocket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -288,5 +290,5 @@ def listen(host: str, port: int) -> CountingSocket:
     except OSError as failure:
         listener.close()
         reason = _WHY.get(failure.errno or 0, failure.strerror)
-        raise OSError(f"listen: {host}:{port} cannot be had: {reason}") from failure
+        raise OSError(f"listen: {host}:{port} cannot be opened: {reason}") from failure
     return listener

@@ -1,6 +1,7 @@
-"""Exports: files of the history for those who ask for them, few at a time.
+"""Exports of the history as CSV or Parquet files.
 
-Each takes a thread while its next piece is made, and a file of Parquet takes room on the history's disk.
+Their number is limited: each uses a thread while a piece is made, and Parquet uses space on the history's
+disk.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ from starlette.types import Receive, Scope, Send
 from multidrop.gateway.http.messages import Denied
 from multidrop.supervisor import supervisor
 
-MOST_EXPORTS = 8  # under way
-PIECE_S = 600.0  # that a piece may take: the first one of Parquet has the whole file behind it
+MOST_EXPORTS = 8  # concurrent exports
+PIECE_S = 600.0  # time limit of a piece: the first one of Parquet takes the whole file
 R = TypeVar("R")
-MOST_NAME = 80  # characters of a series in a file's name
-FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # in the names of files
+MOST_NAME = 80  # characters of a series' name in a file name
+FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # in file names
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 
 
 class ExportingPart(Protocol):
-    """The part of the historian that is needed here."""
+    """The method of the historian that exports use."""
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return a file piece by piece; called, and gone through, in threads."""
+        """Return a file in pieces; called and iterated in threads."""
 
 
 class Exports:
-    """The exports that are under way."""
+    """The exports in progress."""
 
     def __init__(self) -> None:
         self.under_way = 0
@@ -42,7 +43,7 @@ class Exports:
     async def respond(
         self, part: ExportingPart, names: Sequence[str], begin: int, end: int, kind: str
     ) -> Response:
-        """Return a file of these series. Raises Denied if it cannot be made, or not now; Hung by the disk."""
+        """Return a file of these series. Raises Denied for wrong arguments or too many exports; Hung."""
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
         if self.under_way >= MOST_EXPORTS:
@@ -59,7 +60,7 @@ class Exports:
 
 
 class _Export(StreamingResponse):
-    """One export, until its client has all of it or is gone."""
+    """One export, until its client has received all or disconnected."""
 
     def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str, name: str) -> None:
         plain = name.encode("ascii", "replace").decode().replace("?", "_")
@@ -75,11 +76,11 @@ class _Export(StreamingResponse):
 
 
 async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
-    """Yield the pieces, each made in a thread: a disk may hang."""
+    """Yield the pieces, each made in a thread because a disk may hang."""
     try:
         while (piece := await _in_thread(partial(next, pieces, None))) is not None:
             yield piece
-    finally:  # its client may be gone: what it had on the disk goes
+    finally:  # removes temporary files, also if the client has disconnected
         if isinstance(pieces, Generator):
             supervisor().thread("exports", PIECE_S, pieces.close)
 
@@ -89,7 +90,7 @@ async def _in_thread(work: Callable[[], R]) -> R:
 
 
 def _what(names: Sequence[str]) -> str:
-    """Return the drives of these series as a file's name may have them."""
+    """Return the drives of these series in a form allowed in file names."""
     drives = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
     if not drives:
         return "all drives"
@@ -99,7 +100,7 @@ def _what(names: Sequence[str]) -> str:
 
 
 def _moment(ms: int) -> str:
-    """Return a time of UTC without the colons that some systems forbid in names."""
+    """Return a UTC time without colons, which some systems forbid in file names."""
     try:
         return datetime.fromtimestamp(ms / 1000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     except (ValueError, OverflowError, OSError):

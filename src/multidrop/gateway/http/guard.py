@@ -1,4 +1,4 @@
-"""Guard: checks a request before any route sees it: the page it comes from, and its sender."""
+"""Guard: checks the origin and the token of each request before any route handles it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.gateway.http.rights import SCHEMES, Caller, May, OwnNames, Right,
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
-HEADERS = {  # of what is no page: short, since each frame has them
+HEADERS = {  # of API answers: few, because each frame has them
     "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
     "cross-origin-resource-policy": "same-origin",
     "x-content-type-options": "nosniff",
@@ -26,13 +26,13 @@ PAGE_HEADERS = HEADERS | {
     "cross-origin-opener-policy": "same-origin",
     "x-frame-options": "DENY",
     "referrer-policy": "no-referrer",
-    "cache-control": "no-cache",  # a page's file is asked for again, by its ETag
+    "cache-control": "no-cache",  # browsers check the ETag on each load
 }
 ANYONE = "anyone"
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
-HAS_WRONG_TOKEN = "has_wrong_token"  # of a scope: a stop, which is sent all the same
-MOST_HEAD = 64 * 1024  # bytes before a request's body: a browser sends the cookies of all ports of a host
+HAS_WRONG_TOKEN = "has_wrong_token"  # key in the scope of a stop, which is sent despite a wrong token
+MOST_HEAD = 64 * 1024  # bytes of a request's head: a browser sends the cookies of all ports of a host
 
 
 def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
@@ -45,7 +45,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Needed(NamedTuple):
-    """The method of a path, and the right that it needs; None: anybody may, and no token is asked for."""
+    """The method of a path, and the right that it needs; None: no token is checked."""
 
     method: str
     right: Right | None
@@ -75,7 +75,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
-            return  # uvicorn refuses a connection that nobody accepts
+            return  # uvicorn then refuses the connection
 
         is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
         added = _RAW_PAGE_HEADERS if is_page else _RAW_HEADERS
@@ -93,7 +93,7 @@ class Guard:
             response = JsonResponse({"error": str(denied)}, denied.status)
             if denied.status == 401:
                 response.headers["www-authenticate"] = "Bearer"
-                if COOKIE in Headers(scope=scope).get("cookie", ""):  # the next request is without it
+                if COOKIE in Headers(scope=scope).get("cookie", ""):  # remove the wrong token
                     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
             await response(scope, receive, send_with_headers)
             return
@@ -117,7 +117,7 @@ class Guard:
         return self._admit(scope, headers, needed.right)
 
     def _find(self, path: str) -> Needed:
-        """Return what is needed for the longest listed prefix of a path."""
+        """Return the requirement of the longest listed prefix of a path."""
         while path not in self._needed:
             head, slash, _ = path.rstrip("/").rpartition("/")
             if not slash:
@@ -126,31 +126,30 @@ class Guard:
         return self._needed[path]
 
     def _check_site(self, headers: Headers, host: str, needed: Needed, schemes: Sequence[str]) -> None:
-        """Refuse what another site's page sends: a browser says so, and nothing else has to."""
+        """Raise Denied for a request of another site's page, which browsers mark as such."""
         origin = headers.get("origin")
         if origin is not None and not self._names.has_origin(origin, host, schemes):
-            raise Denied(403, f"a page of {origin[:100]!r} asks, which is not this gateway's")
+            raise Denied(403, f"the request comes from a page of {origin[:100]!r}, not of this gateway")
         site = headers.get("sec-fetch-site", "none")
         is_page = needed == Needed("GET", None) and headers.get("sec-fetch-mode") == "navigate"
         if site not in ("none", "same-origin") and not is_page:
-            raise Denied(403, "a page of another site asks")
+            raise Denied(403, "the request comes from a page of another site")
         if needed.method == "POST":
             kind = headers.get("content-type", "").partition(";")[0].strip().lower()
             if kind != "application/json":
                 raise Denied(415, "the body must be application/json")
 
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
-        """Return the caller of a request that needs this right.
+        """Return the caller of a request that needs this right. Raises Denied without it.
 
-        A wrong token is refused, whatever its sender may do without one: all but a stop that anybody may
-        send. After several wrong ones from an address none from there is looked at for a while, but for a
-        stop, which nothing may hold back.
+        A wrong token is refused even if the request needs none, except for a stop that needs none. After
+        several wrong tokens, an address must wait before others are checked; stops are checked always.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy
         free = self._may().without_token(is_loopback=local)
         secret, way = _secret(headers)
-        secret = secret if self._tokens else ""  # without any there is nothing to check it against
+        secret = secret if self._tokens else ""  # ignore it if the gateway has no tokens
         token: Token | None = None
         is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
         if secret and not is_shut:
@@ -176,7 +175,7 @@ class Guard:
         )
 
     def address(self, scope: Scope, headers: Headers) -> str:
-        """Return the client's address; behind a proxy the one that it added last."""
+        """Return the client's address; behind a proxy the last one in its header."""
         client: Any = scope.get("client")
         peer = str(client[0]) if client else ""
         if not self._behind_proxy:
@@ -192,7 +191,7 @@ def _length(scope: Scope) -> int:
 
 
 def _secret(headers: Headers) -> tuple[str, str]:
-    """Return the token that was sent, and who sent it: a program or the page."""
+    """Return the token in a request, and its sender: "http" for a program, "page" for the page."""
     scheme, _, secret = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return secret.strip(), "http"

@@ -1,4 +1,4 @@
-"""Fields of a request to the web server: its caller, its body, and texts and numbers in them."""
+"""Messages of the web server: request bodies and their fields, JSON answers, refusals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from multidrop.printable import plain_whole
 
 
 class Denied(Exception):
-    """A request that is not served: its status, and a sentence."""
+    """A refused request: HTTP status and a sentence."""
 
     def __init__(self, status: int, sentence: str) -> None:
         super().__init__(sentence)
@@ -24,7 +24,7 @@ class Denied(Exception):
 
 
 class JsonResponse(Response):
-    """An answer of ASCII alone; what is no Unicode is told by its escape."""
+    """JSON escaped to ASCII; tolerates lone surrogates, which names from requests and files may have."""
 
     media_type = "application/json"
 
@@ -33,8 +33,8 @@ class JsonResponse(Response):
 
 
 MOST_BYTES = 64 * 1024  # of a body
-BODY_S = 10.0  # that it may take to come
-STOP_BODY_S = 3.0  # that a stop waits for it: a network that lost it sends it once or twice more
+BODY_S = 10.0  # time limit for a body
+STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -45,7 +45,7 @@ def caller_of(request: Request) -> Caller:
 
 
 async def body_of(request: Request, seconds: float | None = None) -> dict[str, Any]:
-    """Return the body's JSON object. Raises Denied for any other, and for one that is too long or late."""
+    """Return the JSON object in the body. Raises Denied if it is another type, too long or late."""
     data = bytearray()
     seconds = BODY_S if seconds is None else seconds
     try:
@@ -55,9 +55,9 @@ async def body_of(request: Request, seconds: float | None = None) -> dict[str, A
                 if len(data) > MOST_BYTES:
                     raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
     except ClientDisconnect:
-        raise Denied(400, "the client is gone") from None
+        raise Denied(400, "the client has disconnected") from None
     except TimeoutError:
-        raise Denied(408, f"the body did not come within {seconds:g} s") from None
+        raise Denied(408, f"the body did not arrive within {seconds:g} s") from None
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):
@@ -70,13 +70,13 @@ async def body_of(request: Request, seconds: float | None = None) -> dict[str, A
 async def drives_to_stop(request: Request) -> list[str] | None:
     """Return the drives that a stop names; None: all.
 
-    A stop needs no body: one that is late, cut off, too long, or no list of names, or one of none, asks for
-    all drives. To stop too many can be mended, and to stop none cannot.
+    A stop whose body is missing, late, truncated, too long, empty or invalid means all drives: stopping too
+    many is harmless, stopping none is not.
     """
     try:
         drives = (await body_of(request, STOP_BODY_S)).get("drives")
     except Denied as unread:
-        _log.warning("a stop is one of all drives, because %s", unread)
+        _log.warning("stopping all drives, because %s", unread)
         return None
     if isinstance(drives, str):
         return [drives]
@@ -84,22 +84,22 @@ async def drives_to_stop(request: Request) -> list[str] | None:
         return None
     if isinstance(drives, list) and drives and all(isinstance(one, str) for one in drives):
         return drives
-    _log.warning("a stop is one of all drives, because %.100r is no list of names", drives)
+    _log.warning("stopping all drives, because %.100r is not a list of names", drives)
     return None
 
 
 def text_in(body: Mapping[str, Any], key: str) -> str:
     value = body.get(key)
     if not isinstance(value, str) or not value:
-        raise Denied(400, f"{key} is missing, or is no text")
+        raise Denied(400, f"{key} is missing or not a text")
     return value
 
 
 def frame_in(body: Mapping[str, Any]) -> int:
-    """Return the number of the frame that the sender of a command had seen."""
+    """Return the number of the frame that the sender of a command has seen."""
     seen = body.get("seen")
     if isinstance(seen, bool) or not isinstance(seen, int) or not 0 <= seen < 1 << 63:
-        raise Denied(400, "seen is missing, or no whole number: it is the n of the newest frame you have")
+        raise Denied(400, "seen is missing or not a whole number: give the n of your newest frame")
     return seen
 
 
@@ -107,4 +107,4 @@ def number_in(text: str, key: str) -> int:
     try:
         return plain_whole(text)
     except ValueError:
-        raise Denied(400, f"{key} = {text[:40]!r} is no whole number") from None
+        raise Denied(400, f"{key} = {text[:40]!r} is not a whole number") from None

@@ -55,7 +55,7 @@ class PageFiles:
         if found is None and name == INDEX:
             raise Denied(404, "this version of multidrop has no page; /api/plant and /metrics are there")
         if found is None:
-            raise Denied(404, "there is nothing here")
+            raise Denied(404, "unknown path")
         headers = {"etag": found.etag}
         if found.etag in request.headers.get("if-none-match", ""):
             return Response(status_code=304, headers=headers)

@@ -1,4 +1,4 @@
-"""Rights: callers, the ways they come by, and what each may do. Pure: texts and times come in."""
+"""Callers, tokens and rights. Pure: takes texts and times."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ipaddress import ip_address
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-NOT_LISTED = "not on the list"  # rules of a WriteForbidden that the gateway itself raises
+NOT_LISTED = "not on the list"  # rules of WriteForbidden raised by the gateway
 NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
 
-MOST_WRONG, WINDOW_S = 5, 60.0  # wrong tokens of an address, and within which time
-MOST_ADDRESSES = 10_000  # whose wrong tokens are remembered
+MOST_WRONG, WINDOW_S = 5, 60.0  # wrong tokens allowed to an address within this time
+MOST_ADDRESSES = 10_000  # addresses whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SCHEMES = ("http", "https")
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 class Right(IntEnum):
-    """Each role may do what those before it may."""
+    """Roles; each includes the rights of those before it."""
 
     LOOK = 0
     STOP = 1
@@ -34,7 +34,7 @@ class Right(IntEnum):
 
 
 class Caller(NamedTuple):
-    """Somebody who asks for something."""
+    """The sender of a request."""
 
     name: str  # a token's name, or "anyone"
     way: str  # "page", "http", "mqtt", "modbus"
@@ -43,12 +43,12 @@ class Caller(NamedTuple):
 
     @property
     def by(self) -> str:
-        """Say who it is, as log lines do."""
+        """The caller as named in log lines."""
         return f"{self.name} by {self.way} from {self.address}"
 
 
 class Token(NamedTuple):
-    """One line of the tokens' file; it holds a digest, so that the file itself lets nobody in."""
+    """One line of the token file; it has only a digest, so the file alone gives no access."""
 
     name: str
     right: Right
@@ -60,20 +60,22 @@ class Token(NamedTuple):
 
 
 def digest(token: str) -> str:
-    """Return a token's digest. Tokens are long and random, and need no slow hash."""
+    """Return a token's digest. Tokens are long and random, so a fast hash is safe."""
     return hashlib.sha256(token.encode(errors="surrogatepass")).hexdigest()
 
 
 def new_token(name: str, right: Right) -> tuple[str, Token]:
-    """Return a fresh token, to be told once, and its line. Raises ValueError for such a name."""
+    """Return a new secret and its token. Raises ValueError for an invalid name."""
     if not NAME.fullmatch(name):
-        raise ValueError(f"{name!r} is no name for a token: letters, digits, . _ @ and - do, 64 at most")
+        raise ValueError(
+            f"{name!r} cannot name a token: use letters, digits and . _ @ - (at most 64, no sign first)"
+        )
     secret = secrets.token_urlsafe(32)
     return secret, Token(name, right, digest(secret))
 
 
 def read_tokens(text: str) -> tuple[list[Token], list[str]]:
-    """Return the tokens of a file, and a sentence for each line that is none."""
+    """Return the tokens in a file, and a sentence for each invalid line."""
     found: list[Token] = []
     wrong: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -84,32 +86,31 @@ def read_tokens(text: str) -> tuple[list[Token], list[str]]:
         if role not in Right.__members__ or not NAME.fullmatch(words[0]) or not SHA256.fullmatch(words[2]):
             wrong.append(f"line {number} is not `name role sha256`; `multidrop serve --new-token` prints one")
         elif any(words[0] == token.name for token in found):
-            wrong.append(f"line {number}: another token is called {words[0]}; give every one its own name")
+            wrong.append(f"line {number}: the name {words[0]} is in use already; give each token its own")
         else:
             found.append(Token(words[0], Right[role], words[2]))
     return found, wrong
 
 
 class Tokens:
-    """The valid tokens, and the wrong ones with which each address came.
+    """The valid tokens, and the wrong tokens from each address.
 
-    A wrong one that comes again is no further guess: a browser sends a token that was taken away with every
-    request.
+    A repeated wrong token counts once, because a browser sends a revoked token with every request.
     """
 
     def __init__(self, tokens: Iterable[Token] = ()) -> None:
         self._tokens = tuple(tokens)
-        self._wrong: dict[str, deque[tuple[float, str]]] = {}  # when, and its digest
+        self._wrong: dict[str, deque[tuple[float, str]]] = {}  # time and digest, by address
 
     def __len__(self) -> int:
         return len(self._tokens)
 
     def replace(self, tokens: Iterable[Token]) -> None:
-        """Take the tokens of a file that was read again."""
+        """Use the tokens of a reloaded file."""
         self._tokens = tuple(tokens)
 
     def find(self, secret: str) -> Token | None:
-        """Return the token of this secret, in the same time whether or not there is one."""
+        """Return the token of this secret or None, in constant time."""
         given, found = digest(secret), None
         for token in self._tokens:
             if hmac.compare_digest(token.sha256, given):
@@ -117,7 +118,7 @@ class Tokens:
         return found
 
     def is_shut(self, address: str, now: float) -> bool:
-        """Return True where no more wrong tokens are looked at from this address for now."""
+        """Return True if this address has sent too many wrong tokens recently."""
         came = self._wrong.get(address)
         while came and now - came[0][0] >= WINDOW_S:
             came.popleft()
@@ -126,9 +127,9 @@ class Tokens:
         return came is not None and len(came) >= MOST_WRONG
 
     def note_wrong(self, address: str, secret: str, now: float) -> bool:
-        """Count a wrong token; return True unless it came before.
+        """Count a wrong token; return True unless it is a repetition.
 
-        The addresses that came first are forgotten where there are very many.
+        Beyond MOST_ADDRESSES the oldest address is forgotten.
         """
         given = digest(secret)
         if address not in self._wrong and len(self._wrong) >= MOST_ADDRESSES:
@@ -149,12 +150,12 @@ class May(NamedTuple):
     verbs: frozenset[str] = frozenset()
 
     def bounded_by(self, other: May) -> May:
-        """Return the same lists, and those rights without a token that both give."""
+        """Return these lists, with the rights without a token limited to those of both."""
         look = "anyone" if self.look == other.look == "anyone" else "token"
         return self._replace(look=look, on_loopback=min(self.on_loopback, other.on_loopback))
 
     def without_token(self, *, is_loopback: bool) -> Right | None:
-        """Return the right of those without a token; None: not even a look."""
+        """Return the right of callers without a token; None: no access."""
         if is_loopback and self.on_loopback > Right.LOOK:
             return self.on_loopback
         return Right.LOOK if self.look == "anyone" else None
@@ -162,7 +163,7 @@ class May(NamedTuple):
 
 @lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
-    """Return True for addresses and names that this machine alone can reach."""
+    """Return True for addresses and names that only this machine can reach."""
     if host in ("localhost", ""):
         return host == "localhost"
     try:
@@ -172,7 +173,7 @@ def is_loopback(host: str) -> bool:
 
 
 class OwnNames:
-    """The names of the gateway; a page under any other name is somebody else's."""
+    """The host names of the gateway; a page under any other name is foreign."""
 
     def __init__(self, names: Iterable[str], listen: str, port: int) -> None:
         self._always = {"localhost", "127.0.0.1", "[::1]"}
@@ -182,18 +183,18 @@ class OwnNames:
         self.replace(names)
 
     def replace(self, names: Iterable[str]) -> None:
-        """Take the names of a file that was read again."""
+        """Use the names of a reloaded file."""
         self._hosts = frozenset({*self._always, *(name.lower() for name in names)})
 
     def has_host(self, host: str) -> bool:
-        """Return True for a Host header that is ours; a proxy's port may be another one."""
+        """Return True if a Host header names this gateway; a proxy's port may differ."""
         split = _split(host)
         return split is not None and split[0] in self._hosts
 
     def has_origin(self, origin: str, host: str, schemes: Container[str]) -> bool:
-        """Return True for an Origin header of our own page: same host and port as the request itself.
+        """Return True for an Origin header of the gateway's page: host and port equal those of the request.
 
-        `schemes` are those by which a page may have come.
+        `schemes` are the allowed URL schemes of the page.
         """
         scheme, _, rest = origin.partition("://")
         if scheme not in schemes:
@@ -205,9 +206,9 @@ class OwnNames:
         return (theirs[0], theirs[1] or usual) == (ours[0], ours[1] or usual)
 
 
-@lru_cache(maxsize=64)  # each request of a viewer has the same one
+@lru_cache(maxsize=64)  # all requests of a viewer have the same header
 def _split(host: str) -> tuple[str, int | None] | None:
-    """Return name and port of a Host header; None where it is not one."""
+    """Return name and port of a Host header; None if it is invalid."""
     if not re.fullmatch(r"[A-Za-z0-9._-]+(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]+\](:[0-9]{1,5})?", host):
         return None
     split = urlsplit(f"//{host}")

@@ -1,4 +1,4 @@
-"""Web: the routes, each behind the guard."""
+"""The routes of the web server, behind the guard."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from multidrop.gateway.http.page_files import PageFiles
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.frames import WHOLE, Frames
-from multidrop.gateway.live.views import figures_of, health_of, look_at, look_at_lines
+from multidrop.gateway.live.views import drive_view, figures_of, health_of, line_views
 from multidrop.gateway.metrics import families_of
 from multidrop.supervisor import Hung, supervisor
 
@@ -46,12 +46,12 @@ if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
 
-MOST_QUERIES = 2  # of the audit log, at the same time
-AUDIT_S = 20.0  # that one may take
+MOST_QUERIES = 2  # concurrent queries of the audit log
+AUDIT_S = 20.0  # time limit of one
 COOKIE_S = 30 * 24 * 3600
-MOST_NOTE = 500  # characters beside an alarm
-HEAD_S = 0.5  # after which a stop's answer begins: its head confirms that the stop was taken
-UNBUFFERED = {"x-accel-buffering": "no"}  # a proxy passes the head on at once
+MOST_NOTE = 500  # characters of an acknowledgement's note
+HEAD_S = 0.5  # a stop's answer starts after this time; its head confirms that the stop was accepted
+UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head at once
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
 NEEDED: Mapping[str, Needed] = {
@@ -62,7 +62,7 @@ NEEDED: Mapping[str, Needed] = {
     "/metrics": Needed("GET", Right.LOOK),
     "/api/stop": Needed("POST", Right.STOP),
     "/api/fleet/stop": Needed("POST", Right.STOP),
-    "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
+    "/api/act": Needed("POST", Right.STOP),  # Commands checks the verb's own right
     "/api/acknowledge": Needed("POST", Right.STOP),
     "/api/write": Needed("POST", Right.WRITE),
     "/api/reload": Needed("POST", Right.WRITE),
@@ -101,14 +101,14 @@ def make_app(gateway: Gateway) -> ASGIApp:
     handlers: Any = {
         Denied: _denied,
         Hung: lambda request, failure: _error(503, str(failure)),
-        404: lambda request, failure: _error(404, "there is nothing here"),
-        500: lambda request, failure: _error(500, "this went wrong in the gateway; its log says why"),
+        404: lambda request, failure: _error(404, "unknown path"),
+        500: lambda request, failure: _error(500, "internal error; see the gateway's log"),
     }
     others = Starlette(routes=routes, exception_handlers=handlers)
     frames = FrameRoute(gateway.frames)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer for frames before the router: they are asked for most often by far."""
+        """Answer requests for frames without the router: they are by far the most frequent."""
         await (frames if scope["path"] == "/api/frame" else others)(scope, receive, send)
 
     return Guard(
@@ -135,7 +135,7 @@ def _told(told: CommandResult) -> dict[str, Any]:
 
 
 def _answer(told: CommandResult) -> Response:
-    """Return what became of a command: 403 where a right was missing, else 200 with what happened."""
+    """Return the outcome of a command: status 403 if a right was missing, else 200."""
     is_denied = isinstance(told.error, WriteForbidden) and told.error.rule in RIGHTS_RULES
     return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
 
@@ -163,7 +163,7 @@ class _Pages:
         self._gateway = gateway
         self._exports = Exports()
 
-    # ---- looks ----
+    # ---- queries ----
 
     async def plant(self, request: Request) -> Response:
         gateway = self._gateway
@@ -183,17 +183,17 @@ class _Pages:
 
     async def drive(self, request: Request) -> Response:
         try:
-            return JsonResponse(await look_at(self._gateway, request.path_params["name"]))
+            return JsonResponse(await drive_view(self._gateway, request.path_params["name"]))
         except ValueError as unknown:
             return _error(404, str(unknown))
 
     async def lines(self, request: Request) -> Response:
-        return JsonResponse(look_at_lines(self._gateway))
+        return JsonResponse(line_views(self._gateway))
 
     async def fleet(self, request: Request) -> Response:
         part: Any = self._gateway.feeds.get("fleet")
         if part is None:
-            return _error(404, "no fleet is looked at; add [serve.fleet] to the plant file")
+            return _error(404, "this gateway shows no fleet; add [serve.fleet] to the plant file")
         return JsonResponse(part.told())
 
     async def health(self, request: Request) -> Response:
@@ -220,15 +220,15 @@ class _Pages:
         return JsonResponse({"alarms": found, "since": events.since})
 
     async def acknowledge(self, request: Request) -> Response:
-        """Note that the caller has seen an alarm, with what he has to say of it."""
+        """Acknowledge an alarm, with the caller's note."""
         body = await body_of(request)
         alarm, note = text_in(body, "alarm"), body.get("note", "")
         if not isinstance(note, str) or len(note) > MOST_NOTE or not note.isprintable():
-            raise Denied(400, f"note is no text of at most {MOST_NOTE} printable characters")
+            raise Denied(400, f"note must be a text of at most {MOST_NOTE} printable characters")
         try:
             found = self._gateway.alarms.acknowledge(alarm, utc_ms(), caller_of(request).by, note.strip())
         except KeyError:
-            raise Denied(404, "there is no such alarm; its list may have changed meanwhile") from None
+            raise Denied(404, "unknown alarm; the list may have changed") from None
         self._gateway.frames.note_news()
         return JsonResponse(found.as_json())
 
@@ -254,7 +254,7 @@ class _Pages:
     def _history(self) -> Any:
         part = self._gateway.feeds.get("history")
         if part is None:
-            raise Denied(404, "no history is kept; add [serve.history] to the plant file")
+            raise Denied(404, "this gateway records no history; add [serve.history] to the plant file")
         return part
 
     # ---- commands ----
@@ -268,15 +268,16 @@ class _Pages:
         """Stop all drives of the fleet, with the commander's key of `[serve.fleet]`."""
         part: Any = self._gateway.feeds.get("fleet")
         if part is None or not part.can_stop:
-            raise Denied(404, "no fleet is stopped from here; add commander to [serve.fleet]")
+            raise Denied(404, "this gateway cannot stop the fleet; add commander to [serve.fleet]")
         caller = caller_of(request)
         _log.warning("stop of the whole fleet, asked for by %s", caller.by)
         return await self._answer_stop(_answer_fleet(part.stop(caller.by)))
 
     async def _answer_stop(self, work: Coroutine[Any, Any, Response]) -> Response:
-        """Return the answer to a stop, which goes on even if its client leaves.
+        """Return the answer to a stop, which continues even if its client disconnects.
 
-        The answer to a longer one begins after HEAD_S: a client without it knows that no stop was taken.
+        If the stop takes longer than HEAD_S, the answer starts before its end. A client that receives no head
+        knows that its stop was not accepted.
         """
         task = supervisor().start("stop", work)
         await asyncio.wait({task}, timeout=HEAD_S)
@@ -288,7 +289,7 @@ class _Pages:
         body = await body_of(request)
         value = body.get("value")
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise Denied(400, "value is missing, or is no number")
+            raise Denied(400, "value is missing or not a number")
         drive, register = text_in(body, "drive"), text_in(body, "register")
         caller = caller_of(request)
         admit = self._admission(drive, (register, value, caller), body)
@@ -299,16 +300,16 @@ class _Pages:
         drive, verb = text_in(body, "drive"), text_in(body, "verb")
         if HAS_WRONG_TOKEN in request.scope and verb not in STOPPING:
             raise Denied(401, WRONG)
-        options = {} if verb in STOPPING else body.get("options", {})  # no wrong ones keep a stop back
+        options = {} if verb in STOPPING else body.get("options", {})  # wrong options must not prevent a stop
         if not isinstance(options, dict):
-            raise Denied(400, "options is no JSON object")
+            raise Denied(400, "options is not a JSON object")
         caller = caller_of(request)
         admit = self._admission(drive, (verb, repr(options), caller), body)
         acting = _answer_one(self._gateway.commands.act(drive, verb, options, caller, admit))
         return await (self._answer_stop(acting) if verb in STOPPING else acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return what admits a command by the frame that its sender had seen; stops need none."""
+        """Return the check of a command against the frame that its sender has seen; stops skip it."""
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 
@@ -323,9 +324,9 @@ class _Pages:
     # ---- tokens ----
 
     async def token(self, request: Request) -> Response:
-        """Keep a token in a cookie that no script can read.
+        """Store a token in a cookie that scripts cannot read.
 
-        After several wrong ones from an address none is looked at for a while, but to send a stop.
+        After several wrong tokens an address must wait, except to send a stop.
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)
@@ -356,7 +357,7 @@ _GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
 
 
 class FrameRoute:
-    """Answers `/api/frame?after=N` with a frame other than the N-th, as soon as there is one."""
+    """Answers `/api/frame?after=N` as soon as there is a frame other than the N-th."""
 
     def __init__(self, frames: Frames) -> None:
         self._frames = frames

@@ -1,4 +1,4 @@
-"""AlarmFile: keeps alarms on the disk. `run` has a thread of its own, so polling never waits for a disk."""
+"""AlarmFile: keeps alarms on disk. It writes in its own thread, so polling never waits for a disk."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from typing import Any
 
 from multidrop.gateway.live.alarms import KINDS, MOST_ENDED, Alarm
 
-MOST_WAITING = 10_000  # alarms that the disk has not taken yet
-MOST_BYTES = 4 << 20  # of the file, which is written anew with its newest alarms when it is longer
-SLOW_S = 10.0  # a disk that takes longer is reported
+MOST_WAITING = 10_000  # alarms not yet written
+MOST_BYTES = 4 << 20  # size at which the file is rewritten with its newest alarms
+SLOW_S = 10.0  # a slower disk is reported
 CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """The alarms in a file of JSON lines, the newest line of an alarm being the one that counts.
+    """The alarms in a file of JSON lines; the newest line of an alarm counts.
 
-    Nothing here waits for the disk or raises.
+    Only `run` waits for the disk. No method raises.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.past: list[Alarm] | None = None  # of earlier runs, once they are read
+        self.past: list[Alarm] | None = None  # alarms of earlier runs; None until they are read
         self._failure = ""
-        self._since = time.monotonic()  # when the disk began with what it is at; inf: it has nothing to do
+        self._since = time.monotonic()  # start of the present disk access; inf while idle
         self._waiting: Queue[Alarm | None] = Queue(MOST_WAITING)
         self._ended = threading.Event()
 
     @property
     def trouble(self) -> str:
-        """Why alarms are not kept now; "" is well."""
+        """Why alarms are not written now; "" if they are."""
         if time.monotonic() - self._since > SLOW_S:
             return f"alarms are not kept: {self.path} has not been written for {SLOW_S:g} s"
         return f"alarms are not kept: {self._failure}" if self._failure else ""
 
     def note(self, alarm: Alarm) -> None:
-        """Have an alarm written that began, ended or changed."""
+        """Queue an alarm that started, ended or changed."""
         try:
             self._waiting.put_nowait(alarm)
         except Full:
             self._failure = f"{MOST_WAITING} wait for {self.path} already"
 
     def close(self) -> None:
-        """Write what waits; a disk that hangs is left alone after CLOSE_S."""
+        """Write the queued alarms, waiting at most CLOSE_S for the disk."""
         try:
             self._waiting.put_nowait(None)
         except Full:
@@ -57,7 +57,7 @@ class AlarmFile:
     # ---- on the thread ----
 
     def run(self) -> None:
-        """Read the alarms of earlier runs, then write what is noted until `close`."""
+        """Read the alarms of earlier runs, then write queued alarms until `close`."""
         try:
             self._keep()
         finally:
@@ -97,7 +97,7 @@ class AlarmFile:
                 return found
 
     def _write(self, changed: list[Alarm], known: dict[str, Alarm]) -> None:
-        """Append what changed; after a failure, or in a file that is too long, write all that is known."""
+        """Append the changed alarms; after a failure, or if the file is too long, write all known alarms."""
         is_whole = not self._failure and (not self.path.exists() or self.path.stat().st_size <= MOST_BYTES)
         if is_whole:
             with self.path.open("a", encoding="utf-8") as file:
@@ -109,12 +109,12 @@ class AlarmFile:
 
 
 def _line(alarm: Alarm) -> str:
-    """Return a line of its own: one that a lost power truncated ends before it."""
+    """Return the alarm's line. It starts with a newline: a power cut may have truncated the previous one."""
     return f"\n{json.dumps(alarm.as_json())}\n"
 
 
 def _newest(known: dict[str, Alarm]) -> dict[str, Alarm]:
-    """Return those that last, and the newest of the others."""
+    """Return the active alarms and the newest ended ones."""
     ended = [name for name, alarm in known.items() if alarm.ended is not None]
     forgotten = {*ended[: max(0, len(ended) - MOST_ENDED)]}
     return {name: alarm for name, alarm in known.items() if name not in forgotten}
@@ -136,7 +136,7 @@ def _read(path: Path) -> dict[str, Alarm]:
 
 
 def alarm_in(line: bytes) -> Alarm | None:
-    """Return the alarm of a line; None for one that is none, such as one that was truncated."""
+    """Return the alarm in a line; None if the line is invalid, for example truncated."""
     try:
         given: Any = json.loads(line)
         alarm = Alarm(**{name: given[name] for name in Alarm._fields})

@@ -1,4 +1,4 @@
-"""Events: alarms of drives and of lines, each with its begin and end. Pure."""
+"""Alarms of drives and lines, each with start and end. Pure."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from multidrop.gateway.live.hub import (
     Shown,
 )
 
-STOPPED, PORT = "stopped", "port"  # kinds beside "fault" and "silent"
+STOPPED, PORT = "stopped", "port"  # kinds in addition to "fault" and "silent"
 KINDS = (FAULT, STOPPED, PORT, SILENT)  # the gravest first
 UNCALLED = "the motor stopped, and no stop was called here"
-STANDS_MS = 2000  # for which a motor must stand: one that reverses passes 0 Hz
-MOST_ENDED = 1000  # that are remembered
-MOST_SHOWN = 20  # of them beside those that last
-LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
+STANDS_MS = 2000  # a motor must be at rest this long: a reversing one passes 0 Hz
+MOST_ENDED = 1000  # ended alarms kept
+MOST_SHOWN = 20  # ended alarms shown
+LOST = ("port lost", "port refused its settings")  # statuses of rows of a line without its port
 
 
 class Alarm(NamedTuple):
-    """Something that is or was wrong with a drive or a line; times are UTC in ms."""
+    """A problem of a drive or a line, present or past; times are UTC in ms."""
 
     time: int
-    drive: str  # "" for a line's
+    drive: str  # "" for an alarm of a line
     text: str
     ended: int | None
     kind: str
     line: str = ""
-    is_before: bool = False  # it may have begun before `time`, when it was first seen
+    is_before: bool = False  # it may have started before `time`, when it was first seen
     acknowledged: int | None = None
-    by: str = ""  # who acknowledged it
+    by: str = ""  # the caller who acknowledged it
     note: str = ""
 
     @property
     def id(self) -> str:
-        """A name of its own, which is the same after a restart."""
+        """A unique id, stable across restarts."""
         return f"{self.time} {self.kind} {self.drive or self.line}"
 
     def as_json(self) -> dict[str, Any]:
@@ -51,32 +51,32 @@ class Alarm(NamedTuple):
 
 
 class Alarms:
-    """Alarms that last, and the latest of those that are over.
+    """The active alarms, and the latest ended ones.
 
-    `since` is the time (UTC, ms) from which all are known: none is of before it, and of later ones those that
-    ended first are forgotten. `note` is called with each alarm that began, ended or changed.
+    `since` is the UTC time in ms from which the record is complete. `note` is called with each alarm that
+    started, ended or changed.
     """
 
     def __init__(self, since: int = 0, note: Callable[[Alarm], object] = lambda alarm: None) -> None:
         self.since = since
         self._note = note
-        self._lasting: dict[tuple[str, str, str], Alarm] = {}  # by line, drive and kind, the oldest first
+        self._lasting: dict[tuple[str, str, str], Alarm] = {}  # active, by line, drive and kind, oldest first
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
-        self._known: set[tuple[str, str]] = set()  # lines and drives of which something was seen
-        self._runs: dict[str, int] = {}  # stops that were called before a drive's motor was seen to run
-        self._stands: dict[str, int] = {}  # since when a motor that ran has stood
-        self.begun = 0  # so far
+        self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
+        self._runs: dict[str, int] = {}  # stop count of each drive when its motor was first seen running
+        self._stands: dict[str, int] = {}  # time at which a motor that ran was first seen at rest
+        self.begun = 0  # alarms so far
 
-    # ---- what is seen ----
+    # ---- observations ----
 
     def look(self, time: int, drive: str, shown: Shown, stops: int | None = None) -> None:
-        """Note what a drive shows. A fault lasts until somebody sees it go, so while its drive is silent.
+        """Note a drive's state. A fault stays active while its drive is silent.
 
-        `stops` counts the commands that end a run of its motor; None: a stand means nothing now.
+        `stops` counts the commands that end a run of its motor; None: rest is no alarm at present.
         """
         state, words = shown.state, shown.words
         if state == SILENT:
-            if not (words or "").startswith(LOST):  # that is one alarm of its line
+            if not (words or "").startswith(LOST):  # a lost port is one alarm of the line
                 self._begin(time, "", drive, SILENT, words or "no reply")
             return
         if words == NOT_ASKED:
@@ -110,30 +110,30 @@ class Alarms:
         self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
-        """Note that a line's port is lost, and why, or with None that it is there."""
+        """Note why a line's port is lost; None: it is present."""
         if lost is None:
             self._end(time, line, "", PORT)
         else:
             self._begin(time, line, "", PORT, lost)
 
     def note_there(self, line: str) -> None:
-        """Note that a line was seen to work: what is lost later was not lost before."""
+        """Note that a line works: a later loss starts at its own time."""
         self._known.add((line, ""))
 
     def forget(self, name: str, time: int) -> None:
-        """End the alarms of a drive or a line that is no longer there."""
+        """End the alarms of a drive or a line that was removed."""
         self._forget_run(name)
         self._known -= {("", name), (name, "")}
         for line, drive, kind in list(self._lasting):
             if name in (line, drive):
                 self._end(time, line, drive, kind)
 
-    # ---- what a person does, and what a disk keeps ----
+    # ---- acknowledgement, and alarms of earlier runs ----
 
     def acknowledge(self, id: str, time: int, by: str, note: str = "") -> Alarm:
-        """Note that somebody has seen an alarm; one of a motor that stopped is over then.
+        """Return the acknowledged alarm; acknowledgement also ends the alarm of a motor that stopped.
 
-        Raises KeyError for an unknown one.
+        Raises KeyError for an unknown id.
         """
         found = next((one for one in (*self._lasting.values(), *self._ended) if one.id == id), None)
         if found is None:
@@ -149,7 +149,7 @@ class Alarms:
         return changed
 
     def restore(self, kept: Iterable[Alarm], time: int, names: Collection[str]) -> None:
-        """Take alarms of an earlier run; those of drives and lines that are not in `names` end now."""
+        """Take over the alarms of an earlier run; those of drives and lines not in `names` end now."""
         kept = sorted(kept, key=lambda alarm: alarm.ended or alarm.time)
         if kept:
             self.since = min(self.since, *(alarm.time for alarm in kept))
@@ -162,27 +162,27 @@ class Alarms:
                 self._take_up(alarm, time, names)
 
     def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
-        """Let an alarm of an earlier run go on, if it is not known by now that it is over."""
+        """Continue an alarm of an earlier run unless it is known to be over."""
         key = _key(alarm)
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
         if present is not None and present.is_before and present.text in (alarm.text, UNNAMED):
-            self._lasting[key] = alarm  # it is the same one
+            self._lasting[key] = alarm  # the same alarm
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
             self._note(self._ended[-1])
         else:
             self._lasting[key] = alarm
 
-    # ---- what is shown ----
+    # ---- queries ----
 
     def shown(self) -> list[Alarm]:
-        """Return those that last, the gravest kind first, and behind them the newest that ended."""
+        """Return the active alarms, the gravest kind first, followed by the newest ended ones."""
         ended = [*self._ended][-MOST_SHOWN:]
         return [*self.lasting, *sorted(ended, key=lambda alarm: -alarm.time)]
 
     def between(self, begin: int, end: int) -> list[Alarm]:
-        """Return the alarms of a span of time, the newest first."""
+        """Return the alarms between two times, newest first."""
         found = [one for one in (*self._lasting.values(), *self._ended) if one.time <= end]
         return sorted(
             (one for one in found if one.ended is None or one.ended >= begin), key=lambda alarm: -alarm.time
@@ -190,13 +190,13 @@ class Alarms:
 
     @property
     def lasting(self) -> list[Alarm]:
-        """The alarms that last: what nobody acknowledged first, then the gravest kind, then the newest."""
+        """The active alarms: unacknowledged ones first, then the gravest kind, then the newest."""
         return sorted(
             self._lasting.values(),
             key=lambda alarm: (alarm.acknowledged is not None, KINDS.index(alarm.kind), -alarm.time),
         )
 
-    # ---- begin and end ----
+    # ---- start and end ----
 
     def _begin(self, time: int, line: str, drive: str, kind: str, text: str) -> None:
         key = (line, drive, kind)
@@ -205,7 +205,9 @@ class Alarms:
         self._known.add(key[:2])
         if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
             return
-        if before is not None and (before.text == UNNAMED or kind == PORT):  # the same one, with its name now
+        if before is not None and (
+            before.text == UNNAMED or kind == PORT
+        ):  # the same alarm with a better text
             self._lasting[key] = before._replace(text=text)
             self._note(self._lasting[key])
             return

@@ -1,4 +1,4 @@
-"""Description of a plant for the page: lines, drives, registers, and what the caller may do. Pure."""
+"""Description of a plant for the page: lines, drives, registers and the caller's rights. Pure."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def describe(
     has_fleet: bool = False,
     can_stop_fleet: bool = False,
 ) -> dict[str, Any]:
-    """Return what GET /api/plant answers to a caller with this right."""
+    """Return the answer to GET /api/plant for a caller with this right."""
     is_writer = right is Right.WRITE
     return {
         "revision": revision,
         "version": version,
         "name": hub.plant.path.name,
         "demo": is_demo,
-        "file": has_file,  # that can be read again
-        "fleet": has_fleet,  # that /api/fleet tells of
-        "fleet_stop": can_stop_fleet,  # by /api/fleet/stop
-        "mistakes": list(mistakes),  # of the file, where the newest reload was refused
+        "file": has_file,  # a reload is possible
+        "fleet": has_fleet,  # /api/fleet is available
+        "fleet_stop": can_stop_fleet,  # /api/fleet/stop is available
+        "mistakes": list(mistakes),  # of the file, if the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),
             "write": sorted(may.write) if is_writer else [],
@@ -78,7 +78,7 @@ def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
 
 
 def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | None]:
-    """Return the registers that stand for all others: those that are polled first, and those that are not."""
+    """Return the register of frequency, current and setpoint; a polled one if there is one."""
     wanted = {"frequency": FREQUENCIES, "current": CURRENTS, "setpoint": (drive.setpoint_name,)}
     found: dict[str, str | None] = {}
     for name, registers in wanted.items():
@@ -88,7 +88,7 @@ def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | N
 
 
 def digits_of(register: Register[Any]) -> int | None:
-    """Return the digits behind the point; None where each value has its own, as of a float."""
+    """Return the digits after the decimal point; None if they vary by value, as of a float."""
     return None if register.is_float or register.scale_register else register.decimals
 
 
@@ -109,16 +109,16 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "note": register.note,
         "least": least,
         "most": most,
-        "at_least": register.at_least,  # registers whose values are limits too
+        "at_least": register.at_least,  # registers whose values are limits
         "at_most": register.at_most,
         "step": None if register.is_float else register.step,
     }
 
 
 def _span(register: Register[Any]) -> tuple[float | None, float | None]:
-    """Return the least and the largest value that may be written: the manual's, or else what fits.
+    """Return the least and largest writable value: the manual's range, or else that of the number format.
 
-    None: a float without a span, or named values.
+    None for a float without a range, and for named values.
     """
     if register.span is not None:
         return register.span

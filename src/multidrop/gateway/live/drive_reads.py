@@ -1,4 +1,4 @@
-"""Side reads: registers of one drive that are not polled, read one by one while somebody looks at them."""
+"""Reads in addition to polling: all registers of a viewed drive, and each drive's identity."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from typing import Any
 from multidrop import Bus, BusError, Drive, NoReply, Plant, WriteForbidden
 from multidrop.supervisor import supervisor
 
-PAUSE_S = 0.2  # between two reads on a line,
-SHARE = 20  # or so many times what the last one took, if that is more: the polling keeps the line
-LOOKED_S = 3.0  # after the last look nothing more is read
-MOST_DRIVES = 4  # that are looked at, at the same time
-READ_S = 30.0  # that one read may take
+PAUSE_S = 0.2  # between two reads on a line, to leave the line to polling
+SHARE = 20  # or this many times the duration of the last read, if longer
+LOOKED_S = 3.0  # reading stops this long after the last request for a drive
+MOST_DRIVES = 4  # drives read concurrently
+READ_S = 30.0  # time limit of one read
 
 UNANSWERED = "no reply"
 
-Found = dict[str, list[Any]]  # by register: value or null, UTC in ms, "ok" or the reason
+Found = dict[str, list[Any]]  # by register: value or None, UTC in ms, "ok" or the reason
 
 
 class SideReads:
-    """Reads of the drives that are looked at, one at a time on each line; `is_there` tells who answers."""
+    """Reads all registers of viewed drives, one read at a time per line.
+
+    `is_there` returns whether a drive answers.
+    """
 
     def __init__(
         self,
@@ -43,7 +46,7 @@ class SideReads:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def look(self, plant: Plant, name: str) -> Found:
-        """Return what was read of a drive so far, and read on. Raises ValueError for an unknown drive."""
+        """Return the values read so far, and keep reading. Raises ValueError for an unknown drive."""
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()
         found = self._found.setdefault(name, {})
@@ -56,18 +59,18 @@ class SideReads:
 
     @property
     def under_way(self) -> int:
-        """Return how many drives are read at present."""
+        """The number of drives being read."""
         return len(self._tasks)
 
     def begin_anew(self) -> None:
-        """End all reads: drives may be others now."""
+        """Cancel all reads: names may mean other drives now."""
         for task in self._tasks.values():
             task.cancel()
         self._tasks.clear()
         self._found.clear()
 
     async def close(self) -> None:
-        """Read no more."""
+        """Cancel all reads, and wait for their end."""
         tasks = [*self._tasks.values()]
         self.begin_anew()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -83,11 +86,11 @@ class SideReads:
                     async with turn:
                         await self._read_in_turn(line, drive, register)
                     if found.get(register, ["", 0, ""])[2].startswith(UNANSWERED):
-                        registers.remove(register)  # each would cost its time-out
+                        registers.remove(register)  # each attempt would cost a timeout
         finally:
             if self._tasks.get(drive.name) is asyncio.current_task():
                 del self._tasks[drive.name]
-                self._found.pop(drive.name, None)  # nobody is shown what nobody keeps up to date
+                self._found.pop(drive.name, None)  # stale values must not be shown
 
     async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
         begun = self._clock()
@@ -114,9 +117,9 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Identities:
-    """Asks the drives of the present plant one by one, each once while its port is open.
+    """Checks the identity of each drive once while its port is open, so that its first stop is sent at once.
 
-    `fail` is called while any other exception is handled.
+    `fail` is called inside the handler of an unexpected exception.
     """
 
     def __init__(
@@ -133,7 +136,7 @@ class Identities:
         self._refused: dict[str, str] = {}  # by drive, as it was logged
 
     async def run(self) -> None:
-        """Ask again and again: a drive may answer again, and a port may be opened again."""
+        """Repeat without end: a drive may answer again, and a port may be reopened."""
         while True:
             drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
             for line, drive in drives:
@@ -141,12 +144,12 @@ class Identities:
                     if self._is_there(drive.name) and not self._knows(line, drive):
                         await supervisor().within("identities", ASKED_S, partial(self._ask, line, drive))
                         await asyncio.sleep(PAUSE_S)
-                except Exception:  # whatever it is, polling and stops go on
+                except Exception:  # polling and stops continue after any failure
                     self._fail()
             await asyncio.sleep(ROUND_S)
 
     def _knows(self, line: str, drive: Drive) -> bool:
-        """Return True if a drive need not be asked, or has been removed."""
+        """Return True if the identity is known or the drive was removed."""
         try:
             return self._bus(line).knows_identity(drive)
         except ValueError:
@@ -159,5 +162,5 @@ class Identities:
             if self._refused.get(drive.name) != str(refusal):
                 _log.warning("%s", refusal)
             self._refused[drive.name] = str(refusal)
-        except (BusError, ValueError):  # it will be asked again, or it is no longer there
+        except (BusError, ValueError):  # retried later, or the drive was removed
             pass

@@ -1,7 +1,8 @@
-"""Frames: what all viewers see, made once for all of them, five times a second at most.
+"""Frames: the state of the plant for all viewers, made at most five times a second.
 
-A viewer asks for the next frame when it has the last one: nothing queues for one that is slow. It names the
-one that it has, and is sent what changed since that one while it is remembered.
+A viewer requests the next frame after the last one, so no queue builds up for a slow viewer. The request
+names the viewer's frame, and the answer has the changes since it, or the whole frame if that one is
+forgotten.
 """
 
 from __future__ import annotations
@@ -16,23 +17,22 @@ from typing import Any, NamedTuple
 
 from multidrop import WriteForbidden
 from multidrop.gateway.commands import MOST_AGE_S
-from multidrop.gateway.live.alarms import Alarms
+from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
-LEAST_S = 0.2  # between two frames, on the whole: the page draws no faster
-EARLY_S = 0.02  # by which one may come sooner after one that was late
-WAIT_S = 20.0  # for which a viewer waits for a frame
-MOST_VIEWERS = 200  # that wait at the same time
-WHOLE = -1  # the number of no frame: who has none is sent a whole one
-REMEMBERED = 6  # frames, the newest among them: a viewer may be a second behind
-LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
+LEAST_S = 0.2  # mean time between two frames
+EARLY_S = 0.02  # a frame may come this much earlier after a late one
+WAIT_S = 20.0  # longest wait for a frame
+MOST_VIEWERS = 200  # viewers waiting concurrently
+WHOLE = -1  # in a request: the viewer has no frame
+REMEMBERED = 6  # newest frames kept: a viewer may be a second behind
 
-Times = tuple[int, int]  # the same moment in UTC, and by CLOCK_MONOTONIC, both in ns
+Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 
 
 class Encoded(NamedTuple):
-    """A frame as it is sent, whole or as what changed since another one."""
+    """A frame as it is sent: whole, or the changes since another one."""
 
     n: int
     plain: bytes
@@ -49,7 +49,7 @@ def frame_of(
     revision: int,
     time_ns: int,
 ) -> dict[str, Any]:
-    """Return the frame of this moment; `stops` counts those that were called, by drive."""
+    """Return the present frame; `stops` counts the stops of each drive."""
     return {
         "n": n,
         "revision": revision,
@@ -69,7 +69,7 @@ def frame_of(
 
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
-    """Return what a frame says of a drive; of a value that is known now that and the place of its time."""
+    """Return a drive's part of the frame. A fresh value comes as a pair: value, index of its time."""
     shown = hub.seen(name)
     seen, answered_ns = hub.seen_at(name), hub.answered_ns(name)
     now = time_ns, hub.now_ns()
@@ -92,12 +92,12 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
 
 
 def _age_ms(now: Times, asked: Times) -> int:
-    """Return the longer time of two clocks: one may have been set back, and the other stops in a sleep."""
+    """Return the larger age in ms of two clocks: UTC may be set back, and the other one stops in a sleep."""
     return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
 
 
 class Places(dict[Times, int]):
-    """The places of times in a list without doubles: what was read by one request has one time."""
+    """Indexes of times in a list without duplicates: all values of one request have the same time."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = place = len(self)
@@ -107,7 +107,7 @@ class Places(dict[Times, int]):
 def _unknown(
     hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, now: Times
 ) -> tuple[Any, ...]:
-    """Return null, place of its time, status of what is not known now, and the last value and its time."""
+    """Return None, index of its time, and status of a missing value; then the last value and its time."""
     if newest is None:
         return None, places[now], "not asked yet"
     last = () if good is None else (_finite(good[2]), places[good[:2]])
@@ -121,9 +121,9 @@ def _finite(value: float) -> float | None:
 
 
 def lost_of(hub: Hub, line: str) -> str | None:
-    """Return the reason why a line is not there, where all its newest rows say so; None otherwise.
+    """Return why a line's port is lost, if all its newest rows say so; None otherwise.
 
-    Of a port that could not be opened it is what the system said.
+    If the port could not be opened, the reason is the system's message.
     """
     statuses = set()
     for polled in hub.plant.find_line(line).drives:
@@ -138,9 +138,9 @@ def lost_of(hub: Hub, line: str) -> str | None:
 
 
 def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return those keys of `now` whose values are others than in `before`, which has the same keys.
+    """Return the keys of `now` whose values differ from `before`, which has the same keys.
 
-    Of an object in an object it is again those that changed; anything else is there as a whole.
+    Nested objects are compared in the same way.
     """
     return {
         key: changes(before[key], value) if isinstance(value, dict) else value
@@ -150,10 +150,10 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 
 
 class Frames:
-    """The newest frames, and those who wait for the next one.
+    """The newest frames and the viewers waiting for the next one.
 
-    `clock` gives monotonic seconds. Frames are numbered on from `begin`, so that none that a viewer has of an
-    earlier process is taken for one of ours.
+    `clock` returns monotonic seconds. Frame numbers start at `begin`, which is random: a frame of an earlier
+    process is never mistaken for one of this process.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
-        self._encoded: dict[int, Encoded] = {}  # the newest, by the frame since which it tells
+        self._encoded: dict[int, Encoded] = {}  # the newest frame, by the frame it is relative to
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
@@ -173,11 +173,11 @@ class Frames:
 
     @property
     def viewers(self) -> int:
-        """Return how many wait at present."""
+        """The number of waiting viewers."""
         return len(self._waiting)
 
     def note_news(self) -> None:
-        """Tell that a frame of now would differ from the newest one."""
+        """Note that the state has changed since the newest frame."""
         self._has_news = True
         self._build_when_due()
 
@@ -195,10 +195,10 @@ class Frames:
         self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
-        """Return a frame other than the n-th as soon as there is one; None after 20 s without one.
+        """Return a frame other than the n-th as soon as there is one; None after WAIT_S without one.
 
-        Where the n-th is remembered, that is what changed since then. Raises OverflowError when too many
-        wait already.
+        It has only the changes if the n-th is still remembered. Raises OverflowError if too many viewers
+        wait.
         """
         if self._has_news and self._clock() >= self._due:
             self._build()
@@ -212,7 +212,7 @@ class Frames:
         turn: asyncio.Future[None] = loop.create_future()
         self._waiting.add(turn)
         self._build_when_due()
-        timer = loop.call_later(WAIT_S, _let_go, turn)  # wait_for would take more turns of the loop
+        timer = loop.call_later(WAIT_S, _let_go, turn)  # cheaper than wait_for
         try:
             await turn
         finally:
@@ -221,17 +221,17 @@ class Frames:
         return self._since(n)
 
     def close(self) -> None:
-        """Let all waiting viewers go, without a frame."""
+        """Answer all waiting viewers without a frame."""
         self._is_closed = True
         self._wake()
 
     def _since(self, n: int) -> Encoded | None:
-        """Return the newest frame for one who has the n-th; None where that is the newest."""
+        """Return the newest frame relative to the n-th; None if the n-th is the newest."""
         if not self._remembered or self._remembered[-1]["n"] == n:
             return None
         newest = self._remembered[-1]
         known = next((one for one in self._remembered if one["n"] == n), None)
-        if known is None or known["revision"] != newest["revision"]:  # another plant has other keys
+        if known is None or known["revision"] != newest["revision"]:  # another plant with other keys
             n, known = WHOLE, None
         if n not in self._encoded:
             told = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}
@@ -264,22 +264,26 @@ ANOTHER_PLANT = "the plant was read anew"
 
 
 class SeenFrames:
-    """The frames of the last seconds, and the commands that named them.
+    """Protects commands over HTTP from networks that delay or repeat them.
 
-    `clock` gives ns, and runs on while the machine sleeps. `stopped_ns` returns when the latest stop of a
-    drive was called, by that clock; None without one.
+    A write, or a verb that may move a motor, names the newest frame that its sender has seen. It is sent
+    once, within MOST_AGE_S of that frame, and only if no stop and no reload came after it. Clocks of other
+    machines play no role.
+
+    `clock` returns ns and includes sleep. `stopped_ns` returns when a drive's latest stop was called, by that
+    clock; None without one.
     """
 
     def __init__(self, clock: Callable[[], int], stopped_ns: Callable[[str], int | None]) -> None:
         self.clock = clock
         self._stopped_ns = stopped_ns
-        self._made: dict[int, int] = {}  # when, by the frame's number
-        self._came: dict[int, set[object]] = {}  # commands, by the frame that they named
+        self._made: dict[int, int] = {}  # time of each frame by number
+        self._came: dict[int, set[object]] = {}  # commands by the frame that they named
         self._newest = -1
-        self._newest_before = -1  # the last one that showed another plant
+        self._newest_before = -1  # the last frame before the latest reload
 
     def note(self, n: int) -> None:
-        """Note that a frame of this number is made now."""
+        """Note that the frame of this number is made now."""
         now_ns = self.clock()
         self._newest, self._made[n] = n, now_ns
         for old in [one for one, made_ns in self._made.items() if now_ns - made_ns > MOST_AGE_NS]:
@@ -287,34 +291,28 @@ class SeenFrames:
             self._came.pop(old, None)
 
     def begin_anew(self) -> None:
-        """Note that there is another plant: a name of a frame before may be another drive's now."""
+        """Note a reload: a name in an earlier frame may mean another drive now."""
         self._newest_before = self._newest
 
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
-        """Return until when a command may be sent whose sender had seen this frame, by the clock.
+        """Return the time in ns until which a command may be sent if its sender has seen this frame.
 
-        Raises WriteForbidden where it may not, and when the same command names the same frame again.
+        Raises WriteForbidden if it is too late or a repetition.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS
         if made_ns is None or self.clock() > until_ns:
-            last = f"frame {seen} is none of the last {MOST_AGE_S:g} s"
-            raise WriteForbidden(
-                f"{what} was not sent: {last}: look again, and confirm it anew", rule=TOO_LATE
-            )
+            last = f"frame {seen} is not from the last {MOST_AGE_S:g} s"
+            raise WriteForbidden(f"{what} was not sent: {last}: check and confirm again", rule=TOO_LATE)
         if seen <= self._newest_before:
-            since = f"the plant was read anew after frame {seen}"
-            raise WriteForbidden(
-                f"{what} was not sent: {since}: look again, and confirm it anew", rule=ANOTHER_PLANT
-            )
+            since = f"the plant file was reloaded after frame {seen}"
+            raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=ANOTHER_PLANT)
         if (self._stopped_ns(drive) or 0) >= made_ns:
             since = f"a stop was called after frame {seen}"
-            raise WriteForbidden(
-                f"{what} was not sent: {since}: look again, and confirm it anew", rule=OVERTAKEN
-            )
+            raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=OVERTAKEN)
         came = self._came.setdefault(seen, set())
         if command in came:
-            first = "the first answer says what became of it"
-            raise WriteForbidden(f"{what} was not sent again: it came a second time; {first}", rule=DOUBLED)
+            first = "see the answer to the first request"
+            raise WriteForbidden(f"{what} was not sent again: it is a repetition; {first}", rule=DOUBLED)
         came.add(command)
         return until_ns

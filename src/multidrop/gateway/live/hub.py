@@ -1,4 +1,4 @@
-"""Hub: the newest row of every register of every drive, and what they say of the drive's state.
+"""Hub: the newest row of every register of every drive, and each drive's state from these rows.
 
 Pure: rows and times come in. Rows have times of CLOCK_MONOTONIC, which stands still while the machine sleeps:
 what was read before it slept is old when it wakes.
@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 from multidrop import Batch, Condition, Plant, PolledDrive, Register
 from multidrop.drive import FAULT_RECORDS, StateReader
 
-STALE_NS = 1_000_000_000  # a value is never stale before that,
-STALE_PERIODS = 3  # nor before so many of its periods have passed
+STALE_NS = 1_000_000_000  # a value stays current at least this long,
+STALE_PERIODS = 3  # and at least this many periods
 
-KeptRow = tuple[int, int, float, int]  # time, monotonic, value (of a miss without meaning), status
-Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good one, is it fresh
+KeptRow = tuple[int, int, float, int]  # time, monotonic time, value (meaningless in a miss), status
+Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good row, is it fresh
 
 
 class RegisterRows:
@@ -25,22 +25,22 @@ class RegisterRows:
     __slots__ = ("good", "intervals_ns", "least_ns", "newest", "since_ns")
 
     def __init__(self, least_ns: int, since_ns: int = 0) -> None:
-        self.since_ns = since_ns  # rows of before are another drive's, which had the name
+        self.since_ns = since_ns  # earlier rows belong to another drive of the same name
         self.newest: KeptRow | None = None
         self.good: KeptRow | None = None
-        self.least_ns = least_ns  # of its intervals, as planned
-        self.intervals_ns = 0, 0  # the latest two between samples with no miss between them
+        self.least_ns = least_ns  # planned interval
+        self.intervals_ns = 0, 0  # the latest two intervals between consecutive samples
 
     @property
     def holds_ns(self) -> int:
-        """The time for which its value is the present one.
+        """How long a value stays current.
 
-        Its line may be slower than planned; but one long interval is a pause, and not how often it is asked.
+        The line may be slower than planned. One long interval is only a pause: the shorter of two counts.
         """
         return max(STALE_NS, STALE_PERIODS * max(self.least_ns, min(self.intervals_ns)))
 
     def is_fresh(self, now_ns: int, woke_ns: int) -> bool:
-        """Return True while its newest value is the present one, and from after the machine woke."""
+        """Return True if the newest value is current and newer than the machine's last sleep."""
         if self.good is None or self.good[1] < woke_ns:
             return False
         age = now_ns - self.good[1]
@@ -48,7 +48,7 @@ class RegisterRows:
 
 
 class FreshValues(Mapping[str, float]):
-    """Values of one drive's registers that are young enough, looked up when they are asked for."""
+    """The fresh values of one drive's registers, evaluated on access."""
 
     def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int, woke_ns: int) -> None:
         self._cells = cells
@@ -75,10 +75,10 @@ class FreshValues(Mapping[str, float]):
 
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
-UNNAMED = "it shows a fault"  # whose code is not known
+UNNAMED = "it shows a fault"  # with an unknown code
 
-NOT_ASKED = "not asked recently"  # words of an unknown state: nothing is known of it at present,
-INCOMPLETE = "not all of it is known"  # or not all of what is polled is: a fault may be there all the same
+NOT_ASKED = "not asked recently"  # words of an unknown state: no fresh value at all,
+INCOMPLETE = "not all of it is known"  # or only some: there may be a fault nevertheless
 
 _STATES = {
     Condition.STOPPED: STANDS,
@@ -88,12 +88,12 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-LEAST_SLEEP_NS = 100_000_000  # less is two clocks that were not read at once
+LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between reading two clocks
 
 FAULT_REGISTER = "fault"
-RAN_NS = 3_000_000_000  # for which a motor must turn after its fault record changed, to have no fault
-_TURNING = ("output_frequency", "motor_speed")  # other than 0: the motor turns
-_ANSWERED = ("exception ", "no valid value")  # begin the statuses of misses that are replies all the same
+RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
+_TURNING = ("output_frequency", "motor_speed")  # the motor turns if one is not 0
+_ANSWERED = ("exception ", "no valid value")  # prefixes of statuses of misses with a reply
 
 
 class Newest(NamedTuple):
@@ -103,19 +103,19 @@ class Newest(NamedTuple):
     monotonic_ns: int
     value: float | None  # None: this row is a miss
     status: str  # "ok", or the reason
-    holds_ns: int  # for which a value of this register is the present one
+    holds_ns: int  # how long a value of this register stays current
 
 
 class Shown(NamedTuple):
-    """A drive's state in one of five words, and its fault, or why it is silent, in more."""
+    """A drive's state, one of five words, with the text of its fault or the reason of its silence."""
 
     state: str
     words: str | None
-    note: str = ""  # what else the drive says, or why its state is unknown
+    note: str = ""  # other information, or why the state is unknown
 
     @property
     def fault(self) -> str | None:
-        """The fault that the drive shows, in its own words; None where it shows none."""
+        """The text of the drive's fault; None without a fault."""
         return self.words if self.state == FAULT else None
 
     @property
@@ -124,7 +124,7 @@ class Shown(NamedTuple):
 
 
 class _Trip(NamedTuple):
-    """A fault that a drive told by a change of its fault record alone."""
+    """A fault that only a changed fault record shows."""
 
     words: str
     at_ns: int
@@ -135,16 +135,16 @@ class _Watched:
 
     def __init__(self, polled: PolledDrive, cycle_ns: int, since_ns: int) -> None:
         self.polled = polled
-        self.since_ns = since_ns  # it has been asked for no longer
+        self.since_ns = since_ns  # first request for this drive
         self.names = tuple(poll.register.name for poll in polled.polls)
-        self.cycle_ns = cycle_ns  # of its line, as planned
+        self.cycle_ns = cycle_ns  # planned cycle of its line
         self.reader = StateReader(polled.drive)
-        self.record: float | None = None  # of its newest fault
+        self.record: float | None = None  # fault record as last seen
         self.trip: _Trip | None = None
         self.cells: dict[str, RegisterRows] = {}
 
     def cell(self, register: str) -> RegisterRows:
-        """Return the cell of a register, which is new where it was not known."""
+        """Return the cell of a register; make it if it is new."""
         if register not in self.cells:
             every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
             least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
@@ -153,30 +153,29 @@ class _Watched:
 
 
 class Hub:
-    """The newest rows of a plant; `take` is given every batch.
+    """The newest rows of a plant; `take` receives every batch.
 
-    `clock` returns CLOCK_MONOTONIC, and for how long the machine slept so far, both in ns.
+    `clock` returns CLOCK_MONOTONIC and the total sleep of the machine, both in ns.
     """
 
     def __init__(self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0)) -> None:
         self.plant = plant
         self._clock = clock
         _, self._slept_ns = clock()
-        self._woke_ns = 0  # when a sleep was noticed, by the monotonic clock
-        self.time = 0  # of the newest row, UTC in ns
+        self._woke_ns = 0  # monotonic time at which a sleep was noticed
+        self.time = 0  # time of the newest row, UTC in ns
         self.taken = 0  # batches
         self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
-        self._cells: dict[int, RegisterRows | None] = {}  # by both codes; None: no drive of the plant
+        self._cells: dict[int, RegisterRows | None] = {}  # by drive and register code; None: not in the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Go on with another plant; what is known of drives that stay as they are is kept.
+        """Use another plant, and keep the rows of unchanged drives.
 
-        Rows that were asked for before and come later count for these alone: a name may be another's now.
-        `planned` is `plant.metadata()["planned"]`, for callers that have it: it takes seconds for hundreds
-        of lines.
+        Later rows of earlier requests count only for these, because a name may mean another drive now. Pass
+        `plant.metadata()["planned"]` as `planned` if you have it: it takes seconds for hundreds of lines.
         """
         before = self._watched
         since_ns = self._clock()[0] if before else 0
@@ -194,7 +193,7 @@ class Hub:
                 )
 
     def take(self, batch: Batch) -> None:
-        """Note the newest rows of a batch: about 1 us for each."""
+        """Note the newest rows of a batch; takes about 1 us per row."""
         columns = batch.columns()
         cells = self._cells
         self._statuses = columns.statuses
@@ -233,20 +232,20 @@ class Hub:
         return watched.cell(register) if watched else None
 
     def now_ns(self) -> int:
-        """Return the present time, as rows have it (CLOCK_MONOTONIC)."""
+        """Return the present time by the clock of rows, CLOCK_MONOTONIC."""
         return self._times()[0]
 
     def woke_ns(self) -> int:
-        """Return when the latest sleep of the machine was noticed (CLOCK_MONOTONIC); 0 without one.
+        """Return when the machine's latest sleep was noticed (CLOCK_MONOTONIC); 0 without one.
 
-        What was asked for before is no longer the present.
+        Values requested before are stale.
         """
         return self._times()[1]
 
     def _times(self) -> tuple[int, int]:
         """Return the present time, and when the latest sleep was noticed.
 
-        The clock is read at each look: this process may have stood still until just now.
+        The clock is read on each call because the process may have been suspended until now.
         """
         now_ns, slept_ns = self._clock()
         if slept_ns > self._slept_ns + LEAST_SLEEP_NS:
@@ -257,7 +256,7 @@ class Hub:
     # ---- values ----
 
     def newest(self, drive: str, register: str) -> Newest | None:
-        """Return the newest row, which may be a miss; None when it was never asked."""
+        """Return the newest row, which may be a miss; None before the first request."""
         watched = self._watched.get(drive)
         cell = watched.cells.get(register) if watched else None
         if cell is None or cell.newest is None:
@@ -267,12 +266,12 @@ class Hub:
         return Newest(time, monotonic_ns, good, self._statuses[status], cell.holds_ns)
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
-        """Return the registers of a drive that are polled, in the plant file's order."""
+        """Return a drive's polled registers in the plant file's order."""
         watched = self._watched.get(drive)
         return tuple(poll.register for poll in watched.polled.polls) if watched else ()
 
     def holds_s(self, drive: str, register: str) -> float | None:
-        """Return for how long a value is the present one, in s; None where it is not polled."""
+        """Return how long a value stays current, in s; None for a register that is not polled."""
         watched = self._watched[drive]
         return watched.cell(register).holds_ns / 1e9 if register in watched.names else None
 
@@ -282,7 +281,7 @@ class Hub:
         return iter(self._watched)
 
     def known(self, drive: str) -> Iterator[Known]:
-        """Yield what is known of each polled register of a drive, in the plant file's order."""
+        """Yield the rows of each polled register of a drive, in the plant file's order."""
         watched = self._watched.get(drive)
         if watched is None:
             return
@@ -296,40 +295,40 @@ class Hub:
                 yield name, cell.newest, cell.good, cell.is_fresh(now_ns, woke_ns)
 
     def status(self, code: int) -> str:
-        """Return the words of a row's status."""
+        """Return the text of a row's status code."""
         return self._statuses[code]
 
     def answered_ns(self, drive: str) -> int | None:
-        """Return when its newest value was asked for, by the monotonic clock; None: it never answered."""
+        """Return the monotonic time of the request of a drive's newest value; None if it never answered."""
         watched = self._watched.get(drive)
         cells = watched.cells.values() if watched else ()
         return max([cell.good[1] for cell in cells if cell.good], default=None)
 
     def seen_at(self, drive: str) -> int | None:
-        """Return when the newest value of a drive was asked for, UTC in ns; None: it never answered."""
+        """Return the UTC time in ns of the request of a drive's newest value; None if it never answered."""
         watched = self._watched.get(drive)
         cells = watched.cells.values() if watched else ()
         return max([cell.good[0] for cell in cells if cell.good], default=None)
 
-    # ---- what they say of the drive ----
+    # ---- states ----
 
     def state(self, drive: str) -> str:
         """Return "runs", "stands", "fault", "silent" or "unknown"."""
         return self.seen(drive).state
 
     def seen(self, drive: str) -> Shown:
-        """Return a drive's state, with its fault or the reason why it is silent."""
+        """Return a drive's state with its fault or the reason of its silence."""
         watched = self._watched.get(drive)
         return Shown(UNKNOWN, None) if watched is None else self._look(watched)
 
     def is_set_to_zero(self, drive: str) -> bool:
-        """Return True if a drive's setpoint is known to be 0: its motor may stand though it runs."""
+        """Return True if a drive's setpoint is known to be 0: its motor may be at rest during a run."""
         watched = self._watched[drive]
         setpoint = watched.polled.drive.setpoint_name
         return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
 
     def note_reset(self, drive: str) -> None:
-        """Forget the fault that a drive's record told: it was reset."""
+        """Forget a fault known from the drive's fault record: it was reset."""
         watched = self._watched.get(drive)
         if watched is not None:
             _forget_trip(watched)
@@ -364,7 +363,7 @@ class Hub:
         return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.names) else None, note)
 
     def _unseen(self, watched: _Watched) -> Shown:
-        """Tell a silent drive from one that refuses, and from one that was not asked recent."""
+        """Return the state of a drive without fresh values: silent, refusing, or not asked recently."""
         polls = watched.polled.polls
         newest = [
             cell.newest for poll in polls if (cell := watched.cells.get(poll.register.name)) and cell.newest
@@ -380,7 +379,7 @@ class Hub:
 
 
 def _lack(watched: _Watched) -> str:
-    """Return the reason why a drive's state cannot be worked out."""
+    """Return the reason why a drive's state is unknown."""
     reader = watched.reader
     if not reader.has_state:
         return "its family has no register for its state"
@@ -390,7 +389,7 @@ def _lack(watched: _Watched) -> str:
 
 
 def _look_for_trip(watched: _Watched) -> None:
-    """Note a fault that the drive's record tells by a change; a record from before polling may be past."""
+    """Note a fault shown by a change of the fault record; a record from before polling may be old."""
     name = next((name for name in FAULT_RECORDS if name in watched.names), "")
     cell = watched.cells.get(name)
     if cell is None or cell.good is None:
@@ -403,18 +402,18 @@ def _look_for_trip(watched: _Watched) -> None:
 
 
 def _turns_since(watched: _Watched, since_ns: int) -> bool:
-    """Return True if all that tells that the motor turns was asked for after this time."""
+    """Return True if all values that show a turning motor were requested after this time."""
     cells = [cell for name in ("status", *_TURNING) if (cell := watched.cells.get(name)) and cell.good]
     return all(cell.good[1] > since_ns for cell in cells if cell.good)
 
 
 def _forget_trip(watched: _Watched) -> None:
     watched.trip = None
-    watched.reader = StateReader(watched.polled.drive)  # what it noted of the record is old too
+    watched.reader = StateReader(watched.polled.drive)  # the old one remembers the record
 
 
 def _words(register: Register[Any], value: float) -> str:
-    """Return a value in words, or the number that it is with its register's name."""
+    """Return a value as text: its name, or the number with its register's name."""
     if register.values is not None:
         return register.in_words(register.decode(value))
     return f"{register.name.replace('_', ' ')}: {register.format(value)}"

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from multidrop import Plant, PlantLine
 from multidrop.transport import LineStatistics, Statistics
 
-SECONDS = 5.0  # over which a line's use is taken, and between two readings of the last minute's figures
+SECONDS = 5.0  # averaging time of a line's use, and refresh interval of the last minute's figures
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]
@@ -18,22 +18,22 @@ T = TypeVar("T", float, int)
 
 
 class RecentStatistics:
-    """Readings of a poller's statistics, about one a second."""
+    """The recent readings of a poller's statistics; `tick` adds one about every second."""
 
     def __init__(self, plant: Plant) -> None:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
-        self._minute: dict[str, LineStatistics | None] = {}  # the last one, of each line
-        self._due = 0.0  # when it is taken anew
+        self._minute: dict[str, LineStatistics | None] = {}  # of each line over the last minute
+        self._due = 0.0  # when they are refreshed
         self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
-        self._figures: dict[str, dict[str, Any]] = {}  # of the lines, as of the newest reading
-        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # the newest: one takes much memory
-        self._hours: dict[str, deque[dict[str, Any]]] = {}  # of whole minutes, by line
+        self._figures: dict[str, dict[str, Any]] = {}  # by line, from the newest reading
+        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # few, because a reading is large
+        self._hours: dict[str, deque[dict[str, Any]]] = {}  # figures of whole minutes by line
         self._lines: Mapping[str, PlantLine] = {}
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Take what is planned from another plant, and forget readings of lines that count anew."""
+        """Use the plan of another plant, and forget readings of lines whose counters start again."""
         before, self._lines = self._lines, {line.name: line for line in plant.lines}
         goes_on = {
             name for name, line in self._lines.items() if name in before and _counts_on(before[name], line)
@@ -49,7 +49,7 @@ class RecentStatistics:
         self._figures = {name: self._line_figures(name, minute) for name, minute in self._minute.items()}
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
-        """Take a reading; `now` is of the monotonic clock, in s."""
+        """Add a reading; `now` is monotonic time in s."""
         self.newest = reading
         self._recent.append((now, reading))
         while now - self._recent[0][0] > SECONDS:
@@ -70,7 +70,7 @@ class RecentStatistics:
         self._figures = {line: self._line_figures(line, minute) for line, minute in self._minute.items()}
 
     def line(self, name: str) -> dict[str, Any]:
-        """Return a line's use, as measured and as planned, its rate, and the misses of the last minute."""
+        """Return a line's measured and planned use, its rate, and the last minute's misses."""
         return self._figures.get(name) or self._line_figures(name, None)
 
     def _line_figures(self, name: str, minute: LineStatistics | None) -> dict[str, Any]:
@@ -84,7 +84,7 @@ class RecentStatistics:
         }
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
-        """Return the used share of a line's time and its exchanges a second, recent."""
+        """Return the used share of a line's time and its exchanges per second, over SECONDS."""
         before = self._recent[0][1].get(name) if self._recent else None
         now = self.newest.get(name)
         if before is None or now is None or before is now or before.epoch != now.epoch:
@@ -94,11 +94,11 @@ class RecentStatistics:
         return round(used_s / seconds, 4), round((now.exchanges - before.exchanges) / seconds, 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
-        """Return the share that was missed in the last minute, and the delay of a drive."""
+        """Return a drive's share of misses in the last minute, and its response delay."""
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:
-        """Return a line's statistics over the last one to two minutes."""
+        """Return a line's statistics over one to two minutes."""
         earlier = self._minutes[max(-2, -len(self._minutes))][1] if self._minutes else {}
         return self._since(earlier, line)
 
@@ -109,23 +109,23 @@ class RecentStatistics:
         return now.since(earlier[name])
 
     def drive(self, line: str, name: str) -> Statistics | None:
-        """Return a drive's statistics since polling began; None for one that is not there."""
+        """Return a drive's statistics since polling started; None for an unknown drive."""
         found = self.newest.get(line)
         return found.drives.get(name) if found else None
 
     def hour(self, line: str) -> list[dict[str, Any]]:
-        """Return what was asked, and misses by reason, in each of the last 60 minutes, the oldest first."""
+        """Return the requested values, and misses by reason, of each of the last 60 minutes, oldest first."""
         return [*self._hours.get(line, ()), *self._this_minute(line)][-MINUTES:]
 
     def _this_minute(self, line: str) -> list[dict[str, Any]]:
-        """Return the figures since the newest minute began; none where it has just begun."""
+        """Return the figures of the current minute; an empty list if it has just started."""
         begin_ms, before = self._minutes[-1] if self._minutes else (0, {})
         minute = self._since(before, line)
         return [{"time": begin_ms, "asked": asked_of(minute), "misses": misses_of(minute)}] if minute else []
 
 
 def _counts_on(before: PlantLine, line: PlantLine) -> bool:
-    """Return True where port and drives are the same ones: their counts go on."""
+    """Return True if port and drives are the same: their counters continue."""
     drives = [[polled.drive for polled in one.drives] for one in (before, line)]
     is_same = len(drives[0]) == len(drives[1]) and all(a is b for a, b in zip(*drives, strict=True))
     return is_same and replace(before, drives=()) == replace(line, drives=())
@@ -142,12 +142,12 @@ def _of_lines(reading: Reading, names: set[str]) -> Reading:
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:
-    """Return the misses by reason; reasons without a miss are left out."""
+    """Return the misses by reason, without reasons that have none."""
     return {why: n for why, n in statistics.misses.items() if n > 0}
 
 
 def asked_of(statistics: Statistics) -> int:
-    """Return the number of values that came or were missed."""
+    """Return the number of requested values, received or missed."""
     return statistics.samples + sum(statistics.misses.values())
 
 
@@ -160,6 +160,6 @@ def _of_minute(statistics: Statistics) -> dict[str, Any]:
 
 
 def _p99(statistics: Statistics) -> float | None:
-    """Return the 99th percentile of the response delays in ms; None where nothing replied."""
+    """Return the 99th percentile of the response delays in ms; None without replies."""
     delays = statistics.delays
     return round(delays.p99 * 1e3, 3) if delays.replies else None

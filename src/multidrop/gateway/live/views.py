@@ -1,4 +1,4 @@
-"""Views: what pages and probes are told of a gateway, made when they ask."""
+"""Views of a gateway for pages and probes, made on request: one drive, lines, health and metrics."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from multidrop.transport import Statistics
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
-LEDGER_S = 6.0  # that the ledger may take: it waits 5 s for a lock
+LEDGER_S = 6.0  # time limit for the EEPROM ledger, which waits 5 s for a lock
 
 
-async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
-    """Return what the page shows of one drive alone. Raises ValueError for an unknown one."""
+async def drive_view(gateway: Gateway, name: str) -> dict[str, Any]:
+    """Return the details of one drive. Raises ValueError for an unknown drive."""
     name = drive_meant(name, drives_of(gateway.plant))
     line, drive = gateway.plant.find_drive(name)
     bus = gateway.poller.buses.get(line.name) if gateway.poller else None
@@ -57,21 +57,21 @@ def _delays(statistics: Statistics | None) -> dict[str, Any] | None:
 
 
 def _usual_delays(statistics: Statistics) -> dict[str, float | None]:
-    """Return the median and the 99th percentile of the response delays, in ms; None where nothing replied."""
+    """Return the median and the 99th percentile of the response delays in ms; None without replies."""
     delays = statistics.delays
     quantiles = {"p50": delays.p50, "p99": delays.p99}
     return {name: round(s * 1e3, 3) if delays.replies else None for name, s in quantiles.items()}
 
 
 async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
-    """Return the wear, or none if the ledger's file is locked for long, or its disk does not answer."""
+    """Return the EEPROM wear; an empty list if the ledger's file is locked or its disk hangs."""
     with contextlib.suppress(Hung):
         return await supervisor().within("ledger", LEDGER_S, partial(_wear, ledger, port, drive))
     return []
 
 
 def _wear(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
-    """Return the writes of a year to each cell of a drive's EEPROM, and how many it may have."""
+    """Return this year's writes to each cell of a drive's EEPROM, and the yearly budget."""
     with contextlib.suppress(OSError):
         book = ledger.at(port)
         return [
@@ -86,8 +86,8 @@ def _wear(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
     return []
 
 
-def look_at_lines(gateway: Gateway) -> dict[str, Any]:
-    """Return what the page shows of the lines alone."""
+def line_views(gateway: Gateway) -> dict[str, Any]:
+    """Return the details of all lines."""
     return {
         line.name: {
             "lost": lost_of(gateway.hub, line.name),
@@ -102,9 +102,9 @@ def look_at_lines(gateway: Gateway) -> dict[str, Any]:
 
 
 def health_of(gateway: Gateway) -> dict[str, Any]:
-    """Return how all is, by line and by part: "ok", "degraded", or "failed".
+    """Return the health as "ok", "degraded" or "failed", with details by line and part.
 
-    It has failed if nothing is polled, or if a task or a thread that must go on has ended.
+    "failed" means that no rows arrive, or that a permanent task or thread has ended.
     """
     supervisor().look()
     dead, hung = supervisor().dead | gateway.parts.dead, supervisor().hung
@@ -135,11 +135,11 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def parts_of(gateway: Gateway) -> dict[str, str]:
-    """Return "ok" of each part, or what is not well with it."""
+    """Return "ok" or the problem of each part."""
     parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
-        | dict.fromkeys(parts.pending, "it is not there yet: its files do not answer")
+        | dict.fromkeys(parts.pending, "it is not ready: its files do not answer")
         | parts.dead
         | {name: why for name, why in dead.items() if name in parts.feeds}
         | ({"alarms": kept.trouble} if kept is not None and kept.trouble else {})
@@ -147,13 +147,13 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
 
 
 def failing_lines_of(gateway: Gateway) -> dict[str, str]:
-    """Return by name why a line is not polled at present: an exception, such as one of a user's class."""
+    """Return the lines whose polling raises an exception, for example in a user's class, and the reasons."""
     failures = {} if gateway.poller is None else gateway.poller.line_failures
     return {line: f"polling fails: {why}" for line, why in failures.items()}
 
 
 def audit_trouble_of(gateway: Gateway) -> str:
-    """Return why the newest write of a line is not in the audit log; "" is well."""
+    """Return why the newest write of a line is not in the audit log; "" if it is."""
     if gateway.unaudited:
         return gateway.unaudited
     poller = gateway.poller
@@ -163,7 +163,7 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 
 def troubles_of(gateway: Gateway) -> list[str]:
-    """Return a sentence for each thing beside the lines that is not well, for the page."""
+    """Return a sentence for each problem other than a lost line, for the page."""
     said = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
     said |= supervisor().hung | supervisor().dead
     said |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}
@@ -174,17 +174,17 @@ def troubles_of(gateway: Gateway) -> list[str]:
 def _health_of_part(feed: object) -> str:
     try:
         return str(getattr(feed, "health", str)()) or "ok"
-    except Exception as failure:  # it is not well then
+    except Exception as failure:  # also a problem of the part
         return f"{type(failure).__name__}: {failure}"
 
 
 def figures_of(gateway: Gateway) -> Figures:
-    """Return what the metrics say of the gateway itself."""
+    """Return the gateway's own metrics."""
     parts: list[MetricFamily] = []
     for feed in gateway.feeds.values():
         said = getattr(feed, "figures", None)
         if said is not None:
-            with contextlib.suppress(Exception):  # a part's failure hides its own figures alone
+            with contextlib.suppress(Exception):  # a failing part hides only its own figures
                 parts += said()
     dropped = gateway.poller.dropped if gateway.poller else 0
     failures = {name: gateway.failures.get(name, 0) for name in ("hub", *gateway.feeds)} | gateway.failures

@@ -1,7 +1,7 @@
-"""Modbus clients: the connections of Modbus TCP, on which requests come and answers go.
+"""Connections of Modbus TCP clients.
 
-What a client sent is read on whatever becomes of its answers: a stop waits neither for the requests before it
-nor until its client reads.
+Requests are always read, even if a client does not take its answers: a stop waits neither for earlier
+requests nor until its client reads.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from multidrop.gateway.modbus_server.protocol import (
 )
 from multidrop.supervisor import supervisor
 
-SLICE = 64  # requests of a client that are answered before others have their turn,
-SLICE_S = 0.002  # or so much time,
-ROUND_S = 0.004  # or their share of this, if many have requests to be looked at: a stop waits for a round
-MOST_CLIENTS = 64  # beside each other, on one TCP port
-MOST_BEHIND = 1 << 18  # bytes of requests of one client that wait for their turn
-MOST_UNTAKEN = 1 << 18  # bytes of answers that a client does not take
-MOST_UNDER_WAY = 16  # requests of one client that wait for a line
-IDLE_S = 300.0  # without a request, after which a client is let go
-FORGETTABLE_S = 10.0  # the same, where a new client finds no place
-STALLED_S = 10.0  # for which a client takes none of its answers
-SWEEP_S = 1.0  # between looks at all clients
+SLICE = 64  # requests of a client answered before others have their turn,
+SLICE_S = 0.002  # or this time,
+ROUND_S = 0.004  # or its share of this time among busy clients: a stop waits for one round
+MOST_CLIENTS = 64  # per TCP port
+MOST_BEHIND = 1 << 18  # bytes of pending requests of one client
+MOST_UNTAKEN = 1 << 18  # bytes of answers that a client has not read
+MOST_UNDER_WAY = 16  # requests of one client waiting for lines
+IDLE_S = 300.0  # idle clients are closed after this time,
+FORGETTABLE_S = 10.0  # or after this, if a new client needs the place
+STALLED_S = 10.0  # a client that reads none of its answers for this long is cut
+SWEEP_S = 1.0  # interval of checking all clients
 
 _log = logging.getLogger("multidrop.gateway")
 
 
-# The frame of the answer, at once or later; None: the connection is closed without one. What comes later is
-# cancelled when the client is gone: shield what must be done all the same.
+# The frame of the answer, at once or later; None closes the connection. A later answer is cancelled when the
+# client disconnects: shield work that must be finished.
 Answer = bytes | Awaitable[bytes] | None
 
 
 class ModbusClient(asyncio.Protocol):
-    """One connection: each request is answered under its own transaction id, whenever it is done.
+    """One connection. Each answer has the transaction id of its request and is sent when it is ready.
 
-    Requests that write are begun as they come, in their order; the others wait for their turn behind them.
+    Writes start on arrival, in their order; other requests wait for their turn.
     """
 
     def __init__(self, port: ModbusPort) -> None:
         self._port = port
-        self._came = bytearray()  # that was not looked at yet
-        self._waiting = bytearray()  # frames whose turn has not come
+        self._came = bytearray()  # received bytes, not parsed yet
+        self._waiting = bytearray()  # frames waiting for their turn
         self._under_way: set[asyncio.Future[bytes]] = set()
         self._is_draining = False
-        self._is_refused = False  # it sent what closes its connection
-        self._has_ended = False  # the client sends no more, and may still read
+        self._is_refused = False  # a request of it closes the connection
+        self._has_ended = False  # the client has closed its sending side, and may still read
         self._has_lost_answers = False
         self._stalled_since: float | None = None
         self.last_request = port.clock()
@@ -65,15 +65,15 @@ class ModbusClient(asyncio.Protocol):
 
     @property
     def is_full(self) -> bool:
-        """True while as many of its requests wait for lines as one client may have."""
+        """True while MOST_UNDER_WAY of its requests wait for lines."""
         return len(self._under_way) >= MOST_UNDER_WAY
 
     @property
     def is_idle(self) -> bool:
-        """True while nothing of it is under way."""
+        """True while no request is in progress."""
         return not self._under_way
 
-    # ---- what asyncio calls ----
+    # ---- called by asyncio ----
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
@@ -88,7 +88,7 @@ class ModbusClient(asyncio.Protocol):
         self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
-            asyncio.get_running_loop().call_soon(task.cancel)  # each has begun by then
+            asyncio.get_running_loop().call_soon(task.cancel)  # after each has started
 
     def data_received(self, data: bytes) -> None:
         if self._is_refused:
@@ -98,12 +98,12 @@ class ModbusClient(asyncio.Protocol):
             self._drain()
 
     def eof_received(self) -> bool:
-        """Keep the connection for the answers that are not given yet."""
+        """Keep the connection open for pending answers."""
         self._has_ended = True
         return bool(self._under_way or self._waiting or self._is_draining)
 
     def pause_writing(self) -> None:
-        """Let the requests wait of a client that does not take its answers; it is read on all the same."""
+        """Hold back the answers of a client that does not read them; keep reading its requests."""
         self._stalled_since = self._port.clock()
 
     def resume_writing(self) -> None:
@@ -114,7 +114,7 @@ class ModbusClient(asyncio.Protocol):
     # ---- requests and answers ----
 
     def _drain(self) -> None:
-        """Look at what came and answer some of it; let others have their turn before the rest."""
+        """Parse received bytes and answer some requests; continue after other clients' turns."""
         is_looked_at = self._look()
         self._is_draining = self._answer_some() or not is_looked_at
         self._port.share.note(self, is_busy=self._is_draining)
@@ -130,7 +130,7 @@ class ModbusClient(asyncio.Protocol):
         self._close_if_done()
 
     def _look(self) -> bool:
-        """Begin what writes and let the rest wait; return False where more of it is to be looked at."""
+        """Start writes and queue other requests; return False if received frames are left."""
         begun = self._port.clock()
         answers: list[bytes] = []
         is_in_time = True
@@ -158,12 +158,12 @@ class ModbusClient(asyncio.Protocol):
             return None
 
     def _refuse(self) -> None:
-        """Take nothing more of this client."""
+        """Ignore all further requests of this client."""
         self._is_refused = True
         self._came.clear()
 
     def _answer_some(self) -> bool:
-        """Answer requests that wait; return True where more of them could be answered."""
+        """Answer pending requests; return True if more of them could be answered."""
         begun = self._port.clock()
         answers: list[bytes] = []
         for _ in range(SLICE):
@@ -177,7 +177,7 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._waiting) and self._stalled_since is None
 
     def _answered(self, request: MbapRequest) -> bytes:
-        """Return the answer to a request where it is known at once; b"" where it is not."""
+        """Return the answer to a request if it is known at once; b"" otherwise."""
         answer = self._port.serve(request, self)
         if isinstance(answer, bytes):
             return answer
@@ -207,33 +207,33 @@ class ModbusClient(asyncio.Protocol):
             self.close()
 
     def _write(self, data: bytes) -> None:
-        """Write answers, or give them up where the client has not taken many others."""
+        """Write answers, or drop them if the client has left too many unread."""
         if not data or self.transport is None or self.transport.is_closing():
             return
         if self._stalled_since is not None and self.transport.get_write_buffer_size() > MOST_UNTAKEN:
             if not self._has_lost_answers:
-                _log.warning("modbus client %s takes none of its answers; some are given up", self.address)
+                _log.warning("modbus client %s does not read its answers; some are dropped", self.address)
             self._has_lost_answers = True
             return
         self.transport.write(data)
 
     def close(self) -> None:
-        """Close this connection once all that was written to it has left."""
+        """Close this connection after all written answers are sent."""
         if self.transport is not None:
             self.transport.close()
 
     def abort(self) -> None:
-        """Cut this connection at once."""
+        """Close this connection at once."""
         if self.transport is not None:
             self.transport.abort()
 
     def stalled_for(self, now: float) -> float:
-        """Return for how many seconds it has taken none of its answers."""
+        """Return for how many seconds it has read none of its answers."""
         return 0.0 if self._stalled_since is None else now - self._stalled_since
 
 
 class RoundShare:
-    """The time of one round of the loop, divided among the clients of all ports that have requests left."""
+    """The time of one round of the loop, divided among the busy clients of all ports."""
 
     def __init__(self) -> None:
         self._busy: set[ModbusClient] = set()
@@ -246,7 +246,7 @@ class RoundShare:
 
     @property
     def slice_s(self) -> float:
-        """The seconds for which one client may be served at once."""
+        """The seconds for which one client may be served in a round."""
         return min(SLICE_S, ROUND_S / max(1, len(self._busy)))
 
 
@@ -257,8 +257,8 @@ async def _awaited(answer: Awaitable[bytes]) -> bytes:
 class ModbusPort:
     """One TCP port and its clients.
 
-    `serve` answers a request; `may_connect` says which addresses may come; `clock` is in seconds. Ports of
-    one server have the same `share`.
+    `serve` answers a request, `may_connect` returns whether an address is allowed, `clock` returns seconds.
+    All ports of a server have the same `share`.
     """
 
     def __init__(
@@ -277,14 +277,14 @@ class ModbusPort:
         self._server: asyncio.Server | None = None
 
     async def open(self, listener: Any) -> None:
-        """Begin to accept clients on a listening socket."""
+        """Accept clients on a listening socket."""
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
 
     def admit(self, client: ModbusClient) -> None:
-        """Take a new client in; one that has been idle for long makes place where there is none."""
+        """Accept a new client, or refuse it; if the port is full, close the longest idle client for it."""
         if not self._may_connect(client.address):
-            _log.warning("modbus client %s is refused: it is not among the clients", client.address)
+            _log.warning("modbus client %s is refused: its address is not in clients", client.address)
             self.refused += 1
             client.abort()
             return
@@ -305,11 +305,11 @@ class ModbusPort:
         return True
 
     def forget(self, client: ModbusClient) -> None:
-        """Remove a client that is gone."""
+        """Remove a disconnected client."""
         self.clients.discard(client)
 
     def sweep(self) -> None:
-        """Let go of clients that have been idle for long, or that take none of their answers."""
+        """Close clients that are idle too long or do not read their answers."""
         now = self.clock()
         for client in list(self.clients):
             if client.stalled_for(now) >= STALLED_S:
@@ -318,7 +318,7 @@ class ModbusPort:
                 client.close()
 
     def close(self) -> None:
-        """Listen no more, and cut all connections."""
+        """Stop listening, and close all connections at once."""
         if self._server is not None:
             self._server.close()
         for client in list(self.clients):

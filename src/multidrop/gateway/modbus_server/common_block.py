@@ -1,7 +1,7 @@
-"""Common block: what every drive says of itself at the same addresses in the same units, whatever its family.
+"""Common block: state, values and stop of every drive at the same addresses and in the same units.
 
-All numbers of two words have their high word first. A value is there only while it is fresh; what is not
-known has a count of its own, so that it never reads as 0.
+Numbers of two words have the high word first. A value that is not fresh reads as a reserved number, never as
+0.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from multidrop import PolledDrive, Register
 from multidrop.gateway.modbus_server.words import NewestRow, is_fresh
 
 COMMON_LENGTH = 16  # words of the block
-STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # words from its begin
+STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # offsets in words
 
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
-NO_NUMBER = -(1 << 31)  # 8000 0000H: it is not known, or does not fit
+NO_NUMBER = -(1 << 31)  # 8000 0000H: unknown, or out of range
 NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ms
 
 _PER_UNIT = 100
 
 
 class CommonSource(Protocol):
-    """The part of the hub that the block needs."""
+    """The methods of the hub that the block uses."""
 
     def newest(self, drive: str, register: str) -> NewestRow | None: ...
     def answered_ns(self, drive: str) -> int | None: ...
@@ -32,7 +32,7 @@ class CommonSource(Protocol):
 
 
 class CommonBlock:
-    """The block of one drive; its words are made of rows when they are asked for."""
+    """The block of one drive; its words are made on request."""
 
     def __init__(self, polled: PolledDrive) -> None:
         self._name = polled.drive.name
@@ -44,7 +44,7 @@ class CommonBlock:
         )
 
     def words(self, hub: CommonSource, now_ns: int) -> list[int]:
-        """Return the words of this moment."""
+        """Return the present words."""
         state, woke_ns = hub.state(self._name), hub.woke_ns()
         words = [0] * COMMON_LENGTH
         words[STATE] = STATES.get(state, 0)
@@ -58,12 +58,12 @@ class CommonBlock:
     def _fresh_value(
         self, hub: CommonSource, now_ns: int, woke_ns: int, name: str, unit: str | None
     ) -> float | None:
-        """Return the fresh value of a polled register, in this unit or its own; None where there is none."""
+        """Return the fresh value of a polled register in this unit (None: its own); None without one."""
         row = hub.newest(self._name, name) if (name, unit) in self._polled else None
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: CommonSource, now_ns: int, woke_ns: int, state: str) -> int:
-        """Return the drive's own number of the fault that it shows."""
+        """Return the drive's own number of its present fault."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
@@ -72,17 +72,17 @@ class CommonBlock:
         return int(value)
 
     def _age(self, hub: CommonSource, now_ns: int, woke_ns: int) -> int:
-        """Return the ms since the newest value of the drive was asked for."""
+        """Return the ms since the request of the drive's newest value."""
         newest = hub.answered_ns(self._name)
         if newest is None:
             return NEVER
-        if newest < woke_ns:  # nothing here counts the time for which the machine slept
+        if newest < woke_ns:  # the time asleep is unknown here
             return LONGEST_AGE
         return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
 
 
 def _units(register: Register[Any]) -> tuple[str | None, ...]:
-    """Return how its unit may be asked for; None, for whichever it is, gives no raw counts."""
+    """Return the units in which a register may be requested; None means any unit but raw counts."""
     is_raw = register.values is None and register.step is None
     return (register.value_unit,) if is_raw else (register.value_unit, None)
 

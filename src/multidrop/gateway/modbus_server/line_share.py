@@ -1,7 +1,7 @@
-"""Passing: the share of a line that clients of the Modbus server may use.
+"""LineShare: the share of a line's time that clients of the Modbus server may use.
 
-What is not in the cache is asked of the drive: one request at a time on each line, ahead of polling, for a
-fifth of the time at most. The time is measured, so a drive that is silent costs its clients their share.
+Reads that the cache lacks are sent to the drive one at a time, ahead of polling, for a fifth of the line's
+time at most. The time is measured, so a silent drive uses up its clients' share.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # of a line's time
-BURST_S = 0.2  # of line time that may be used at once after a rest
-MOST_WAITING = 8  # requests, on a line
-EXPIRY_S = 1.0  # after which a request that waits is not asked any more
+BURST_S = 0.2  # line time available at once after a pause
+MOST_WAITING = 8  # waiting requests per line
+EXPIRY_S = 1.0  # a waiting request is dropped after this time
 
 
 class PassingBusy(Exception):
-    """A request that is not asked: the queue is full, or its turn did not come in time."""
+    """A dropped request: the queue is full, or its turn did not come in time."""
 
 
 @dataclass(eq=False)
@@ -34,24 +34,24 @@ class _WaitingAsk:
 
 
 class LineShare:
-    """The requests of all clients to one line: one at a time, a share of its time, the first come first."""
+    """The requests of all clients to one line: one at a time, in order, within a share of its time."""
 
     def __init__(self, share: float = SHARE) -> None:
         self._loop = asyncio.get_running_loop()
         self._share = share
         self._waiting: list[_WaitingAsk] = []
         self._running: asyncio.Task[None] | None = None
-        self._left_s = BURST_S  # of line time; below 0 after one that took long
+        self._left_s = BURST_S  # available line time; negative after a long request
         self._filled = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
-        self.used_s = 0.0  # of line time so far
+        self.used_s = 0.0  # line time so far
         self.asked = 0
 
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:
-        """Queue work, which gets the seconds until it expires; the result is what it returns or raises.
+        """Queue work, which receives the seconds until its expiry; the future has its result.
 
-        Raises PassingBusy, or the result does, where its turn does not come. Where the queue is full, the
-        client that waits for most loses its last request to one that waits for fewer.
+        Raises PassingBusy, directly or in the future, if its turn does not come. If the queue is full, the
+        client with the most waiting requests loses its last one to a client with fewer.
         """
         if len(self._waiting) >= MOST_WAITING:
             self._make_place(client)
@@ -69,7 +69,7 @@ class LineShare:
         if most <= waiting[id(client)] + 1:
             raise PassingBusy(f"{len(self._waiting)} requests wait for this line already")
         last = next(asked for asked in reversed(self._waiting) if id(asked.client) == greediest)
-        self._refuse(last, "others wait for this line who have asked for less")
+        self._refuse(last, "other clients with fewer requests wait for this line")
 
     def _expire(self, asked: _WaitingAsk) -> None:
         if asked in self._waiting:
@@ -81,7 +81,7 @@ class LineShare:
             asked.answer.set_exception(PassingBusy(why))
 
     def _forget(self, asked: _WaitingAsk) -> None:
-        """Free the place of a request that is answered, or that lost its client."""
+        """Free the place of a request that is answered or whose client has disconnected."""
         if asked.timer is not None:
             asked.timer.cancel()
         if asked in self._waiting:
@@ -90,7 +90,7 @@ class LineShare:
     # ---- turns ----
 
     def _step(self) -> None:
-        """Begin the next one, now or when the line may be used again."""
+        """Start the next request, now or when line time is available."""
         if self._running is not None or not self._waiting:
             return
         now = self._loop.time()
@@ -111,7 +111,7 @@ class LineShare:
         self._filled = now
 
     async def _run(self, asked: _WaitingAsk) -> None:
-        """Ask, also to the end where the client goes meanwhile: the line is used until then."""
+        """Carry a request out, also if its client disconnects: the line is in use until its end."""
         begun = self._loop.time()
         try:
             result = await asked.work(asked.expires - begun)
@@ -130,9 +130,9 @@ class LineShare:
             self._step()
 
     def close(self) -> None:
-        """Ask no more; what is under way is no longer waited for."""
+        """Drop all waiting requests, and cancel the current one."""
         for asked in list(self._waiting):
-            self._refuse(asked, "the gateway ends")
+            self._refuse(asked, "the gateway is shutting down")
         if self._timer is not None:
             self._timer.cancel()
         if self._running is not None:

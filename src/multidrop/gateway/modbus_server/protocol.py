@@ -1,6 +1,7 @@
-"""MBAP: the frames of Modbus TCP.
+"""Modbus TCP: frames, request data and exception codes. Pure.
 
-Source: MODBUS Messaging on TCP/IP Implementation Guide V1.0b, section 3.1.3.
+Sources: MODBUS Messaging on TCP/IP Implementation Guide V1.0b, section 3.1.3 (frames); MODBUS Application
+Protocol Specification V1.1b3, sections 6 (requests) and 7 (exception codes).
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from multidrop.gateway.modbus_server.line_share import PassingBusy
 
 MOST_DATA = 253  # bytes of a function code and its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")
-_FUNCTION = _HEADER.size  # where the function code stands
+_FUNCTION = _HEADER.size  # offset of the function code
 
 
 class Garbage(ValueError):
-    """Bytes that are no header of Modbus TCP."""
+    """Bytes that cannot be a header of Modbus TCP."""
 
 
 class MbapRequest(NamedTuple):
@@ -45,7 +46,7 @@ class MbapRequest(NamedTuple):
     transaction: int
     unit: int
     function: int
-    data: bytes  # that follows the function code
+    data: bytes  # after the function code
 
     def reply(self, data: bytes) -> bytes:
         """Return the frame of a good reply."""
@@ -57,9 +58,9 @@ class MbapRequest(NamedTuple):
 
 
 def take_frame(buffer: bytearray) -> bytes | None:
-    """Take the first request's frame out of the bytes that came; None where it is not whole yet.
+    """Remove the first frame from the buffer and return it; None if it is incomplete.
 
-    Raises Garbage as soon as a header can be none: after it no frame's begin is known any more.
+    Raises Garbage for an invalid header: the start of the next frame is unknown then.
     """
     if len(buffer) >= 4 and buffer[2:4] != b"\0\0":
         raise Garbage(f"protocol id {int.from_bytes(buffer[2:4]):04X}H, and Modbus has 0")
@@ -87,7 +88,7 @@ def request_of(frame: bytes) -> MbapRequest:
 
 
 def take_request(buffer: bytearray) -> MbapRequest | None:
-    """Take the first request out of the bytes that came; None where it is not whole yet. Raises Garbage."""
+    """Remove the first request from the buffer and return it; None if it is incomplete. Raises Garbage."""
     frame = take_frame(buffer)
     return None if frame is None else request_of(frame)
 
@@ -106,14 +107,14 @@ class ModbusCode(IntEnum):
 
 
 class Declined(Exception):
-    """A request that is answered with an exception code."""
+    """A request to be answered with an exception code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code:02X}H")
         self.code = code
 
 
-# The first of these that an error is decides the code.
+# The first matching type decides the code.
 _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (PassingBusy, ModbusCode.BUSY),
     (Expired, ModbusCode.BUSY),
@@ -128,7 +129,7 @@ _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (NotVerified, ModbusCode.DEVICE_FAILURE),
     (ValueError, ModbusCode.ILLEGAL_VALUE),
 )
-# The same for refusals by the rule that they name.
+# Codes of refusals, by rule.
 _RULES: Mapping[str, ModbusCode] = {
     NOT_ALLOWED: ModbusCode.ILLEGAL_FUNCTION,
     NOT_LISTED: ModbusCode.ILLEGAL_ADDRESS,
@@ -137,7 +138,7 @@ _RULES: Mapping[str, ModbusCode] = {
 
 
 def code_of(error: BaseException | None) -> int:
-    """Return the exception code that tells a client of this error; a drive's own code as it came."""
+    """Return the exception code for an error; a drive's exception keeps its own code."""
     if isinstance(error, DriveException):
         return error.code if 1 <= error.code <= 0x7F else ModbusCode.DEVICE_FAILURE
     if isinstance(error, WriteForbidden) and (code := _RULES.get(error.rule)):
@@ -162,7 +163,7 @@ class WriteRequest(NamedTuple):
 
 
 def read_range(request: MbapRequest) -> range:
-    """Return the addresses that a request reads; raises Declined for what cannot be read."""
+    """Return the addresses that a request reads. Raises Declined for an invalid request."""
     if request.function not in MOST_READ:
         raise Declined(ModbusCode.ILLEGAL_FUNCTION)
     if len(request.data) != 4:
@@ -176,7 +177,7 @@ def read_range(request: MbapRequest) -> range:
 
 
 def reply_data(function: int, words: list[int]) -> bytes:
-    """Return a reply's data: words, or bits of which the first is the least significant of the first byte."""
+    """Return a reply's data: words, or bits packed from the least significant bit of the first byte."""
     if function in (3, 4):
         return struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     size = (len(words) + 7) // 8

@@ -1,6 +1,7 @@
-"""Modbus TCP server: what each request of a client reads or writes, and the answer to it.
+"""Modbus TCP server: answers the requests of clients such as SCADA systems.
 
-Reads come from polled rows where they can. A write is held to the rules of every way in; none starts a motor.
+Reads are answered from polled rows if possible. Writes obey the same rules as all commands; none starts a
+motor.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from multidrop.gateway.modbus_server.words import Lack
 from multidrop.gateway.parts import Ask, PartContext
 from multidrop.supervisor import supervisor
 
-STOP_WAIT_S = 0.4  # for which a stop's answer waits for the motor: less than clients wait for a reply
-MOST_STOPS = 8  # of one drive, under way; further requests are acknowledged alone
+STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
+MOST_STOPS = 8  # concurrent stops of a drive; further requests are only acknowledged
 
 Settings = ModbusSettings
 
@@ -46,7 +47,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class ModbusCommands(Protocol):
-    """The part of Commands that the server needs."""
+    """The methods of Commands that the server uses."""
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]: ...
     async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult: ...
@@ -54,17 +55,17 @@ class ModbusCommands(Protocol):
 
 
 def build(settings: ModbusSettings, context: PartContext) -> ModbusServer:
-    """Return the server as a part of the gateway, listening. Raises OSError where a port cannot be had."""
+    """Return the listening server. Raises OSError if a port cannot be opened."""
     server = ModbusServer(context.plant, context.hub, context.commands, settings, context.ask)
     server.listen()
     return server
 
 
 class ModbusServer:
-    """The Modbus TCP server of a plant: a port for all lines, and one for each that has its own.
+    """The Modbus TCP server of a plant: one port for all lines, and one for each line with its own.
 
-    `ask` reads past the cache: drive, function, start, count and the seconds until it expires; it gives the
-    words or bits. Raises ValueError, with all mistakes, where units clash.
+    `ask` reads words or bits from a drive: drive, function, start, count, expiry in s. Raises ValueError with
+    all mistakes if unit ids clash.
     """
 
     def __init__(
@@ -76,22 +77,22 @@ class ModbusServer:
         ask: Ask,
     ) -> None:
         self.settings = settings
-        self.answered: Counter[str] = Counter()  # requests, by what became of them
-        self.ports: dict[str, int] = {}  # numbers of the TCP ports, by line; MAIN: of all others
+        self.answered: Counter[str] = Counter()  # requests by kind of answer
+        self.ports: dict[str, int] = {}  # TCP port numbers by line; MAIN: all other lines
         self._hub = hub
         self._commands = commands
         self._ask = ask
         self._units = Units(plant, settings)
         self._role = Right[settings.may.upper()]
         self._shares: dict[str, LineShare] = {}
-        self._sockets: dict[str, Any] = {}  # that listen, by line
+        self._sockets: dict[str, Any] = {}  # listening sockets by line
         self._listening: list[ModbusPort] = []
-        self._stops: dict[str, set[asyncio.Task[int]]] = {}  # under way, by drive
+        self._stops: dict[str, set[asyncio.Task[int]]] = {}  # in progress, by drive
 
-    # ---- life ----
+    # ---- start and end ----
 
     def listen(self) -> None:
-        """Open all ports, or none. Raises OSError with the one that cannot be opened."""
+        """Open all ports, or none. Raises OSError for the first that cannot be opened."""
         for line, number in {MAIN: self.settings.port, **self.settings.ports}.items():
             try:
                 self._sockets[line] = listen(self.settings.host, number)
@@ -101,7 +102,7 @@ class ModbusServer:
             self.ports[line] = self._sockets[line].getsockname()[1]
 
     async def start(self) -> None:
-        """Begin to accept clients."""
+        """Accept clients."""
         if not self._sockets:
             self.listen()
         clock, share = asyncio.get_running_loop().time, RoundShare()
@@ -111,7 +112,7 @@ class ModbusServer:
             self._listening.append(port)
 
     async def run(self) -> None:
-        """Tend the clients until cancelled."""
+        """Close idle clients until cancelled."""
         if not self._listening:
             await self.start()
         while True:
@@ -120,7 +121,7 @@ class ModbusServer:
                 port.sweep()
 
     def take(self, batch: Batch) -> None:
-        """Do nothing: the hub has the rows already."""
+        """Ignore the batch: the hub has the rows."""
 
     def _close_sockets(self) -> None:
         for listener in self._sockets.values():
@@ -128,7 +129,7 @@ class ModbusServer:
         self._sockets, self.ports = {}, {}
 
     async def close(self) -> None:
-        """Listen no more and cut all connections; stops that are under way go on."""
+        """Close all sockets and connections; stops in progress continue."""
         for port in self._listening:
             port.close()
         for share in self._shares.values():
@@ -137,18 +138,18 @@ class ModbusServer:
         self._close_sockets()
 
     def adopt(self, plant: Plant) -> None:
-        """Go on with another plant; raises ValueError, and keeps the old one, where its units clash."""
+        """Use another plant. Raises ValueError, and keeps the old one, if its unit ids clash."""
         self._units = Units(plant, self.settings)
 
     @property
     def clients(self) -> int:
-        """Connections at present."""
+        """The number of connections."""
         return sum(len(port.clients) for port in self._listening)
 
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
-        """Answer a request of a client, at once or later; None for a broadcast, which nobody may send."""
+        """Answer a request, at once or later; None for a broadcast, which is forbidden."""
         if request.unit == 0:
             self.answered["broadcast"] += 1
             return None
@@ -166,9 +167,9 @@ class ModbusServer:
         return request.exception(code)
 
     async def _later(self, request: MbapRequest, task: asyncio.Task[int], wait_s: float | None) -> bytes:
-        """Return the answer to a command, which is done whether or not its client is still there."""
+        """Return the answer to a command, which continues even if its client disconnects."""
         done, _ = await asyncio.wait([task], timeout=wait_s)
-        code = task.result() if done else ModbusCode.ACKNOWLEDGE  # it goes on
+        code = task.result() if done else ModbusCode.ACKNOWLEDGE  # still in progress
         return self._exception(request, code) if code else request.reply(request.data[:4])
 
     # ---- reading ----
@@ -202,14 +203,14 @@ class ModbusServer:
     def _pass(
         self, unit: Unit, request: MbapRequest, addresses: range, lack: Lack, client: ModbusClient
     ) -> Awaitable[bytes]:
-        """Ask the drive itself, where the settings let a client do that."""
+        """Read from the drive itself, if the settings allow it."""
         passing = self.settings.passing
         if passing == "off" and lack is Lack.UNPOLLED:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "declared" and not unit.is_declared(request.function, addresses):
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "off" or self._hub.state(unit.drive.name) == "silent":
-            raise Declined(ModbusCode.NO_RESPONSE)  # polling will see it come back
+            raise Declined(ModbusCode.NO_RESPONSE)  # polling notices when it answers again
         if client.is_full:
             raise Declined(ModbusCode.BUSY)
         share = self._shares.get(unit.line)
@@ -235,14 +236,14 @@ class ModbusServer:
 
     def _write(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> Awaitable[bytes]:
         if self._role < Right.STOP:
-            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # read only, and says so
+            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # read only
         carrier, address, count, data = written = WRITES[request.function](request)
         common, register = self.settings.common_addresses, unit.writable(carrier, address)
         is_one = count == (register.words if register else 1)
         if not is_one and unit.has_stop_in(written, common.start + STOP):
-            with suppress(Declined):  # enough of them are under way
+            with suppress(Declined):  # too many are in progress already
                 self._begin_stop(unit, client)
-            raise Declined(ModbusCode.ILLEGAL_VALUE)  # what else it writes may start a motor
+            raise Declined(ModbusCode.ILLEGAL_VALUE)  # its other registers may start a motor
         if carrier is Carrier.WORD and address in common:
             if address != common.start + STOP:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)
@@ -266,7 +267,7 @@ class ModbusServer:
         return self._later(request, task, None)
 
     async def _write_one(self, unit: Unit, register: Register[Any], raw: float, caller: Caller) -> int:
-        """Write a register, and return 0 or the code that says why it was not done."""
+        """Write a register; return 0 or an exception code."""
         value = raw if register.values is not None else register.decode(raw)
         told = await self._commands.write(unit.drive.name, register.name, value, caller)
         self.answered["written" if told.is_done else "not written"] += 1
@@ -276,7 +277,7 @@ class ModbusServer:
         return self._later(request, self._begin_stop(unit, client), STOP_WAIT_S)
 
     def _begin_stop(self, unit: Unit, client: ModbusClient) -> asyncio.Task[int]:
-        """Begin a stop here and now, whatever else is under way, and whoever waits for its end."""
+        """Start a stop at once. Raises Declined if MOST_STOPS of this drive are in progress."""
         self.answered["stop"] += 1
         name = unit.drive.name
         under_way = self._stops.setdefault(name, set())

@@ -1,4 +1,4 @@
-"""Settings of the Modbus server: the table [serve.modbus] of a plant file, with all its mistakes."""
+"""The table [serve.modbus] of a plant file."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ ROLES = ("look", "stop", "write")
 
 @dataclass(frozen=True)
 class ModbusSettings:
-    """The table [serve.modbus] of a plant file. Raises ValueError, with a line for each mistake."""
+    """The settings of the Modbus server. Raises ValueError with a line for each mistake."""
 
     listen: str = "127.0.0.1:1502"
-    passing: str = "declared"  # what is asked of a drive where the cache has it not
-    units: Mapping[str, int] = field(default_factory=dict)  # by drive; else its address
-    ports: Mapping[str, int] = field(default_factory=dict)  # by line; else that of `listen`
-    may: str = "look"  # the role of all clients, which can show no token
-    clients: Sequence[str] = ()  # addresses and networks; none: this machine alone
+    passing: str = "declared"  # reads passed on to a drive if the cache lacks them
+    units: Mapping[str, int] = field(default_factory=dict)  # unit ids by drive; default: its address
+    ports: Mapping[str, int] = field(default_factory=dict)  # TCP ports by line; default: that of `listen`
+    may: str = "look"  # the role of all clients, because Modbus has no tokens
+    clients: Sequence[str] = ()  # allowed addresses and networks; empty: this machine only
     common: int = 0xF000  # address of the common block
 
     def __post_init__(self) -> None:
@@ -33,7 +33,7 @@ class ModbusSettings:
             raise ValueError("\n".join(wrong))
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each thing that does not fit this plant."""
+        """Return a sentence for each mistake regarding this plant."""
         try:
             Units(plant, self)
         except ValueError as mistakes:
@@ -47,7 +47,7 @@ class ModbusSettings:
 
     @property
     def port(self) -> int:
-        """The TCP port of all lines that have none of their own."""
+        """The TCP port of all lines without their own."""
         return int(self.listen.rpartition(":")[2])
 
     @property
@@ -56,7 +56,7 @@ class ModbusSettings:
         return range(self.common, self.common + COMMON_LENGTH)
 
     def may_connect(self, address: str) -> bool:
-        """Return True for the address of a client that may come."""
+        """Return True if a client at this address may connect."""
         host = ip_address(address.partition("%")[0])
         host = getattr(host, "ipv4_mapped", None) or host
         if not self.clients:
@@ -66,14 +66,14 @@ class ModbusSettings:
     def _mistakes(self) -> Iterator[str]:
         yield from self._listening_mistakes()
         if self.passing not in PASSING:
-            yield f"passing = {self.passing!r} is none of {', '.join(PASSING)}"
+            yield f"passing = {self.passing!r} is not one of {', '.join(PASSING)}"
         if self.may not in ROLES:
-            yield f"may = {self.may!r} is none of {', '.join(ROLES)}"
+            yield f"may = {self.may!r} is not one of {', '.join(ROLES)}"
         for drive, unit in self.units.items():
             if not _is_whole(unit, 1, 255):
-                yield f"units: {drive} = {unit!r} is no unit id from 1 to 247 (255 at most)"
+                yield f"units: {drive} = {unit!r} is not a unit id from 1 to 247 (255 at most)"
         if not _is_whole(self.common, 0, 0x10000 - COMMON_LENGTH):
-            yield f"common = {self.common!r} is no address from 0 to {0x10000 - COMMON_LENGTH:#X}"
+            yield f"common = {self.common!r} is not an address from 0 to {0x10000 - COMMON_LENGTH:#X}"
         for network in self.clients:
             if not _is_network(network):
                 yield f"clients: {network!r} is neither an address nor a network such as 10.0.0.0/24"
@@ -86,18 +86,18 @@ class ModbusSettings:
             yield f"listen = {self.listen!r} is not ADDRESS:PORT, such as 127.0.0.1:1502"
             return
         if int(port) > 65535:
-            yield f"listen = {self.listen!r}: a port is 1 to 65535"
+            yield f"listen = {self.listen!r}: a port is a number from 1 to 65535"
         if not is_loopback(host) and not self.clients:
             yield (
-                f"listen = {self.listen!r} lets other machines in, and Modbus knows no tokens: name "
-                'those that may come, such as clients = ["10.0.0.5", "10.0.1.0/24"]'
+                f"listen = {self.listen!r} is open to other machines, and Modbus has no tokens: list the "
+                'allowed clients, such as clients = ["10.0.0.5", "10.0.1.0/24"]'
             )
         owners = {int(port): "listen"} if int(port) else {}
         for line, number in self.ports.items():
             if not _is_whole(number, 0, 65535):
-                yield f"ports: {line} = {number!r} is no port from 1 to 65535"
+                yield f"ports: {line} = {number!r} is not a port from 1 to 65535"
             elif number in owners:
-                yield f"ports: {line} = {number} is that of {owners[number]} already"
+                yield f"ports: {line} = {number} is in use by {owners[number]}"
             elif number:
                 owners[number] = line
 

@@ -1,4 +1,4 @@
-"""Units: the unit id and TCP port under which Modbus clients reach each drive. Pure."""
+"""Unit ids: the number and TCP port by which Modbus clients address each drive. Pure."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from multidrop.gateway.modbus_server.common_block import CommonBlock
 from multidrop.gateway.modbus_server.protocol import WriteRequest
 from multidrop.gateway.modbus_server.words import DriveWords, reading_function
 
-MAIN = ""  # the TCP port of all lines that have none of their own
-UNITS = range(1, 248)  # 0 is a broadcast, and 248 to 255 are reserved
-LAST_UNIT = 255  # some devices have it all the same
+MAIN = ""  # key of the TCP port of all lines without their own
+UNITS = range(1, 248)  # 0 is a broadcast, 248 to 255 are reserved
+LAST_UNIT = 255  # used by some devices nevertheless
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
 _STOPS = ("stop", "coast", "emergency_stop")
 
 
 class StopWrite(NamedTuple):
-    """A write that is one of the drive's own ways to stop: its register and its count."""
+    """A write by which the drive's own verbs stop the motor: register name and raw count."""
 
     register: str
     raw: float
 
 
 class Unit:
-    """A drive as Modbus clients see it: what is there to read and to write, by address."""
+    """A drive as Modbus clients see it: readable and writable addresses."""
 
     def __init__(self, line: str, polled: PolledDrive) -> None:
         self.line = line
@@ -36,7 +36,7 @@ class Unit:
         self.words = DriveWords(polled)
         self.common = CommonBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
-        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # 0: by none
+        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # by function; 0: by none
         self._gaps: list[tuple[int, range]] = []
         self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
         for register in self.drive.registers.values():
@@ -59,17 +59,17 @@ class Unit:
             self._writable[table.carrier, register.address] = register
 
     def is_declared(self, function: int, addresses: range) -> bool:
-        """Return True where the family's document has all of these to be read."""
+        """Return True if the drive's manual declares all these addresses readable."""
         own = self._readable[function]
         gaps = [gap for code, gap in self._gaps if code == function]
         return all(at in own or any(at in gap for gap in gaps) for at in addresses)
 
     def writable(self, carrier: Carrier, address: int) -> Register[Any] | None:
-        """Return the register that begins at this address and may be written; None where there is none."""
+        """Return the writable register that starts at this address; None if there is none."""
         return self._writable.get((carrier, address))
 
     def has_stop_in(self, written: WriteRequest, common_stop: int) -> bool:
-        """Return True where a stop is among what a request writes, or is the common block's."""
+        """Return True if a request writes a stop: one of the drive's, or that of the common block."""
         carrier, start, size, data = written
         for at in range(size):
             if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
@@ -82,7 +82,7 @@ class Unit:
         return False
 
     def holding_addresses(self) -> set[int]:
-        """Return all addresses of words at which the family has something."""
+        """Return the addresses of all words of the family."""
         written = {
             at
             for register in self.drive.registers.values()
@@ -93,10 +93,10 @@ class Unit:
 
 
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
-    """Yield the first write of each verb that stops the motor, as the family's own scripts have it.
+    """Yield the first write of each stop verb of the family.
 
-    With it all others that the family calls harmless there, such as YD1000's 8000H; but for 0, which may be
-    no command at all.
+    Other counts that the register declares harmless are included, such as YD1000's 8000H, but not 0, which
+    may be no command.
     """
     for name in _STOPS:
         try:
@@ -112,7 +112,7 @@ def _stop_writes(drive: Any) -> Iterator[StopWrite]:
 
 
 class UnitSettings(Protocol):
-    """The part of the settings that the units need."""
+    """The settings that units use."""
 
     @property
     def units(self) -> Mapping[str, int]: ...
@@ -125,8 +125,8 @@ class UnitSettings(Protocol):
 class Units:
     """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
 
-    A line that has a port of its own is reached there alone. Raises ValueError with a sentence for each
-    mistake, in lines, where a unit id would be two drives' or the settings name what is not there.
+    A line with its own port is reached only there. Raises ValueError with a line for each mistake: unit ids
+    of two drives, or unknown names in the settings.
     """
 
     def __init__(self, plant: Plant, settings: UnitSettings) -> None:
@@ -142,7 +142,7 @@ class Units:
             raise ValueError("\n".join(wrong))
 
     def find(self, port: str, number: int) -> Unit | None:
-        """Return the unit of this number on a port; None where there is none."""
+        """Return the unit of this number on a port; None if there is none."""
         return self._units.get((port, number))
 
     def __iter__(self) -> Iterator[tuple[str, int, Unit]]:
@@ -160,7 +160,7 @@ def _by_port(plant: Plant, settings: UnitSettings) -> Mapping[str, Mapping[int, 
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
-    """Yield a sentence for each unit id of two drives, or of none, and one with the ids that are free."""
+    """Yield a sentence for each duplicate or invalid unit id, and one with the free ids."""
     where = "" if port == MAIN else f" on the port of line {port}"
     wrong: list[str] = []  # drives
     for number, found in sorted(units.items()):
@@ -175,8 +175,8 @@ def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
         free = [number for number in UNITS if number not in units]
         example = f'units = {{ "{wrong[0]}" = {free[0] if free else 1} }}'
         yield (
-            f"units gives a drive a number of its own, such as {example}, and ports gives a "
-            f"line a port of its own; free numbers{where}: {_ranges(free)}"
+            f"units gives a drive another number, such as {example}, and ports gives a line its own "
+            f"port; free numbers{where}: {_ranges(free)}"
         )
 
 
@@ -192,12 +192,12 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def _overlap(unit: Unit, settings: UnitSettings) -> Iterator[str]:
-    """Yield a sentence where the family has registers where the common block is."""
+    """Yield a sentence if the common block overlaps registers of the family."""
     own = sorted(unit.holding_addresses() & set(settings.common_addresses))
     if own:
         yield (
-            f"{unit.drive.name} has registers of its own at {own[0]:04X}H, where the common "
-            f"block is: give that another place, such as common = 0xE000"
+            f"{unit.drive.name} has registers at {own[0]:04X}H, in the range of the common block: move "
+            f"the block, such as common = 0xE000"
         )
 
 

@@ -1,10 +1,9 @@
-"""DriveWords: the words that a drive sent, made again from the values that were polled, or none.
+"""DriveWords: the words that a drive sent, computed from polled values.
 
-A row has a value in its unit; a Modbus client wants the count in the drive's words. A value is turned back
-only where one count alone has it: the count is packed and read again by the register's own coding. It must
-give this value, and its two neighbours must not. So some words are never made of values: a part of a word,
-what a scale register scales, `I8` and `U32_EITHER`, which leave bits open, and a float's zero, which has two
-signs.
+Rows have values in units and Modbus clients expect the drive's raw words. Batches have no raw words: they
+would cost every row 8 bytes. A word is computed only if it is certain: packing the value's count and decoding
+it again must give the value, and the neighbouring counts must not. Uncertain are parts of a word, registers
+with a scale register, `I8` and `U32_EITHER`, which leave bits open, and a float's zero, which has two signs.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ _FLOATS = {
     NumberFormat.F64: (">d", ">Q"),
 }
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
-MOST_KNOWN = 8192  # values whose data are remembered: drives of a family share their registers
-_MOST_EXACT = 1 << 53  # beyond it a float64 does not hold every whole number
+MOST_KNOWN = 8192  # cached values: drives of a family share their registers
+_MOST_EXACT = 1 << 53  # a float64 holds every whole number up to here
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 
 
 def reading_function(table: Table) -> int:
-    """Return the one of Modbus' functions 1 to 4 that reads a table; 0 where none does."""
+    """Return the Modbus function from 1 to 4 that reads a table; 0 if none does."""
     code = table.read or 0
     return code if code in _FUNCTIONS.get(table.carrier, ()) else 0
 
 
 class NewestRow(Protocol):
-    """The newest row of a register, as the hub has it."""
+    """The newest row of a register from the hub."""
 
     @property
     def monotonic_ns(self) -> int: ...
@@ -51,12 +50,12 @@ class NewestRow(Protocol):
 class Lack(Enum):
     """The reason why a range is not in the cache."""
 
-    UNPOLLED = "not polled, or its words cannot be told from its value"
-    STALE = "polled, and its newest row is a miss or old"
+    UNPOLLED = "not polled, or the words are uncertain"
+    STALE = "polled, but the newest row is a miss or old"
 
 
 def is_fresh(row: NewestRow | None, now_ns: int, since_ns: int = 0) -> bool:
-    """Return True for a row with a value that is not too old, nor from before `since_ns`."""
+    """Return True if a row has a current value that is not older than `since_ns`."""
     if row is None or row.value is None:
         return False
     return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
@@ -64,7 +63,7 @@ def is_fresh(row: NewestRow | None, now_ns: int, since_ns: int = 0) -> bool:
 
 @lru_cache(maxsize=MOST_KNOWN)
 def exact_data(register: Register[Any], value: float) -> bytes | None:
-    """Return the bytes that the drive sends for this value (coils: one byte, 0 or 1); None where in doubt."""
+    """Return the bytes that the drive sends for this value (a coil: one byte, 0 or 1); None if uncertain."""
     coding = register.coding
     if register.part is not None or register.scale_register or coding.number_format in _OPEN:
         return None
@@ -82,13 +81,13 @@ def exact_data(register: Register[Any], value: float) -> bytes | None:
         near = _neighbours(raw, coding.number_format)
         if any(float(coding.value_of(other)) == value for other in near):
             return None
-    except (ArithmeticError, ValueError, struct.error):  # a number that no count stands for
+    except (ArithmeticError, ValueError, struct.error):  # no count has this value
         return None
     return data
 
 
 def _nearest_count(register: Register[Any], value: float) -> float | None:
-    """Return the count whose value is nearest; None where others may have the same."""
+    """Return the count with the nearest value; None if others may have the same value."""
     multiplier, addend, divisor = register.coding.factors
     count = value if multiplier == divisor and not addend else (value * divisor - addend) / multiplier
     if register.coding.number_format not in _FLOATS:
@@ -96,11 +95,11 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
         return raw if abs(raw * multiplier) + abs(addend) <= _MOST_EXACT else None
     code, _ = _FLOATS[register.coding.number_format]
     held: float = struct.unpack(code, struct.pack(code, count))[0]
-    return held if held else None  # a zero has two signs, and its value none
+    return held if held else None  # the sign of a zero is unknown
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
-    """Return the next counts below and above: no other value is nearer."""
+    """Return the next counts below and above."""
     if number_format not in _FLOATS:
         return (raw - 1, raw + 1)
     as_float, as_bits = _FLOATS[number_format]
@@ -110,7 +109,7 @@ def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
 
 
 class _Place:
-    """A register at its addresses, and the words of its latest value."""
+    """A register with the words of its latest value."""
 
     __slots__ = ("_data", "_register", "_value", "name")
 
@@ -121,9 +120,9 @@ class _Place:
         self._data: bytes | None = None
 
     def word(self, row: NewestRow | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
-        """Return the word (coil: bit) that many addresses after its first, of its newest row; or the reason.
+        """Return the word (of a coil: the bit) at this offset in the newest row, or why there is none.
 
-        A row that is no value, too old, or from before `since_ns` gives none.
+        Misses, stale rows and rows older than `since_ns` have none.
         """
         if row is None or not is_fresh(row, now_ns, since_ns):
             return Lack.STALE
@@ -159,10 +158,9 @@ class DriveWords:
         now_ns: int,
         since_ns: int = 0,
     ) -> list[int] | Lack:
-        """Return the words or bits at these addresses, each of a fresh row; else why that cannot be.
+        """Return the words or bits at these addresses from fresh rows, or why that is impossible.
 
-        `newest` gives a register's newest row by its name, the same one throughout; rows before `since_ns` do
-        not count.
+        `newest` returns the newest row of a register by name. Rows older than `since_ns` do not count.
         """
         words: list[int] = []
         lacks: list[Lack] = []
@@ -186,7 +184,7 @@ class DriveWords:
 
 
 def _newest_word(found: list[tuple[NewestRow | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
-    """Return the word that the newest row gives; several registers may lie at one address."""
+    """Return the word of the newest row; several registers may share an address."""
     lack = Lack.STALE
     for row, place, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
         word = place.word(row, at, now_ns, since_ns)

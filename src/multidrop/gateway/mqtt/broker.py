@@ -1,4 +1,4 @@
-"""Broker: one connection to an MQTT broker, made again for as long as it takes."""
+"""Broker: one connection to an MQTT broker, re-established after each loss."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from urllib.parse import urlsplit
 from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
-MOST_UNDER_WAY = 64  # messages that were sent, and not acknowledged: two lines' drives go at once
-MOST_WAITING = 4096  # topics; more than any plant has
+MOST_UNDER_WAY = 64  # unacknowledged messages: enough for the drives of two lines
+MOST_WAITING = 4096  # topics, more than any plant has
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class Publication(NamedTuple):
-    """A topic, and a function that makes its message when it is sent."""
+    """A topic, and a function that makes its payload when it is sent."""
 
     topic: str
     make: Callable[[], bytes]
@@ -31,7 +31,7 @@ class Publication(NamedTuple):
 
 
 class Outbox:
-    """Messages that wait, one of each topic.
+    """Pending messages, one per topic, and a limited number of unacknowledged ones.
 
     `send` takes a message and returns its number, or None where it cannot be sent now.
     """
@@ -64,7 +64,7 @@ class Outbox:
             except Exception as failure:  # no broker takes this one; all others are sent
                 del self._waiting[topic]
                 self.dropped += 1
-                _log.warning("what was to be said on %.100r cannot be sent: %r", topic, failure)
+                _log.warning("the message on %.100r cannot be sent: %r", topic, failure)
                 continue
             if number is None:
                 return
@@ -73,12 +73,12 @@ class Outbox:
             self.sent += 1
 
     def acknowledge(self, numbers: Iterable[int]) -> None:
-        """Note that messages have arrived."""
+        """Note that the broker has received messages."""
         self._under_way.difference_update(numbers)
         self.flush()
 
     def forget(self) -> None:
-        """Drop all that waits: the connection is gone, and what comes next begins anew."""
+        """Drop all messages after a lost connection."""
         self.dropped += len(self._waiting) + len(self._under_way)
         self._waiting.clear()
         self._under_way.clear()
@@ -89,15 +89,15 @@ class Outbox:
 
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
-RETRY_S = (1, 30)  # before the first attempt to connect again, and at most
+RETRY_S = (1, 30)  # first and longest pause before reconnecting
 KEEP_ALIVE_S = 15
-FAREWELL_S = 1.0  # that the last messages may take
+FAREWELL_S = 1.0  # time limit for the last messages
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class Address(NamedTuple):
-    """A broker's address."""
+    """The address of a broker."""
 
     host: str
     port: int
@@ -105,7 +105,7 @@ class Address(NamedTuple):
 
 
 def parse_broker(text: str) -> Address:
-    """Return the parts of `mqtt://host:port`. Raises ValueError for anything else, without its password."""
+    """Return the parts of `mqtt://host:port`. Raises ValueError for anything else; a password is masked."""
     try:
         parts = urlsplit(text)
         port = parts.port
@@ -113,49 +113,51 @@ def parse_broker(text: str) -> Address:
         parts, port = urlsplit(""), None
     if "@" in text:
         raise ValueError(
-            f'broker = "{masked(text)}" comes with a login; write user = "name" and password = "FILE"'
+            f'broker = "{masked(text)}" has a login in it; write user = "name" and password = "FILE" instead'
         )
     is_plain = not (parts.path.strip("/") or parts.query or parts.fragment or parts.username)
     if parts.scheme not in PORTS or not parts.hostname or not is_plain:
-        raise ValueError(f'broker = "{text}" is no broker; write broker = "mqtt://broker:1883", or mqtts://')
+        raise ValueError(
+            f'broker = "{text}" is not a broker\'s URL; write broker = "mqtt://broker:1883", or mqtts://'
+        )
     return Address(parts.hostname, port or PORTS[parts.scheme], parts.scheme == "mqtts")
 
 
 class Login(NamedTuple):
-    """A user and his password, and the certificates by which the broker is known."""
+    """User name, password, and certificates that verify the broker."""
 
     user: str = ""
     password: str = ""
-    authorities: str | None = None  # a file; None: the system's
+    authorities: str | None = None  # file of certificates; None: the system's
 
 
 class Speaker(Protocol):
-    """The user of a connection: it has messages to send, and takes those that come. Called in the loop."""
+    """The user of a connection, which sends and receives its messages. Called in the loop."""
 
     def will(self) -> Publication:
-        """Return the message that the broker sends when this connection breaks."""
+        """Return the message that the broker publishes when this connection breaks."""
 
     def topics(self) -> list[tuple[str, int]]:
-        """Return the topics to listen to, with their QoS."""
+        """Return the topics to subscribe to, with their QoS."""
 
     def connected(self) -> None:
-        """Send what comes first on a new connection."""
+        """Send the first messages of a new connection."""
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         """Take a message."""
 
     def publish(self) -> None:
-        """Send what is new."""
+        """Send new values."""
 
     def pass_over(self) -> int:
-        """Return how many messages would be sent now, had the broker a connection."""
+        """Return how many messages `publish` would send now."""
 
     def leave(self) -> None:
-        """Send that there will be nothing more to say."""
+        """Send the last messages before a disconnect."""
 
 
 class Broker:
-    """The connection of a speaker. Paho's thread does the sending; nothing here waits for it."""
+    """The connection of a speaker. Paho's thread sends; no method but `close` waits for it."""
 
     def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
         from paho.mqtt.client import Client
@@ -168,24 +170,24 @@ class Broker:
         self._loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
         self.is_connected = False
-        self.failure = ""  # why the speaker cannot say anything now
+        self.failure = ""  # why the speaker cannot publish now
         self._client: Any = Client(CallbackAPIVersion.VERSION2, client_id=name, clean_session=True)
         self._client.reconnect_delay_set(*RETRY_S)
-        self._client.max_inflight_messages_set(0)  # the outbox has the bound
+        self._client.max_inflight_messages_set(0)  # the outbox sets the limit
         if login.user:
             self._client.username_pw_set(login.user, login.password or None)
         if address.is_tls:
             self._client.tls_set_context(ssl.create_default_context(cafile=login.authorities))
         self._client.on_connect = self._on_connect
-        self._client.on_connect_fail = lambda *_: self._call(self._failed, "it does not answer")
+        self._client.on_connect_fail = lambda *_: self._call(self._failed, "no answer")
         self._client.on_disconnect = lambda *given: self._call(self._lost, str(given[3]))
         self._client.on_publish = self._on_publish
         self._client.on_message = self._on_message
-        self._arrived: deque[int] = deque()  # numbers of messages that the loop does not know of yet
+        self._arrived: deque[int] = deque()  # numbers of acknowledged messages, for the loop
         self._why = ""
 
     def open(self) -> None:
-        """Begin to connect; every failure is followed by another attempt."""
+        """Start to connect, and retry after each failure."""
         self._loop = asyncio.get_running_loop()
         self._set_will()
         self._client.connect_async(self._address.host, self._address.port, KEEP_ALIVE_S)
@@ -193,7 +195,7 @@ class Broker:
         self._thread = next((one for one in threading.enumerate() if one.name.endswith(self._name)), None)
 
     async def close(self) -> None:
-        """Send what waits, for a second at most, and disconnect."""
+        """Send pending messages for FAREWELL_S at most, and disconnect."""
         begun = asyncio.get_running_loop().time()
         while self.is_connected and not self.outbox.is_idle:
             if asyncio.get_running_loop().time() - begun > FAREWELL_S:
@@ -201,49 +203,49 @@ class Broker:
             await asyncio.sleep(0.01)
         self._loop = None
         self._client.disconnect()
-        with suppress(Hung):  # its thread may wait for a name server, and does not keep the process
+        with suppress(Hung):  # its daemon thread may wait for a name server
             await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
         self.is_connected = False
-        self._client = None  # with it go the sockets by which paho wakes its thread
+        self._client = None  # frees the sockets by which paho wakes its thread
 
     def publish(self) -> None:
-        """Let the speaker say what is new, or count what it would have said.
+        """Let the speaker publish, or count its messages while there is no connection.
 
-        Raises RuntimeError if paho's thread has ended: nothing would be sent.
+        Raises RuntimeError if paho's thread has ended.
         """
         if self._thread is not None and not self._thread.is_alive():
             raise RuntimeError("the thread of its connection has ended")
         had_failed = self.failure
         self._let(self._speaker.publish if self.is_connected else self._pass_over)
         if had_failed and not self.failure and self.is_connected:
-            self.begin_anew()
+            self.publish_all()
 
-    def begin_anew(self) -> None:
-        """Let the speaker say all, as on a new connection."""
+    def publish_all(self) -> None:
+        """Let the speaker publish everything, as on a new connection."""
         self._let(self._speaker.connected)
 
     def _pass_over(self) -> None:
         self.outbox.dropped += self._speaker.pass_over()
 
     def _let(self, say: Callable[[], None]) -> None:
-        """Let the speaker say something; one that fails is away, and hears commands all the same.
+        """Let the speaker publish. If that fails, mark it as offline, but keep receiving commands.
 
-        What the broker keeps of its drives would pass for the present otherwise.
+        Otherwise the retained values of its drives would look current.
         """
         try:
             say()
         except Exception as failure:
             if not self.failure:
-                _log.exception("nothing can be said")
+                _log.exception("publishing fails")
                 if self.is_connected:
                     self._speaker.leave()
-            self.failure = f"nothing can be said: {type(failure).__name__}: {failure}"
+            self.failure = f"publishing fails: {type(failure).__name__}: {failure}"
         else:
             self.failure = ""
 
     @property
     def trouble(self) -> str:
-        """Return that there is no connection, and why where it is known."""
+        """The sentence for a missing connection, with the reason if known."""
         return f"no connection to {self._address.host}:{self._address.port}" + (
             self._why and f": {self._why}"
         )
@@ -266,8 +268,8 @@ class Broker:
         _log.info("connected to %s:%d", self._address.host, self._address.port)
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
-        self.failure = ""  # of the connection before; one of this one is to be told on it
-        self.begin_anew()
+        self.failure = ""  # that of the previous connection
+        self.publish_all()
 
     def _acknowledge(self) -> None:
         numbers = []
@@ -301,7 +303,7 @@ class Broker:
 
     def _on_publish(self, _client: Any, _data: Any, number: int, *_more: Any) -> None:
         self._arrived.append(number)
-        if len(self._arrived) == 1:  # else the loop is woken already: they come many at a time
+        if len(self._arrived) == 1:  # else the loop has been woken: they arrive in bursts
             self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:

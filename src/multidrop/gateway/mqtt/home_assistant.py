@@ -1,6 +1,6 @@
-"""Home Assistant's discovery messages (homeassistant/device/ID/config): one for each drive. Pure.
+"""Home Assistant's discovery messages (homeassistant/device/ID/config), one for each drive. Pure.
 
-Each component has its own state topic: one of the whole device would be the state of its numbers and buttons.
+Each component has its own state topic: one for the device would apply to its numbers and buttons too.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ CLASSES = {  # device_class of a unit
     "s": "duration",
 }
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
-OWN = ("problem", "running", "set", "value")  # ends of ids that are no register's alone
-MOST = 1e12  # of a number whose register says nothing of its span
-LEAST_STEP = 0.001  # that Home Assistant takes
-STALE_PERIODS = 3  # after which a sensor is unavailable
-# Home Assistant's own clock dates a command: one that a broker held up is refused.
+OWN = ("problem", "running", "set", "value")  # suffixes of ids with another meaning than a register
+MOST = 1e12  # limit of a number whose register has no range
+LEAST_STEP = 0.001  # the smallest that Home Assistant accepts
+STALE_PERIODS = 3  # a sensor is unavailable after this many periods
+# Commands carry the time of Home Assistant's clock: the gateway refuses delayed ones.
 COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | int }}}}}}'
 
 
 def discovery_topic(prefix: str, drive: str) -> str:
-    """Return the topic of a drive's configuration."""
+    """Return the topic of a drive's discovery message."""
     return f"{DISCOVERY}/device/{object_id(prefix, drive)}/config"
 
 
 def object_id(prefix: str, drive: str) -> str:
-    """Return an id of the signs that Home Assistant takes; others are told by their code points.
+    """Return an id with only the characters that Home Assistant allows; others become code points.
 
-    The first - ends the prefix, so no other prefix and drive have this id.
+    The first "-" ends the prefix, so ids of different prefixes and drives differ.
     """
     return f"{_escaped(r'[^A-Za-z0-9]', prefix)}-{_escaped(r'[^A-Za-z0-9-]', drive)}"
 
@@ -66,9 +66,9 @@ def discovery(
     takes_commands: bool,
     page: str = "",
 ) -> bytes:
-    """Return the configuration of one drive: its state, a sensor for each polled register, and commands.
+    """Return the discovery message of a drive: its state, a sensor for each polled register, and commands.
 
-    `topics` has those of the drive by what they are for, and `page` is the address of the gateway's page.
+    `topics` are the drive's topics by purpose, `page` is the address of the gateway's page.
     """
     name = object_id(prefix, drive.name)
     polled = list(polled)
@@ -90,7 +90,7 @@ def discovery(
             "name": "Stop",
             "command_topic": topics["stop"],
             "payload_press": "stop",
-            "availability": [{"topic": topics["gateway"]}],  # also while the drive is silent
+            "availability": [{"topic": topics["gateway"]}],  # available also while the drive is silent
         }
     maker, space, _ = drive.title.partition(" ")
     device = {"ids": name, "name": drive.name, "mdl": drive.title or type(drive).__name__}
@@ -108,7 +108,7 @@ def discovery(
     ).encode()
 
 
-# What a state means for each binary sensor; nothing is known in the others.
+# The value of each binary sensor by state; unknown in all other states.
 BINARY = {
     "problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"},
     "running": {RUNS: "ON", STANDS: "OFF"},
@@ -116,7 +116,7 @@ BINARY = {
 
 
 def _unused(key: str, parts: Mapping[str, Any]) -> str:
-    """Return a component's key that none has yet: a register may be called "running"."""
+    """Return an unused key for a component: a register may have the name "running"."""
     return _unused(f"{key}_", parts) if key in parts else key
 
 
@@ -163,7 +163,7 @@ def _sensor(name: str, register: Register[Any]) -> dict[str, Any]:
 
 
 def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
-    """Return the component that writes a register: a choice among names, or a number with its span."""
+    """Return the component that writes a register: a choice of names, or a number with its range."""
     found: dict[str, Any] = {
         "unique_id": f"{name}-{register.name}-set",
         "name": f"{register.name.replace('_', ' ')} (set)",
@@ -184,14 +184,14 @@ def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
 
 
 def _choices(register: Register[Any]) -> dict[str, int]:
-    """Return the raw counts of a register's choices by name; none for a number, and for bits."""
+    """Return the raw counts of a register's choices by name; empty for numbers and bits."""
     if register.values is None or issubclass(register.values, Flag):
         return {}
     return {member.name: member.value for member in register.values}
 
 
 def _value_template(register: Register[Any]) -> str:
-    """Return the template of a polled register's value; of a choice without a name nothing is known."""
+    """Return the template of a polled register's value; a choice without a name is unknown."""
     value = f"value_json['values']['{register.name}']"
     if names := list(_choices(register)):
         return f"{{{{ {value} if {value} in {json.dumps(names)} else 'None' }}}}"
@@ -199,7 +199,7 @@ def _value_template(register: Register[Any]) -> str:
 
 
 def _span(register: Register[Any]) -> tuple[float, float]:
-    """Return the least and the greatest number: without them Home Assistant takes 1 to 100."""
+    """Return the range of a register; without one Home Assistant assumes 1 to 100."""
     if register.span is not None:
         return register.span
     coding = register.coding

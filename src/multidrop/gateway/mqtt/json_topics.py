@@ -1,6 +1,7 @@
-"""Topics in JSON: PREFIX/DRIVE has a drive's newest values, and null for one that is not fresh.
+"""JSON topics: PREFIX/DRIVE has a drive's newest values, null for one that is not fresh.
 
-PREFIX/DRIVE/available and PREFIX/gateway say who is there; PREFIX/DRIVE/told says what became of a command.
+PREFIX/DRIVE/available and PREFIX/gateway have "online" or "offline"; PREFIX/DRIVE/told has results of
+commands.
 """
 
 from __future__ import annotations
@@ -23,19 +24,23 @@ from multidrop.gateway.parts import PartContext
 from multidrop.plant import drive_meant
 
 ONLINE, OFFLINE = b"online", b"offline"
-MOST_KEPT = 256  # messages of a connection that are looked at; what is more waits for the next one
-MOST_DISCOVERY = 1 << 18  # bytes of a configuration
+MOST_KEPT = 256  # retained messages examined per connection; others wait for the next one
+MOST_DISCOVERY = 1 << 18  # bytes of a discovery message
 
 
 class KeptTopic(NamedTuple):
-    """A topic of a drive, of which the broker keeps a message."""
+    """A topic with a retained message, and its drive."""
 
     drive: str
     topic: str
 
 
-class LeftBehind:
-    """Looks for such topics among the messages that a broker kept."""
+class RetainedTopics:
+    """Finds retained messages of removed drives.
+
+    They remain after a gateway was killed, if its plant file has lost a drive since. Only topics of the own
+    prefix are returned, and only a limited number, whatever the broker sends.
+    """
 
     def __init__(self, prefix: str, *, home_assistant: bool) -> None:
         self._prefix = prefix
@@ -43,18 +48,18 @@ class LeftBehind:
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew, on a new connection."""
-        self._is_alone = False  # the gateway of before is gone, and no other one has this prefix
+        """Start again on a new connection."""
+        self._is_alone = False  # no other gateway is online with this prefix
         self._found: list[KeptTopic] = []
         self._looked_at = 0
 
     def topics(self) -> list[str]:
-        """Return what is to be listened to."""
+        """Return the topics to subscribe to."""
         kept = [f"{self._prefix}/gateway", f"{self._prefix}/+/available"]
         return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
 
     def hear(self, topic: str, payload: bytes, there: Collection[str]) -> list[str]:
-        """Take a message that was kept; return the topics to be taken back now. `there` are the drives."""
+        """Take a retained message; return the topics to delete now. `there` are the present drives."""
         if topic == f"{self._prefix}/gateway":
             self._is_alone = payload == OFFLINE
         elif self._looked_at < MOST_KEPT:
@@ -65,7 +70,7 @@ class LeftBehind:
         return [one.topic for one in found if one.drive not in there]
 
     def _topics_of(self, topic: str, payload: bytes, there: Collection[str]) -> list[KeptTopic]:
-        """Return the topics of which a message tells that a drive has them that is not there."""
+        """Return the topics of a removed drive that a message shows."""
         if payload in (ONLINE, OFFLINE):
             drive = self._drive_in(topic.removesuffix("/available"))
             if drive is None or drive in there or topic != f"{self._prefix}/{drive}/available":
@@ -77,17 +82,17 @@ class LeftBehind:
         self._looked_at += 1
         drive = self._drive_in(_state_topic(payload))
         if drive is None or drive in there or topic != discovery_topic(self._prefix, drive):
-            return []  # another gateway's, whose prefix and drive make the same beginning
+            return []  # of another gateway, whose prefix starts with this one
         return [KeptTopic(drive, topic)]
 
     def _drive_in(self, topic: str) -> str | None:
-        """Return the drive whose values are on this topic."""
+        """Return the drive whose values are published on this topic."""
         drive = topic.removeprefix(f"{self._prefix}/")
         return drive if drive and topic == f"{self._prefix}/{drive}" and "/" not in drive else None
 
 
 def _state_topic(payload: bytes) -> str:
-    """Return where a drive's values are, as its discovery says; "" where it says nothing of it."""
+    """Return the state topic in a discovery message; "" if it has none."""
     if len(payload) > MOST_DISCOVERY:
         return ""
     try:
@@ -95,7 +100,7 @@ def _state_topic(payload: bytes) -> str:
     except (ValueError, RecursionError):
         return ""
     parts = said.get("cmps") if isinstance(said, dict) else None
-    state = parts.get("state") if isinstance(parts, dict) else said  # the whole device had one once
+    state = parts.get("state") if isinstance(parts, dict) else said  # older messages have it at the top
     found = state.get("state_topic") if isinstance(state, dict) else None
     return found if isinstance(found, str) else ""
 
@@ -105,7 +110,7 @@ EXAMPLES = {
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
 MOST_BYTES = 65_536  # of a write or a verb
-NOTHING = b""  # makes a broker forget what it kept of a topic
+NOTHING = b""  # removes a retained message
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
@@ -123,15 +128,15 @@ class JsonTopics:
         self._plant = context.plant
         self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
-        self._left: set[str] = set()  # drives of which the broker is to keep nothing
-        self._left_behind = LeftBehind(settings.prefix, home_assistant=settings.home_assistant)
+        self._left: set[str] = set()  # removed drives, whose retained messages are to be deleted
+        self._retained_topics = RetainedTopics(settings.prefix, home_assistant=settings.home_assistant)
 
     def _topic(self, *levels: str) -> str:
         return "/".join((self._settings.prefix, *levels))
 
     @staticmethod
     def _kept(topic: str, payload: bytes) -> Publication:
-        """Return a message that the broker keeps for those who come later."""
+        """Return a retained message."""
         return Publication(topic, lambda: payload, is_retained=True)
 
     # ---- a speaker ----
@@ -140,7 +145,7 @@ class JsonTopics:
         return self._kept(self._topic("gateway"), OFFLINE)
 
     def topics(self) -> list[tuple[str, int]]:
-        kept = [(topic, 0) for topic in self._left_behind.topics()]
+        kept = [(topic, 0) for topic in self._retained_topics.topics()]
         if not self._settings.commands:
             return kept
         once = [(self._topic("+", "set", "+"), 0), (self._topic("+", "act"), 0)]
@@ -148,9 +153,9 @@ class JsonTopics:
 
     def connected(self) -> None:
         self._available.clear()
-        self._left_behind.begin()
+        self._retained_topics.begin()
         self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
-        self._take_back()  # the connection may have broken before it was heard
+        self._take_back()  # the previous connection may have broken before
         if self._settings.home_assistant:
             for drive in self._hub.drives:
                 self._discover(drive)
@@ -163,15 +168,15 @@ class JsonTopics:
             if is_retained:
                 self._look_back(topic, payload)
         elif not self._settings.commands:
-            _log.warning("the broker sent a command that nobody listens to: %.100r", topic)
+            _log.warning("the broker sent a command, but commands are off: %.100r", topic)
         elif is_stop:
             self._orders.stop(None if levels == ["stop"] else [levels[0]])
         else:
             self._order(levels, payload, is_retained=is_retained)
 
     def _look_back(self, topic: str, payload: bytes) -> None:
-        """Take back what the broker has kept since before of drives that are no more."""
-        for left in self._left_behind.hear(topic, payload, _drives(self._plant)):
+        """Delete retained messages of removed drives."""
+        for left in self._retained_topics.hear(topic, payload, _drives(self._plant)):
             self.outbox.put(self._kept(left, NOTHING))
 
     def _order(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
@@ -180,16 +185,16 @@ class JsonTopics:
             given = _read(payload)
         except ValueError as mistake:
             if what[0] == "act" and any(f'"{verb}"'.encode() in payload for verb in STOPPING):
-                self._orders.stop([drive])  # whatever is wrong with the rest
+                self._orders.stop([drive])  # an invalid message must not prevent a stop
             else:
                 self._refuse(drive, what, mistake)
             return
         try:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
-                    self._orders.stop_by(one, given["verb"], {})  # it takes none: no wrong ones keep it back
-            elif is_retained:  # it comes at every connection
-                kept = "the broker had kept it; publish it without retain"
+                    self._orders.stop_by(one, given["verb"], {})  # wrong options must not prevent a stop
+            elif is_retained:  # it would arrive on every connection
+                kept = "it was retained; publish it without retain"
                 self._orders.refuse(drive, "/".join(what), kept)
             elif what[0] == "set":
                 self._orders.write(drive, what[1], *_read_write(given))
@@ -199,19 +204,19 @@ class JsonTopics:
             self._refuse(drive, what, mistake)
 
     def _refuse(self, drive: str, what: list[str], mistake: ValueError) -> None:
-        self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
+        self._orders.refuse(drive, "/".join(what), f"it is not {EXAMPLES[what[0]]}: {mistake}")
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
-        """Return the topic's drive and, where there is one, another one that the stop names.
+        """Return the topic's drive, and the drive named in the stop if it is another one.
 
-        To stop too many can be mended, and to stop none cannot.
+        Stopping too many drives is harmless, stopping none is not.
         """
         named, there = given.get("drive"), _drives(self._plant)
         other = drive_meant(named, there) if isinstance(named, str) else drive
         return [drive, other] if other in there - {drive_meant(drive, there)} else [drive]
 
     def adopt(self, plant: Plant) -> None:
-        """Go on with another plant: what the broker keeps of drives that left is taken back."""
+        """Use another plant, and delete the retained messages of removed drives."""
         self._left = (self._left | _drives(self._plant)) - _drives(plant)
         self._plant = plant
         self._take_back()
@@ -225,10 +230,10 @@ class JsonTopics:
             for topic in topics:
                 self.outbox.put(self._kept(topic, NOTHING))
 
-    # ---- what is said ----
+    # ---- published messages ----
 
     def publish(self) -> None:
-        """Say the newest values of each drive."""
+        """Publish the newest values of each drive."""
         for drive in self._hub.drives:
             self.outbox.put(Publication(self._topic(drive), partial(self._state, drive), is_retained=True))
             available = OFFLINE if self._hub.state(drive) == SILENT else ONLINE
@@ -237,13 +242,13 @@ class JsonTopics:
                 self.outbox.put(self._kept(self._topic(drive, "available"), available))
 
     def pass_over(self) -> int:
-        """Return how many messages `publish` would have."""
+        """Return how many messages `publish` would send."""
         return len(list(self._hub.drives))
 
     def leave(self) -> None:
-        """Say that the gateway goes, and of each drive that nothing more comes.
+        """Publish the gateway and each drive as offline.
 
-        One that the plant file has no more when the gateway begins again is never spoken of again.
+        A drive removed from the plant file before the next start would otherwise stay online.
         """
         self.outbox.put(self.will())
         for drive in self._available:
@@ -295,7 +300,7 @@ def _drives(plant: Plant) -> set[str]:
 
 
 def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
-    """Return value and time of a write. Raises ValueError for what is none."""
+    """Return value and time of a write. Raises ValueError for an invalid message."""
     _check_keys(given, "value", "time")
     value = given["value"]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -304,7 +309,7 @@ def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
 
 
 def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, object], int]:
-    """Return verb, options and time. Raises ValueError for what is none, or names another drive."""
+    """Return verb, options and time. Raises ValueError for an invalid message or another drive."""
     _check_keys(given, "verb", "drive", "time")
     return str(given["verb"]), _options(drive, given), _time(given)
 
@@ -314,14 +319,14 @@ def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
         raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
     options = given.get("options", {})
     if not isinstance(options, dict):
-        raise ValueError("options is no table")
+        raise ValueError("options is not an object")
     return options
 
 
 def _time(given: Mapping[str, Any]) -> int:
     time: object = given["time"]
     if isinstance(time, bool) or not isinstance(time, int):
-        raise ValueError("time is no whole number of ms")
+        raise ValueError("time is not a whole number of ms")
     return time
 
 
@@ -333,7 +338,7 @@ def _read(payload: bytes) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(given, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     return given
 
 

@@ -1,4 +1,4 @@
-"""MQTT: tells brokers what the drives say, and takes commands from them where the plant file lets it."""
+"""The part `mqtt`: publishes values to a broker, and takes commands from it if the plant file allows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def build(settings: MqttSettings, context: PartContext) -> Mqtt:
 
 
 class Mqtt:
-    """The speakers of MQTT, each with a connection of its own, since a connection has only one will."""
+    """The speakers of MQTT, each with its own connection because a connection has only one will."""
 
     def __init__(self, settings: MqttSettings, context: PartContext, speakers: list[Any]) -> None:
         address, login = parse_broker(settings.broker), settings.login(context.plant)
@@ -36,23 +36,23 @@ class Mqtt:
         self._speakers = speakers
         self._brokers = []
         for speaker in speakers:
-            name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"  # no other gateway's
+            name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"  # unique among gateways
             broker = Broker(address, login, name, speaker)
             speaker.outbox = broker.outbox
             self._brokers.append(broker)
 
     def take(self, batch: Batch) -> None:
-        """Do nothing: the hub has the newest rows."""
+        """Ignore the batch: the hub has the newest rows."""
 
     def adopt(self, plant: Plant) -> None:
-        """Go on with another plant: all drives are made known anew."""
+        """Use another plant, and announce all drives again."""
         for broker, speaker in zip(self._brokers, self._speakers, strict=True):
             speaker.adopt(plant)
             if broker.is_connected:
-                broker.begin_anew()
+                broker.publish_all()
 
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
-        """Publish every so many seconds, until cancelled."""
+        """Publish periodically until cancelled."""
         for broker in self._brokers:
             broker.open()
         while True:
@@ -68,12 +68,12 @@ class Mqtt:
             await broker.close()
 
     def health(self) -> str:
-        """Return why a broker is not reached, or not told anything; "" is well."""
+        """Return why publishing fails; "" if it works."""
         troubles = [broker.failure if broker.is_connected else broker.trouble for broker in self._brokers]
         return next(filter(None, troubles), "")
 
     def figures(self) -> list[MetricFamily]:
-        """Return messages sent and dropped since the start, and how many connections there are."""
+        """Return metrics: messages sent and dropped since the start, and connections."""
         outboxes = [broker.outbox for broker in self._brokers]
         connected = sum(broker.is_connected for broker in self._brokers)
         return [

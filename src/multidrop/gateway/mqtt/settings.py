@@ -1,4 +1,4 @@
-"""Settings of MQTT, the table [serve.mqtt] of a plant file, and the values that are said of a drive."""
+"""The table [serve.mqtt] of a plant file, and the published values of a drive."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from multidrop.plant import check_drive_name
 from multidrop.toml_check import parse_duration
 
 LEVEL = re.compile(r"[^+#/\0]+")  # one level of a topic
-OTHERS = ("homeassistant", "spBv1.0")  # first levels of topics that are not ours: discovery and Sparkplug
+OTHERS = ("homeassistant", "spBv1.0")  # first levels reserved for discovery and Sparkplug
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
 
 
 @dataclass(frozen=True)
 class MqttSettings:
-    """The table [serve.mqtt]. Raises ValueError with a sentence in a line for each mistake."""
+    """The settings of MQTT. Raises ValueError with a line for each mistake."""
 
     broker: str = "mqtt://localhost:1883"
     prefix: str = "multidrop"
     every: str = "1 s"  # between two messages of a drive
     user: str = ""
-    password: str = ""  # a file that has it
-    authorities: str = ""  # a file of certificates, by which a broker of mqtts:// is known
+    password: str = ""  # path of a file
+    authorities: str = ""  # path of a file of certificates that verify a broker of mqtts://
     home_assistant: bool = False
     sparkplug: str = ""  # the group; "": no Sparkplug
-    node: str = ""  # the edge node's name; "": that of the plant file
-    commands: bool = False  # whoever may publish to the broker may then write what [serve.may] lists
+    node: str = ""  # the edge node's name; default: that of the plant file
+    commands: bool = False  # allow publishers to write the registers and verbs listed in [serve.may]
 
     def __post_init__(self) -> None:
         wrong = []
@@ -49,13 +49,13 @@ class MqttSettings:
         if not is_right:
             wrong.append(f'every = "{self.every}" is not "{LEAST_EVERY_S:g} s" to "{MOST_EVERY_S:g} s"')
         if not all(LEVEL.fullmatch(level) for level in self.prefix.split("/")) or self.prefix[0] == "$":
-            wrong.append(f'prefix = "{self.prefix}" is no topic; write prefix = "multidrop"')
+            wrong.append(f'prefix = "{self.prefix}" is not a valid topic; write prefix = "multidrop"')
         if self.prefix.split("/")[0] in OTHERS:
-            wrong.append(f'prefix = "{self.prefix}" is a topic of others; write prefix = "multidrop"')
+            wrong.append(f'prefix = "{self.prefix}" is a reserved topic; write prefix = "multidrop"')
         if self.sparkplug == "STATE":
-            wrong.append('sparkplug = "STATE" is the topic of Sparkplug\'s hosts; name another group')
+            wrong.append('sparkplug = "STATE" is reserved for Sparkplug hosts; name another group')
         wrong += [
-            f'{key} = "{name}" is not one level of a topic: it has none of + # and /'
+            f'{key} = "{name}" is not one level of a topic: remove + # and /'
             for key, name in (("sparkplug", self.sparkplug), ("node", self.node))
             if name and not LEVEL.fullmatch(name)
         ]
@@ -69,11 +69,11 @@ class MqttSettings:
 
     @property
     def caller(self) -> Caller:
-        """The caller that stands for everybody who may publish to the broker."""
+        """The caller of all commands from the broker."""
         return Caller(self.user or "anyone", "mqtt", parse_broker(self.broker).host, Right.WRITE)
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each file that cannot be read, and each drive that cannot be a topic."""
+        """Return a sentence for each missing file, and each drive name that cannot be a topic."""
         names = [polled.drive.name for line in plant.lines for polled in line.drives]
         files = (("password", self.password), ("authorities", self.authorities))
         return (
@@ -88,11 +88,11 @@ class MqttSettings:
                 if self.authorities and path.is_file() and not _has_certificates(path)
             ]
             + [
-                f"drive {name!r} cannot be a topic: give it a name without + # and /"
+                f"drive {name!r} cannot be a topic: choose a name without + # and /"
                 for name in names
                 if not LEVEL.fullmatch(name)
             ]
-            + [mistake for mistake in map(_reserved, names) if mistake]  # a plant need not come from a file
+            + [mistake for mistake in map(_reserved, names) if mistake]  # unchecked if the plant has no file
             + [
                 f'the plant file\'s name {plant.path.stem!r} cannot be an edge node; add node = "hall-1"'
                 for _ in self.sparkplug[:1]
@@ -101,13 +101,13 @@ class MqttSettings:
         )
 
     def login(self, plant: Plant) -> Login:
-        """Return user, password and certificates. Raises OSError where the password cannot be read."""
+        """Return user, password and certificates. Raises OSError if the password cannot be read."""
         password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
         return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
 
 
 def _reserved(drive: str) -> str:
-    """Return why a drive cannot have this name; "" where it can."""
+    """Return why a drive cannot have this name; "" if it can."""
     try:
         check_drive_name(drive)
     except ValueError as mistake:
@@ -118,13 +118,13 @@ def _reserved(drive: str) -> str:
 def _has_certificates(path: Path) -> bool:
     try:
         ssl.create_default_context(cafile=str(path))
-    except OSError:  # as of text that is none
+    except OSError:  # also if the file has no certificates
         return False
     return True
 
 
 def _beside(plant: Plant, name: str) -> Path:
-    """Return the path of a file that is named relative to the plant file."""
+    """Return the path of a file named relative to the plant file."""
     return plant.path.parent / name
 
 
@@ -134,7 +134,7 @@ def shown(register: Register[Any], value: float) -> float | str:
 
 
 def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
-    """Return the values of a drive's polled registers; None for one that is not fresh, or no number."""
+    """Return the values of a drive's polled registers; None for stale, infinite and missing ones."""
     return {
         name: shown(register, good[2])
         if is_fresh and good is not None and newest is good and isfinite(good[2])

@@ -13,7 +13,7 @@ from typing import NamedTuple
 NAMESPACE = "spBv1.0"
 REBIRTH = "Node Control/Rebirth"
 BIRTH_DEATH = "bdSeq"
-SEQUENCES = 256  # seq and bdSeq go from 0 to 255, and again
+SEQUENCES = 256  # seq and bdSeq count from 0 to 255 and start again
 
 # Payload's and Metric's fields (section 6.4.1)
 _TIMESTAMP, _METRICS, _SEQ = 1, 2, 3
@@ -31,7 +31,7 @@ _MOST_VARINT = 10  # bytes
 
 
 class DataType(IntEnum):
-    """Sparkplug's numbers of the types that are used here (section 6.4.16)."""
+    """Sparkplug's numbers of the data types used here (section 6.4.16)."""
 
     INT64 = 4
     UINT64 = 8
@@ -52,15 +52,15 @@ class Metric(NamedTuple):
 
 
 class Given(NamedTuple):
-    """A metric of a command, as somebody sent it."""
+    """A metric in a received command."""
 
-    name: str  # "": it came by its alias
+    name: str  # "" if it has only an alias
     alias: int | None
     value: float | str | None
 
 
 def payload(time_ms: int, metrics: Iterable[Metric], seq: int | None) -> bytes:
-    """Return a payload; an NDEATH has no `seq`."""
+    """Return an encoded payload; an NDEATH has no `seq`."""
     parts = [_number(_TIMESTAMP, time_ms), *(_bytes(_METRICS, _metric(metric)) for metric in metrics)]
     if seq is not None:
         parts.append(_number(_SEQ, seq))
@@ -113,9 +113,9 @@ def _varint(value: int) -> bytes:
 
 
 def read_command(data: bytes) -> tuple[int, list[Given]]:
-    """Return time (UTC, ms; 0 for none) and metrics of an NCMD or a DCMD.
+    """Return time (UTC in ms; 0 if missing) and metrics of an NCMD or a DCMD.
 
-    Raises ValueError for what is no payload.
+    Raises ValueError for an invalid payload.
     """
     if len(data) > MOST_PAYLOAD:
         raise ValueError(f"a payload of {len(data)} bytes")
@@ -161,7 +161,7 @@ def _text(found: bytes) -> str:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield each field's number and value: an int of a varint, bytes of all else."""
+    """Yield each field's number and value: int for a varint, else bytes."""
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)

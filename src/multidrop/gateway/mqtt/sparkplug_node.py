@@ -1,4 +1,4 @@
-"""Edge node of Sparkplug B: births, data by exception, deaths, and rebirth when it is asked for."""
+"""Edge node of Sparkplug B: births, deaths, rebirth on request, and data on change."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from multidrop.gateway.mqtt.sparkplug import (
 from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
-OWN = (STATE, FAULT)  # of all drives alike, in words
-REGISTERS = "registers/"  # begins the metric of a register with the name of one of those
+OWN = (STATE, FAULT)  # metrics of every drive, as text
+REGISTERS = "registers/"  # prefix of registers with one of these names
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 Value = float | str | None
 
 
 class SparkplugNode:
-    """An edge node, each of whose devices is a drive; values are sent when they change."""
+    """An edge node whose devices are drives; values are sent when they change."""
 
     kind = "sparkplug"
 
@@ -48,7 +48,7 @@ class SparkplugNode:
         self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
         self._birth = -1  # bdSeq
         self._seq = 0
-        self._said: dict[str, dict[str, Value]] = {}  # by drive that is born
+        self._said: dict[str, dict[str, Value]] = {}  # last values by born drive
         self._changed: dict[str, dict[str, Value]] = {}
         self._aliases: dict[tuple[str, str], int] = {}
 
@@ -74,13 +74,13 @@ class SparkplugNode:
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         levels = topic.split("/")
         if levels[2:3] != ["NCMD"] and not (levels[2:3] == ["DCMD"] and self._settings.commands):
-            _log.warning("the broker sent a command that nobody listens to: %.100r", topic)
+            _log.warning("the broker sent a command, but commands are off: %.100r", topic)
             return
         try:
             sent_ms, metrics = read_command(payload)
         except ValueError as mistake:
-            _log.warning("a command on %s is no Sparkplug payload: %s", topic, mistake)
-            if levels[2] == "DCMD" and STOP.encode() in payload:  # whatever is wrong with the rest
+            _log.warning("a command on %s is not a Sparkplug payload: %s", topic, mistake)
+            if levels[2] == "DCMD" and STOP.encode() in payload:  # an invalid message must not prevent a stop
                 self._orders.stop([levels[-1]])
             return
         if levels[2] == "NCMD":
@@ -91,25 +91,25 @@ class SparkplugNode:
             self._order(levels[-1], given, sent_ms, is_retained=is_retained)
 
     def adopt(self, plant: Plant) -> None:
-        """Go on with another plant: devices that left are dead."""
+        """Use another plant, and send deaths of removed devices."""
         self._plant = plant
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
         for drive in [drive for drive in self._said if drive not in there]:
             del self._said[drive]
-            self._begin_anew(drive, "DDEATH", self._device_death)
+            self._replace_pending(drive, "DDEATH", self._device_death)
 
     def publish(self) -> None:
-        """Say what changed of each drive, and which came and went."""
+        """Send changed values, births and deaths."""
         for drive in self._hub.drives:
             if self._hub.state(drive) == SILENT:
                 if self._said.pop(drive, None) is not None:
-                    self._begin_anew(drive, "DDEATH", self._device_death)
+                    self._replace_pending(drive, "DDEATH", self._device_death)
                 continue
             values = self._values(drive)
             before = self._said.get(drive)
             self._said[drive] = values
             if before is None:
-                self._begin_anew(drive, "DBIRTH", self._device_birth)
+                self._replace_pending(drive, "DBIRTH", self._device_birth)
                 continue
             changed = {name: value for name, value in values.items() if value != before[name]}
             if changed:
@@ -117,20 +117,20 @@ class SparkplugNode:
                 self._put(drive, "DDATA", self._data)
 
     def pass_over(self) -> int:
-        """Return how many drives changed since the last call: each would have a message."""
+        """Return how many drives have changed since the last call."""
         values = {drive: self._values(drive) for drive in self._hub.drives}
         changed = [drive for drive, found in values.items() if self._said.get(drive) != found]
         self._said = values
         return len(changed)
 
     def leave(self) -> None:
-        """Say that the node goes: its will is not sent at a disconnect in good order."""
+        """Send the node's death, because a regular disconnect does not send the will."""
         self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
 
-    # ---- payloads, each made when it is sent: their numbers go up by one ----
+    # ---- payloads, each made when it is sent because of its sequence number ----
 
-    def _begin_anew(self, drive: str, kind: str, make: Any) -> None:
-        """Say that a drive is born or dead, and drop all else that waited to be said of it."""
+    def _replace_pending(self, drive: str, kind: str, make: Any) -> None:
+        """Send a birth or death, and drop the drive's other pending messages."""
         for other in {"DBIRTH", "DDATA", "DDEATH"} - {kind}:
             self.outbox.withdraw(self._topic(other, drive))
         self._put(drive, kind, make)
@@ -207,7 +207,7 @@ class SparkplugNode:
         return register.value_unit if register and register.values is None else ""
 
     def _register(self, drive: str, name: str) -> Register[Any] | None:
-        """Return the register of a metric; None for those of all drives, which are in words."""
+        """Return the register of a metric; None for the metrics of every drive."""
         return None if name in OWN else self._registers(drive)[name.removeprefix(REGISTERS)]
 
     def _alias(self, drive: str, name: str) -> int:
@@ -222,9 +222,9 @@ class SparkplugNode:
         if name == STOP and given.value:
             self._orders.stop([drive])
         elif is_retained:
-            self._orders.refuse(drive, name, "the broker had kept it; publish it without retain")
+            self._orders.refuse(drive, name, "it was retained; publish it without retain")
         elif not is_writable or not isinstance(given.value, (int, float)):
-            self._orders.refuse(drive, name, "it is no register that [serve.may] lists, and a number for it")
+            self._orders.refuse(drive, name, "it must be a register listed in [serve.may], with a number")
         else:
             self._orders.write(drive, register, float(given.value), sent_ms)
 
