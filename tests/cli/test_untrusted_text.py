@@ -104,7 +104,7 @@ def test_a_plant_file_s_mistakes_have_no_url_s_password(tmp_path: Path) -> None:
         read_plant(lambda: load_plant(tmp_path / "p.toml"), {})
     fleet, broker = caught.value.mistakes
     assert (
-        'broker = "mqtt://broker:1883" comes with a login; write user = "name" and password = "FILE"'
+        'broker = "mqtt://broker:1883" has a login in it; write user = "name" and password = "FILE" instead'
         in broker
     )
     assert "x://host" in fleet

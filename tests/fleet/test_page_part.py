@@ -139,7 +139,7 @@ def test_the_gateway_tells_of_a_real_fleet_and_of_none(fleet: Cluster, tmp_path:
         answer = gateway.get("/api/fleet")
         assert (answer.status, answer.json["error"]) == (
             404,
-            "no fleet is looked at; add [serve.fleet] to the plant file",
+            "this gateway shows no fleet; add [serve.fleet] to the plant file",
         )
 
 

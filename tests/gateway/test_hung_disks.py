@@ -28,8 +28,8 @@ from multidrop.history import writer as writer_module
 SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\n'
 HISTORY = '[serve.history]\nfolder = "kept"\n'
 SHORT_S = 0.1
-COMING = "it is not there yet: its files do not answer"
-UNAUDITED = "audit log: not done within 0.1 s; does the disk answer? A restart tries it again"
+COMING = "it is not ready: its files do not answer"
+UNAUDITED = "audit log: not done within 0.1 s; does the disk answer? Restart to try again"
 HANGING = """
 import sys, threading
 from multidrop.cli import main
@@ -322,7 +322,7 @@ def test_sigterm_ends_a_gateway_whose_disks_hang(tmp_path: Path, fifos: Fifos) -
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0
-    assert "history goes on at the end, and is not waited for" in errors
+    assert "history is still running at shutdown, and is abandoned" in errors
 
 
 @pytest.mark.long

@@ -333,7 +333,7 @@ def test_a_start_of_before_a_reload_does_not_go_to_what_has_its_drive_s_name_now
         start = {"drive": "pump-1", "verb": "start", "options": {}, "seen": seen}
         told = gateway.post("/api/act", start, authorization=gateway.bearer(Right.WRITE)).json
         assert told["text"].startswith(
-            f"pump-1.start was not sent: the plant was read anew after frame {seen}"
+            f"pump-1.start was not sent: the plant file was reloaded after frame {seen}"
         )
         assert not any(sim.motor.goal for sim in gateway.sims.values())  # type: ignore[attr-defined]
 

@@ -84,7 +84,7 @@ def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
     assert told["done"] is False
     assert told["text"] == "the plant goes on as before: the file has mistakes"
     (mistake,) = told["mistakes"]
-    assert mistake.startswith(f"[serve.modbus]: listen: 127.0.0.1:{number} cannot be had")
+    assert mistake.startswith(f"[serve.modbus]: listen: 127.0.0.1:{number} cannot be opened")
     assert parts(gateway) == {"modbus": "ok"}
     until(lambda: status_of(first, 21) == [3])
     assert gateway.frame()["drives"].keys() == {"pump-1", "pump-2"}
@@ -126,7 +126,7 @@ def test_a_part_whose_port_is_lost_meanwhile_is_told(
     assert reload(gateway, MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
     others[0].close()
     told = parts(gateway)["modbus"]
-    assert told.startswith(f"[serve.modbus]: listen: 127.0.0.1:{first} cannot be had")
+    assert told.startswith(f"[serve.modbus]: listen: 127.0.0.1:{first} cannot be opened")
     assert [
         one["done"]
         for one in gateway.post("/api/stop", {}, authorization=gateway.bearer(Right.STOP)).json.values()

@@ -175,7 +175,8 @@ def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path) -> None:
         done = multidrop("serve", tmp_path / "plant.toml")
     assert done.returncode == 1
     assert (
-        done.stderr == f"multidrop: listen: 127.0.0.1:{port} cannot be had: another program listens there\n"
+        done.stderr
+        == f"multidrop: listen: 127.0.0.1:{port} cannot be opened: another program listens there\n"
     )
 
 
@@ -230,7 +231,7 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
         ),
         (
             ("--new-token", "stop", "--for", "a b"),
-            "'a b' is no name for a token: letters, digits, . _ @ and - do, 64 at most",
+            "'a b' cannot name a token: use letters, digits and . _ @ - (at most 64, no sign first)",
         ),
     ],
 )

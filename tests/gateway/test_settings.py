@@ -87,9 +87,9 @@ verbs = ["pump-1.fly"]
         "[serve]: unknown key 'nmaes'; did you mean 'names'?",
         "[serve]: unknown key 'mqqt'; did you mean 'mqtt'?",
         "[serve]: behind_proxy = 'yes' is not right; write behind_proxy = true",
-        '[serve]: listen = "everywhere" is no address and port; write listen = "127.0.0.1:8750"',
-        "[serve]: names: 'http://plant.example/' is no host name; write names = [\"plant.example\"], without "
-        "a port",
+        '[serve]: listen = "everywhere" is not an address and port; write listen = "127.0.0.1:8750"',
+        "[serve]: names: 'http://plant.example/' is not a host name; write names = [\"plant.example\"], "
+        "without a port",
         f"[serve]: certificate {tmp_path}/cert.pem cannot be read: No such file or directory",
         f"[serve]: tokens {tmp_path}/tokens: line 1 is not `name role sha256`; `multidrop serve --new-token` "
         "prints one",
@@ -176,8 +176,8 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("pair", "why"),
     [
         (("own.pem", "other.key"), "do not belong together"),
-        (("own.key", "own.key"), "are no certificate and key in PEM, without password"),
-        (("own.pem", "own.pem"), "are no certificate and key in PEM, without password"),
+        (("own.key", "own.key"), "must be a certificate and a key in PEM, without password"),
+        (("own.pem", "own.pem"), "must be a certificate and a key in PEM, without password"),
     ],
 )
 def test_certificates_that_do_not_fit(
@@ -190,7 +190,7 @@ def test_certificates_that_do_not_fit(
 
 def test_a_certificate_without_its_key(tmp_path: Path, certificates: Path) -> None:
     (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{certificates}/own.pem"\n')
-    assert only == "[serve]: certificate needs the other one of certificate and key too"
+    assert only == "[serve]: certificate alone is not enough: give certificate and key"
 
 
 def test_no_rights_on_the_folder(tmp_path: Path) -> None:
@@ -216,9 +216,7 @@ def test_what_a_service_manager_gives(tmp_path: Path) -> None:
 
 def test_nobody_could_look(tmp_path: Path) -> None:
     (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
-    assert only == (
-        '[serve]: look = "token" of [serve.may] needs tokens: nobody could look; add tokens = "tokens"'
-    )
+    assert only == ('[serve]: look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
 
 
 def test_a_tokens_file_holds_no_token() -> None:
@@ -226,16 +224,20 @@ def test_a_tokens_file_holds_no_token() -> None:
     assert read_tokens(f"{token.line}\n") == ([token], [])
     assert secret not in token.line
     assert read_tokens(f"{token.line}\n{token.line}\n")[1] == [
-        "line 2: another token is called anna; give every one its own name"
+        "line 2: the name anna is in use already; give each token its own"
     ]
 
 
 def test_a_port_that_is_taken() -> None:
     with listen("127.0.0.1", 0) as first:
         port = first.getsockname()[1]
-        with pytest.raises(OSError, match=f"listen: 127.0.0.1:{port} cannot be had: another program listens"):
+        with pytest.raises(
+            OSError, match=f"listen: 127.0.0.1:{port} cannot be opened: another program listens"
+        ):
             listen("127.0.0.1", port)
-    with pytest.raises(OSError, match=r"listen: 192\.0\.2\.1:80 cannot be had: it is no address of this"):
+    with pytest.raises(
+        OSError, match=r"listen: 192\.0\.2\.1:80 cannot be opened: this machine does not have this"
+    ):
         listen("192.0.2.1", 80)
-    with pytest.raises(OSError, match=r"listen: nowhere\.invalid is no address of this machine"):
+    with pytest.raises(OSError, match=r"listen: this machine does not have the address nowhere\.invalid"):
         listen("nowhere.invalid", 80)

@@ -33,7 +33,7 @@ def test_page_files_have_types_and_an_etag_that_saves_the_body(tmp_path: Path) -
 def test_no_other_file_is_served(tmp_path: Path, name: str) -> None:
     with served(tmp_path) as gateway:
         answer = gateway.get(f"/page/{name}")
-        assert (answer.status, answer.json) == (404, {"error": "there is nothing here"})
+        assert (answer.status, answer.json) == (404, {"error": "unknown path"})
 
 
 def test_installation_without_a_page_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -228,7 +228,7 @@ def test_methods_and_bodies(open_gateway: Served) -> None:
     assert post("/api/act", b"[" * 50_000).status == 400
     assert post("/api/act", b"[]").json == {"error": "the body is not a JSON object"}
     assert post("/api/act", b" " * 70_000).status == 413
-    assert get("/api/nothing").json == {"error": "there is nothing here"}
+    assert get("/api/nothing").json == {"error": "unknown path"}
     assert get("/api/drive/pump-9").status == 404
     assert get("/api/frame?after=x").status == 400
     assert get("/api/history?series=pump-1.setpoint&from=0&to=1").status == 404

@@ -176,7 +176,7 @@ def test_closing_refuses_what_waits() -> None:
         waits = share.ask("one", line.ask)
         await asyncio.sleep(0.01)
         share.close()
-        with pytest.raises(PassingBusy, match="the gateway ends"):
+        with pytest.raises(PassingBusy, match="the gateway is shutting down"):
             await waits
 
     run_controlled(main())

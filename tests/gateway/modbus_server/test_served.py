@@ -136,7 +136,7 @@ def test_a_port_that_is_taken_is_told_before_anything_is_polled(tmp_path: Path) 
     with simulated_plant(tmp_path) as (drive, path), socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         path.write_text(path.read_text().replace(':0"\nmay', f':{number}"\nmay'))
-        with pytest.raises(ValueError, match=f"127.0.0.1:{number} cannot be had"), gateway_of(path):
+        with pytest.raises(ValueError, match=f"127.0.0.1:{number} cannot be opened"), gateway_of(path):
             pass
         assert drive.counters.requests == 0
 
@@ -152,7 +152,7 @@ def test_mistakes_in_the_table_are_told_with_their_place(tmp_path: Path) -> None
         shown = str(mistakes.value)
         assert "[serve.modbus]" in shown
         assert 'passing = 3 is not right; write passing = "declared"' in shown
-        assert "may = 'root' is none of look, stop, write" in shown
+        assert "may = 'root' is not one of look, stop, write" in shown
         path.write_text(text.replace("mill = 21", "mil = 21"))
         with pytest.raises(PlantError, match="units: there is no drive 'mil'; did you mean mill"):
             read_settings(Plant.load(path), {})

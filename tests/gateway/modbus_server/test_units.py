@@ -93,7 +93,7 @@ def test_the_common_block_is_nobody_s_own() -> None:
         frequency_source = setting(0xF003)
 
     plant = plant_of(("hall", Parameters(1, name="pump")))
-    with pytest.raises(ValueError, match="pump has registers of its own at F003H, where the common block is"):
+    with pytest.raises(ValueError, match="pump has registers at F003H, in the range of the common block"):
         Units(plant, ModbusSettings())
     Units(plant, ModbusSettings(common=0xE000))
 

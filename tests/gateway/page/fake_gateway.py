@@ -263,7 +263,7 @@ def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
 
 def fleet(handler: Any, gateway: FakeGateway, _: object) -> None:
     if not fake_plant.plant(gateway.renamed).get("fleet"):
-        handler.tell({"error": "no fleet is looked at; add [serve.fleet] to the plant file"}, 404)
+        handler.tell({"error": "this gateway shows no fleet; add [serve.fleet] to the plant file"}, 404)
         return
     handler.tell(fake_plant.fleet(gateway.began) | gateway.fleet)
 
