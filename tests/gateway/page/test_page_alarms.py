@@ -59,14 +59,14 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     page = opened("#/faults")
     page.get_by_role("button", name="Acknowledge").first.click()
     assert "conveyor-2: overcurrent while accelerating" in page.locator("#ask").inner_text()
-    page.get_by_label("Note, if any").fill(" belt stuck ")
+    page.get_by_label("Note (optional)").fill(" belt stuck ")
     page.get_by_role("button", name="Acknowledge").last.click()
     until_met(page, lambda: alarmed.posts)
     assert alarmed.posts == [("/api/acknowledge", {"alarm": ALARMS[0]["id"], "note": "belt stuck"})]
     alarmed.has_changed = True
     page.get_by_role("button", name="Acknowledge").first.click()
     page.get_by_role("button", name="Acknowledge").last.click()
-    page.get_by_role("heading", name="The alarm is not acknowledged").wait_for()
+    page.get_by_role("heading", name="The alarm was not acknowledged").wait_for()
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 

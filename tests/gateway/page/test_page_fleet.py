@@ -82,7 +82,7 @@ def test_it_grows_old_by_itself_where_the_gateway_is_gone(opened: Opener, gatewa
 def test_before_the_first_look_nothing_is_shown(opened: Opener, gateway: FakeGateway) -> None:
     gateway.fleet = {"age_s": None, "trouble": "no such server", "gateways": {}, "lines": {}, "moves": []}
     page = opened("#/fleet")
-    await_note(page, "Nothing of the fleet was seen yet: no such server")
+    await_note(page, "The fleet has not been seen yet: no such server")
     assert cells(page, "gateways") == []
 
 
@@ -164,9 +164,9 @@ def test_what_became_of_each_part_is_told(opened: Opener, gateway: FakeGateway) 
     page = opened("#/fleet")
     page.locator("#stopall").click()
     page.get_by_role("button", name="Stop the whole fleet").click()
-    page.get_by_role("heading", name="1 of 32 drives not known to be stopped").wait_for()
+    page.get_by_role("heading", name="1 of 32 drives are not confirmed as stopped").wait_for()
     assert page.locator("#ask .outcome li").all_inner_texts() == ["the fleet: the stop was NOT sent"]
     page.route("**/api/fleet/stop", lambda route: route.abort())
     page.get_by_role("button", name="Send the stop again").click()
-    page.get_by_role("heading", name="It is not known that the stop was sent").wait_for()
+    page.get_by_role("heading", name="It is unknown whether the stop was sent").wait_for()
     assert "All 31 drives are stopped." in page.locator("#ask").inner_text()

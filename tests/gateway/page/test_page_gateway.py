@@ -29,7 +29,7 @@ def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
         for view, text in (
             ("lines", "Wire used"),
             ("faults", "Lasting: 0"),
-            ("log", "Nothing was written yet."),
+            ("log", "No writes yet."),
         ):
             page.evaluate("view => { location.hash = `#/${view}` }", view)
             page.locator(f"#{view}").get_by_text(text).first.wait_for()
@@ -52,7 +52,7 @@ def test_a_stop_asks_for_the_token_that_the_gateway_wants(page: Any, tmp_path: P
         page.get_by_label("Token").fill(
             next(s for right, s in gateway.secrets.items() if right.name == "STOP")
         )
-        page.get_by_role("button", name="Sign in and send it").click()
+        page.get_by_role("button", name="Sign in and send").click()
         page.get_by_role("heading", name="All 2 drives are stopped").wait_for()
         until(page, "document.querySelector('#role').textContent === 'may stop'")
 

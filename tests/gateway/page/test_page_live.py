@@ -43,12 +43,12 @@ def test_a_killed_gateway_is_told(opened: Opener, gateway: FakeGateway) -> None:
     assert re.fullmatch(r"\d+ s old", link(page))
     notice = page.locator("#notice").inner_text()
     assert "cannot be reached" in notice
-    assert re.search(r"What is shown is of \d\d:\d\d:\d\d UTC\.", notice)
+    assert re.search(r"The values shown are from \d\d:\d\d:\d\d UTC\.", notice)
     until_met(page, lambda: page.locator(FRESH).count() == 0)
     shown = cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
     assert re.search(r"^\d+\.\d+Hz\d+(\.\d)? s old$", shown)
     assert cell(page, "pump-1", "state").inner_text().strip() == "last: runs"
-    assert page.locator("#said").inner_text() == "Values are old: no new ones come."
+    assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 
 def test_a_gateway_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -> None:

@@ -15,7 +15,7 @@ from multidrop.gateway.http.rights import Right
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
-READ_AGAIN = "Read the plant file again"
+READ_AGAIN = "Reload the plant file"
 
 
 def tab_to(page: Any, name: str) -> None:

@@ -174,7 +174,7 @@ def test_drives_that_did_not_stop_are_named(opened: Opener, gateway: FakeGateway
     page = opened()
     page.locator("#stopall").click()
     page.get_by_role("button", name="Stop all 31 drives").click()
-    told(page, "1 of 31 drives not known to be stopped")
+    told(page, "1 of 31 drives are not confirmed as stopped")
     assert page.locator("#ask .outcome li").all_inner_texts() == ["pump-3: no reply; it may still run"]
     assert "hard stop" in page.locator("#ask").inner_text()
     gateway.outcomes = {}
@@ -187,12 +187,12 @@ def test_a_stop_that_may_not_have_arrived_is_not_called_sent(opened: Opener, gat
     gateway.kill()
     page.locator("#stopall").click()
     page.get_by_role("button", name="Stop all 31 drives").click()
-    told(page, "It is not known that the stop was sent")
+    told(page, "It is unknown whether the stop was sent")
     assert "cannot be reached" in page.locator("#ask").inner_text()
     assert page.get_by_role("button", name="Send the stop again").is_visible()
 
 
-UNTAKEN = "The gateway has not taken the stop"
+UNTAKEN = "The gateway has not accepted the stop"
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
@@ -258,7 +258,7 @@ def test_a_stop_without_the_right_asks_for_a_token_and_goes_on(opened: Opener, g
     press_enter(page)
     page.get_by_text("No such token is known.").wait_for()
     page.get_by_label("Token").fill("right")
-    page.get_by_role("button", name="Sign in and send it").click()
+    page.get_by_role("button", name="Sign in and send").click()
     told(page, "All 31 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
@@ -349,7 +349,7 @@ def test_nothing_that_comes_later_takes_the_place_of_a_stop_s_question(
     page.route(f"**/{path}", lambda route: held.append(route))
     if case == "a reload":
         page.locator("#more").click()
-        page.get_by_role("button", name="Read the plant file again").click()
+        page.get_by_role("button", name="Reload the plant file").click()
         page.get_by_role("button", name="Read bottling plant.toml").click()
     else:
         page.get_by_role("button", name="Change frequency setpoint").click()

@@ -274,10 +274,10 @@ def test_on_a_phone_several_drives_are_chosen_at_once_and_told_apart(opened: Ope
     until(page, DRAWN)
     heads = page.locator("#trend-plots .plothead output")
     assert heads.all_inner_texts() == ["", ""]  # one drive needs no legend
-    page.get_by_text("What is shown").click()
+    page.get_by_text("Quantities").click()
     for name in ("pump-1", "filler-1"):
         page.get_by_label(name, exact=True).check()  # which the list is not folded up by
-    page.get_by_text("What is shown").click()
+    page.get_by_text("Quantities").click()
     until_met(page, lambda: heads.first.locator("canvas").count() == 3)
     assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
     marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
@@ -309,8 +309,8 @@ def test_a_time_of_which_the_gateway_knows_nothing_is_not_shown_as_one_without_f
     until_met(page, lambda: lanes.all_inner_texts() == ["none known"] * 2)
     gateway.knows_since = 1764077400000
     page.get_by_role("button", name="Later").click()
-    page.get_by_role("button", name="Back to the span before").click()
-    unknown = "not known: the gateway began later"
+    page.get_by_role("button", name="Back to the previous range").click()
+    unknown = "unknown: the gateway started later"
     until_met(page, lambda: lanes.all_inner_texts() == [unknown] * 2)
     part = "bars => bars.map(bar => bar.firstChild.offsetWidth / bar.clientWidth)"
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))

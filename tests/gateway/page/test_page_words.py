@@ -68,7 +68,7 @@ def test_a_gateway_that_stays_away_is_told_of_in_one_sentence(opened: Opener, ga
     page = opened()
     with page.expect_event("requestfailed", lambda request: request.url.endswith("/api/plant")):
         gateway.kill()
-    told = r"The gateway cannot be reached\. What is shown is of \d\d:\d\d:\d\d UTC\."
+    told = r"The gateway cannot be reached\. The values shown are from \d\d:\d\d:\d\d UTC\."
     page.wait_for_timeout(1000)
     assert re.fullmatch(told, page.locator("#notice").inner_text())
 
@@ -119,7 +119,7 @@ def test_one_drive_is_one(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
     gateway.changes = {"alarms": []}
     page = opened()
-    until_met(page, lambda: page.locator("#strip").inner_text() == "1 drive, no fault known, none silent.")
+    until_met(page, lambda: page.locator("#strip").inner_text() == "1 drive, no known fault, none silent.")
     page.locator("#stopall").click()
     assert page.locator("#ask-title").inner_text() == "Stop all drives?"
     page.keyboard.press("Escape")
@@ -164,7 +164,7 @@ def test_the_hour_ends_with_its_newest_minute(opened: Opener, gateway: FakeGatew
     assert hour.locator(".minutes > div").evaluate_all(bars) == [0] * 58 + [1, 1]
     assert hour.locator(".ends span").all_inner_texts() == ["23:01 UTC", "at most 2 a minute", "00:00"]
     begun = page.get_by_role("article", name="hall-2")
-    assert "No whole minute is counted yet." in begun.inner_text()
+    assert "No full minute counted yet." in begun.inner_text()
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -78,9 +78,9 @@ def test_an_answer_that_breaks_off_is_no_answer(opened: Opener, gateway: FakeGat
     page.get_by_role("button", name="start").click()
     page.get_by_role("button", name="start pump-1").click()
     outcome = page.locator("#outcomes li").inner_text()
-    assert "The gateway's answer broke off." in outcome
+    assert "The gateway's answer was cut off." in outcome
     assert "not known whether it was carried out" in outcome
-    page.locator("#writes").get_by_text("The gateway's answer broke off.").wait_for()
+    page.locator("#writes").get_by_text("The gateway's answer was cut off.").wait_for()
 
 
 def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: FakeGateway) -> None:
@@ -235,7 +235,7 @@ def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, ga
     page.get_by_role("button", name="start pump-1").click()
     page.locator("#outcomes li").wait_for()
     said = page.locator("#outcomes").inner_text()
-    assert "start: not sent. A stop of it was called meanwhile." in said
+    assert "start: not sent. The drive was stopped in the meantime." in said
     assert gateway.posts == []
     page.get_by_role("button", name="start", exact=True).click()
     page.get_by_role("button", name="start pump-1").click()
@@ -253,7 +253,7 @@ def test_a_plant_that_is_read_anew_behind_the_dialog_ends_a_start(
     page.get_by_role("button", name="start pump-1").click()
     page.locator("#outcomes li").wait_for()
     said = page.locator("#outcomes").inner_text()
-    assert "start: not sent. The plant was read anew meanwhile." in said
+    assert "start: not sent. The plant file was reloaded in the meantime." in said
     assert gateway.posts == []
     page.get_by_role("button", name="start", exact=True).click()
     page.get_by_role("button", name="start pump-1").click()

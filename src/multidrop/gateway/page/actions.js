@@ -1,4 +1,4 @@
-// Writes and verbs of one drive: each confirmed by name, sent once, and told of as the gateway says.
+// Writes and verbs of one drive: confirmed by name, sent once, reported in the gateway's words.
 
 import { Refused } from "./api.js";
 import { DANGER, STOP, confirm, confirmForm, send } from "./ask.js";
@@ -64,15 +64,16 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-// Return what makes the body at its confirmation, with the frame that was seen then; to be called as it is
-// asked for. What comes behind the dialog is seen by nobody: after a stop of the drive, or with another
-// plant, whose drives may have each other's names, it fails.
+// Return a function that makes the body at confirmation, with the frame seen then. Call it when the dialog
+// opens: frames behind the dialog are not seen. It fails after a stop of the drive or a reload of the
+// plant, in which names may mean other drives.
 function seen(drive) {
   const stopped = stops(drive),
     { revision } = store.plant;
   return body => () => {
-    if (stops(drive) !== stopped) throw new Refused(409, "A stop of it was called meanwhile.");
-    if (store.frame?.revision !== revision) throw new Refused(409, "The plant was read anew meanwhile.");
+    if (stops(drive) !== stopped) throw new Refused(409, "The drive was stopped in the meantime.");
+    if (store.frame?.revision !== revision)
+      throw new Refused(409, "The plant file was reloaded in the meantime.");
     return { ...body, seen: store.frame.n };
   };
 }
@@ -90,12 +91,12 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
       false,
       isRefused
         ? `not sent. ${error.message}`
-        : `${error.message} It is not known whether it was carried out.`,
+        : `${error.message} The outcome is unknown.`,
     );
   }
 }
 
-// Ask, and give a verb: with a frequency where it takes one.
+// Ask for confirmation and send a verb, with a frequency if it takes one.
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
     asked = WITH_HZ.has(verb) ? hertz(drive) : null,
@@ -103,8 +104,8 @@ export async function act(drive, verb) {
     isStop = STOPS.has(verb),
     kind = isStop ? STOP : DANGER;
   const warning = turns
-    ? "The motor will turn. Make sure that nobody is near what it drives."
-    : "It is sent once.";
+    ? "The motor will turn. Make sure that nobody is near the machine."
+    : "The command is sent once.";
   const contents = [make("p", { class: turns ? "bad" : "" }, warning), ...(asked?.contents ?? [])];
   const asks = asked ? confirmForm : confirm;
   const title = [`${words(verb)}: `, named(drive), "?"],
@@ -116,8 +117,8 @@ export async function act(drive, verb) {
   await deliver(drive, what, "api/act", isStop ? () => body : withSeen(body), kind);
 }
 
-// Return the field of a frequency and what stands around it. Of a setpoint in another unit than Hz the value
-// is shown, and a register of the largest frequency alone is a limit.
+// Return the field of a frequency with its texts. If the setpoint has another unit than Hz, its value
+// is shown, and only the register of the maximum frequency is a limit.
 function hertz(drive) {
   const { registers } = store.drives.get(drive);
   const setpoint = registers.get(key(drive, "setpoint"));
@@ -136,7 +137,7 @@ function hertz(drive) {
   };
 }
 
-// Return the value of a register, or null where it is not known now.
+// Return the present value of a register, or null if it is unknown.
 function held(drive, register) {
   const found = known(drive, register, now());
   return found && !found.isOld ? found.value : null;
@@ -152,22 +153,22 @@ function limits(drive, { least, most, at_least: atLeast, at_most: atMost }) {
   return [Math.max(...ends[0]), Math.min(...ends[1])].map(end => (Number.isFinite(end) ? end : null));
 }
 
-// Say what a register holds, as far as that is known.
+// Return a sentence with a register's value.
 function present(drive, register) {
   const current = known(drive, register.name, now());
-  if (!current || current.value === null) return `The value of ${words(register.name)} is not known.`;
+  if (!current || current.value === null) return `The value of ${words(register.name)} is unknown.`;
   const shown = withUnit(text(current.value, register), register);
-  const past = current.isOld ? `not known now; ${clock.lasting(current.age)} ago it was ` : "";
+  const past = current.isOld ? `unknown now; ${clock.lasting(current.age)} ago it was ` : "";
   return `${words(register.name)} is ${past}${shown}.`;
 }
 
-// Say which values may be written.
+// Return a sentence with the allowed values.
 function span([least, most], of) {
   const bounds = [
     ["from", least],
     ["to", most],
   ].flatMap(([word, end]) => (end === null ? [] : [`${word} ${end}`]));
-  return bounds.length ? `Allowed: ${`${bounds.join(" ")} ${of}`.trim()}.` : "No limits are known.";
+  return bounds.length ? `Allowed: ${`${bounds.join(" ")} ${of}`.trim()}.` : "No limits known.";
 }
 
 // Ask for a value, and write it.
@@ -198,7 +199,7 @@ export async function change(drive, register) {
 
 const FIELD = { id: "new-value", required: true, "data-first": true };
 
-// It begins empty: Enter alone sends nothing, least of all a value that is no longer true.
+// It is empty at first, so that Enter alone sends nothing.
 function editor(register, [least, most]) {
   if (register.kind === "words" && register.words) {
     return make(

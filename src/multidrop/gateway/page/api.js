@@ -1,4 +1,4 @@
-// Requests to the gateway. What goes wrong is an Error whose message is a sentence for a person.
+// Requests to the gateway. Failures are Errors whose message is a sentence for the user.
 
 export class Refused extends Error {
   constructor(status, message) {
@@ -17,15 +17,15 @@ async function ask(path, options, patience, answered = () => {}) {
     throw new Refused(
       0,
       error.name === "TimeoutError"
-        ? `The gateway has not answered for ${Math.round(patience / 1000)} s.`
+        ? `No answer from the gateway for ${Math.round(patience / 1000)} s.`
         : "The gateway cannot be reached.",
     );
   }
   answered();
   const body = await response.json().catch(() => null);
   if (!response.ok)
-    throw new Refused(response.status, body?.error ?? `The gateway answers ${response.status}.`);
-  if (body === null) throw new Refused(0, "The gateway's answer broke off.");
+    throw new Refused(response.status, body?.error ?? `The gateway answered with status ${response.status}.`);
+  if (body === null) throw new Refused(0, "The gateway's answer was cut off.");
   return body;
 }
 

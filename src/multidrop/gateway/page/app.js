@@ -21,13 +21,13 @@ import * as trends from "./trends.js";
 
 const VIEWS = ["drives", "trends", "faults", "lines", "log", "fleet"];
 const BEAT_MS = 100;
-const WIDE = 1000; // px: from here the panel stands beside the table
+const WIDE = 1000; // px: minimum width for the panel beside the table
 
 let view = "drives",
   chosen = null,
   beat = 0;
 
-// Show what the address names: "#/drives/pump-1", "#/trends?drive=pump-1".
+// Show the view of the address, such as "#/drives/pump-1" or "#/trends?drive=pump-1".
 function route() {
   const [path, options] = location.hash.replace(/^#\/?/, "").split("?");
   const [name, rest] = path.split("/");
@@ -65,7 +65,7 @@ function showDrive(name, isOpen) {
   else if (wasOpen && !isOpen) table.focusChosen();
 }
 
-// Draw one part; where it breaks, the others go on.
+// Draw one part; if it fails, the others continue.
 function safely(what) {
   try {
     what();
@@ -91,7 +91,7 @@ function tick() {
   if (view === "drives" && beat % 20 === 0) drive.refresh();
 }
 
-// Make plots anew: their size, colours or times are others.
+// Rebuild the plots after a change of size, colours or time zone.
 function redraw() {
   if (view === "drives" && store.drives.has(chosen))
     safely(() => plots.begin(store.drives.get(chosen).spec));

@@ -1,17 +1,16 @@
-// The page's one dialog: it asks before anything is sent, asks for a token, and tells what became of it.
+// The page's only dialog: asks for confirmation, for a token, and shows results.
 
 import { post } from "./api.js";
 import { find, fill, make } from "./dom.js";
 
-let answer = null, // settles the question that stands now
-  stopAsked = null; // that question's answer, where it asks for a stop
+let answer = null, // resolves the open question
+  stopAsked = null; // the answer to the open question if it asks for a stop
 
 const dialog = () => find("#ask");
 
-// The second click of a double click means what the first one pressed. Where the dialog opened or closed in
-// between it would press what nobody looked at, so it is not taken, but for a stop. Nor is a click that was
-// made before the change was drawn, as on a page that is slow: it waited for its turn. Nor is Enter or Space
-// of then, nor a held one.
+// The second click of a double click belongs to the button of the first. If the dialog opened or closed in
+// between, it would press an unseen button, so it is ignored, except for a stop. The same holds for clicks,
+// Enter and Space that came before the change was drawn, for example on a slow page, and for held keys.
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
@@ -38,7 +37,7 @@ function isOfBefore({ clientX: x, clientY: y, timeStamp: time, detail }) {
   return time < drawn || (isNear && (detail > 1 || time - Math.max(last.time, drawn) < TWICE_MS));
 }
 
-// Beside the dialog there is nothing but Stop all, which lies behind it.
+// Outside the dialog only Stop all can be used, which lies behind it.
 const isAtOnce = target => target === dialog() || target.closest?.(AT_ONCE);
 
 addEventListener(
@@ -71,16 +70,15 @@ for (const kind of ["keydown", "keyup"])
     true,
   );
 
-// Show the dialog and return what was chosen, as `show` does. A question whether to stop is asked at once,
-// and what else there is to ask or tell comes after its answer: it takes no stop from under the hand that
-// gives it.
+// Show the dialog and return the choice, as `show` does. The question of a stop opens at once; other dialogs
+// wait until it is answered.
 async function open(title, contents, buttons, { cancel = "Cancel", kind } = {}) {
   if (kind === STOP) return (stopAsked = show(title, contents, buttons, cancel));
   while (stopAsked) await stopAsked;
   return show(title, contents, buttons, cancel);
 }
 
-// Show the dialog and return what was chosen: a button's name, or null for cancelled. `buttons` are
+// Show the dialog and return the choice: a button's name, or null for cancelled. `buttons` are
 // [name, text, class]; Cancel comes first and has the focus, so that Enter alone does nothing.
 function show(title, contents, buttons, cancel) {
   answer?.(null);
@@ -123,7 +121,7 @@ function show(title, contents, buttons, cancel) {
     close(null);
   };
   changed();
-  if (dialog().open) dialog().close(); // opened anew, it is read out
+  if (dialog().open) dialog().close(); // reopened, so that screen readers read it out
   dialog().showModal();
   (find("[data-first]", form) ?? first).focus();
   return new Promise(done => {
@@ -131,18 +129,18 @@ function show(title, contents, buttons, cancel) {
   });
 }
 
-// Ask for a confirmation. Return true where it is given.
+// Ask for confirmation. Return true if it is given.
 export const confirm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["yes", yes, kind]], { kind })) === "yes";
 
-// Ask for what a form in `contents` holds. Return true where it is to be sent.
+// Show a form in `contents`. Return true if it is submitted.
 export const confirmForm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["submit", yes, kind]], { kind })) === "submit";
 
-// Show something until it is closed. Return the name of the other button where that was pressed.
+// Show a message until it is closed. Return the name of another button if that was pressed.
 export const tell = (title, contents, buttons = []) => open(title, contents, buttons, { cancel: "Close" });
 
-// Ask for a token until one is right. Return true where the gateway took it.
+// Ask for a token until one is right. Return true if the gateway accepted it.
 export async function askToken(why, yes = "Sign in", kind = DANGER) {
   let wrong = null;
   for (;;) {
@@ -159,7 +157,7 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
       make("label", { for: "token", class: "field" }, "Token", field),
       wrong && make("p", { id: "token-wrong", class: "bad" }, wrong),
     ];
-    if (!(await confirmForm("Who are you?", contents, yes, kind))) return false;
+    if (!(await confirmForm("Sign in with a token", contents, yes, kind))) return false;
     try {
       await post("api/token", { token: field.value, ...(kind === STOP ? { to: "stop" } : {}) });
       dispatchEvent(new Event("signed"));
@@ -190,8 +188,8 @@ export async function send(path, body, { kind = DANGER, patience = patienceOf(ki
     return await sent();
   } catch (error) {
     if (error.status !== 401 && error.status !== 403) throw error;
-    const why = `${error.message} A token with the right to it is needed.`;
-    if (!(await askToken(why, "Sign in and send it", kind))) throw error;
+    const why = `${error.message} A token with this right is needed.`;
+    if (!(await askToken(why, "Sign in and send", kind))) throw error;
     return await sent();
   }
 }

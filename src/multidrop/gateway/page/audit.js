@@ -1,4 +1,4 @@
-// The audit log: every write that was sent, who asked for it, and what became of it.
+// The audit log: all writes with their callers and results.
 
 import { get, query } from "./api.js";
 import * as clock from "./clock.js";
@@ -17,14 +17,14 @@ export function begin() {
       "div",
       { class: "card" },
       make("h2", {}, "Audit log"),
-      make("p", { class: "note" }, "Every write that was sent, newest first."),
+      make("p", { class: "note" }, "All writes sent, newest first."),
       make("div", { id: "log-list", class: "scroll" }),
       make("button", { type: "button", id: "older", hidden: true, onclick: older }, "Older"),
     ),
   );
 }
 
-// Ask for the newest entries and draw them. Those that were asked for as older go.
+// Fetch and draw the newest entries, in place of older ones.
 export async function show() {
   [entries, more] = [[], false];
   await fetchMore("");
@@ -40,7 +40,7 @@ async function fetchMore(before) {
     more = Boolean(told.more);
     fill(
       list,
-      entries.length ? auditRows(entries, true) : make("p", { class: "note" }, "Nothing was written yet."),
+      entries.length ? auditRows(entries, true) : make("p", { class: "note" }, "No writes yet."),
     );
   } catch (error) {
     fill(list, make("p", { class: "note bad" }, error.message));
@@ -48,7 +48,7 @@ async function fetchMore(before) {
   find("#older").hidden = !more;
 }
 
-// Draw what is shown anew, in another time zone.
+// Redraw in another time zone.
 export const redraw = () => entries.length && fill(find("#log-list"), auditRows(entries, true));
 
 // Return a table of entries, at most so many rows; `isWhole`: with the drive and the frame too.

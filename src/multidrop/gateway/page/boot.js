@@ -1,9 +1,9 @@
-// Load the page again where a script could not be fetched: a network that changes breaks off all requests.
+// Reload the page if a script could not be fetched: a network change aborts all requests.
 
 const MOST_TIMES = 3,
   PAUSE_MS = 500;
 
-// Not while a person is asked something, such as whether to stop.
+// Not while a dialog is open, such as the one for a stop.
 const loadAgain = () => document.querySelector("dialog[open]") || location.reload();
 
 addEventListener(

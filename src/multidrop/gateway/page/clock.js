@@ -44,7 +44,7 @@ export const day = ms => formatted(ms, "day", DAY);
 export const milli = ms =>
   `${time(ms)}.${String(((Math.floor(ms) % 1000) + 1000) % 1000).padStart(3, "0")}`;
 
-// Return the day and the time, the day with its year where it is not this one.
+// Return date and time, with the year if it is not the present one.
 export function moment(ms) {
   const far = Math.abs(Date.now() - ms) > 300 * 86400e3;
   return `${formatted(ms, far ? "year" : "day", far ? { ...DAY, year: "numeric" } : DAY)}, ${time(ms)}`;
@@ -72,7 +72,7 @@ export function lasting(ms) {
   return `${Math.round(s / 86400)} days`;
 }
 
-// Return for how long an alarm has lasted; one that was there at the first look began before.
+// Return how long an alarm has lasted; one present at the start began before.
 export const since = ({ time: begin, is_before: isBefore }, t) =>
   isBefore ? `since before ${when(begin).slice(0, -3)}` : lasting(t - begin);
 

@@ -19,7 +19,7 @@ export function build(spec) {
   );
 }
 
-// Ask anew. What cannot be had is said in its place.
+// Fetch and redraw; a failure is shown in place of its data.
 export async function refresh() {
   const asked = name;
   const [told, log] = await Promise.allSettled([
@@ -48,13 +48,13 @@ function delays({ delays, misses, asked, ledger }) {
     make(
       "p",
       { class: "note" },
-      `Response delay: half within ${milliseconds(delays?.p50)}, 99 % within ${milliseconds(delays?.p99)}.`,
+      `Response delay: 50 % within ${milliseconds(delays?.p50)}, 99 % within ${milliseconds(delays?.p99)}.`,
     ),
     delays?.counts?.length ? histogram(delays.counts) : null,
     make(
       "p",
       { class: "note" },
-      asked ? `Missed ${total} of ${asked} values, ${share(total / asked)}.` : "Nothing was asked yet.",
+      asked ? `Missed ${total} of ${asked} values, ${share(total / asked)}.` : "No values requested yet.",
     ),
     total
       ? make(
@@ -74,7 +74,7 @@ function delays({ delays, misses, asked, ledger }) {
       ? make(
           "p",
           { class: "note" },
-          "EEPROM writes of the last year: " +
+          "EEPROM writes in the last year: " +
             ledger.map(l => `${words(l.register)} ${l.year} of ${l.budget ?? UNKNOWN}`).join(", "),
         )
       : null,
@@ -112,5 +112,5 @@ function writes({ entries }, drive) {
   const own = (entries ?? []).filter(entry => entry.drive === drive);
   return own.length
     ? auditRows(own, false, 20)
-    : make("p", { class: "note" }, "None among the newest 200 of the log.");
+    : make("p", { class: "note" }, "None among the newest 200 writes.");
 }

@@ -2,7 +2,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 
-// Return an element. `attributes` are set one by one, those that begin with "on" as listeners, `class` as
+// Return an element. `attributes` are set one by one, those with the prefix "on" as listeners, `class` as
 // the class; null and false leave an attribute away. Children are elements, texts, or null for none.
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
@@ -47,7 +47,7 @@ export function glyph(name) {
   return svg;
 }
 
-// Set a text, where it is another one than before: most cells stay as they are.
+// Set a text if it has changed: most cells stay the same.
 export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

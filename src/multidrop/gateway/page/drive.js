@@ -1,4 +1,4 @@
-// One drive: what it does now, its plots, registers, delays, and what became of writes.
+// One drive: state, plots, registers, delays and results of writes.
 
 import * as actions from "./actions.js";
 import * as clock from "./clock.js";
@@ -16,7 +16,7 @@ const KEYS = [
   ["setpoint", "Setpoint"],
   ["current", "Current"],
 ];
-const TITLES = { motor_speed: "Motor speed" }; // of what stands for a frequency that a family does not tell
+const TITLES = { motor_speed: "Motor speed" }; // label of a register shown in place of the frequency
 
 let chosen = null,
   parts = null;
@@ -41,7 +41,7 @@ export function show(name, isOpen) {
         "p",
         { class: "empty" },
         name === null || !store.plant
-          ? "Choose a drive to see its plots and registers."
+          ? "Select a drive to see its plots and registers."
           : ["There is no drive ", named(name), " in this plant."],
       ),
     );
@@ -101,7 +101,7 @@ function build({ spec, line }) {
   plots.begin(spec);
 }
 
-// Draw texts anew, a few times a second.
+// Update the texts, a few times a second.
 export function draw() {
   if (!parts) return;
   const t = now(),

@@ -36,14 +36,14 @@ export function begin() {
       make(
         "p",
         { class: "note" },
-        "What lasts, the gravest first, and what ended in the last 30 days.",
+        "Active alarms, most serious first, and alarms that ended in the last 30 days.",
       ),
       make("div", { id: "fault-list", class: "scroll" }),
     ),
   );
 }
 
-// Draw the list anew, where it is another one.
+// Redraw the list if it has changed.
 export async function show() {
   const [found] = await read(now() - SPAN_MS, now()),
     sign = JSON.stringify([found, clock.zoneName()]),
@@ -56,11 +56,11 @@ export async function show() {
       .filter(alarm => alarm.ended === null)
       .sort((a, b) => rank(a).localeCompare(rank(b)) || b.time - a.time),
     ended = found.filter(alarm => alarm.ended !== null);
-  fill(list, part(`Lasting: ${lasting.length}`, lasting), part(`Ended: ${ended.length}`, ended));
+  fill(list, part(`Active: ${lasting.length}`, lasting), part(`Ended: ${ended.length}`, ended));
 }
 
 function part(title, alarms) {
-  const heads = [`Since, ${clock.zoneName()}`, "Drive", "Kind", "What was said", "Lasted", ""];
+  const heads = [`Since, ${clock.zoneName()}`, "Drive", "Kind", "Message", "Duration", ""];
   return make(
     "section",
     {},
@@ -92,10 +92,10 @@ function row(alarm) {
   );
 }
 
-// Return for how long an alarm lasted. Of a dead gateway nothing lasts on.
+// Return an alarm's duration; it is frozen when the gateway is lost.
 function lasted({ time, ended, is_before: isBefore }) {
   const t = now(),
-    isNew = isLive(t) || store.frame === null, // before the first frame the gateway has just told the list
+    isNew = isLive(t) || store.frame === null, // before the first frame the list is fresh
     seen = ended ?? (isNew ? t : store.time);
   return `${isBefore ? "over " : ""}${clock.lasting(seen - time)}${ended === null ? " so far" : ""}`;
 }
@@ -121,18 +121,18 @@ function trendLink({ drive, time, ended }) {
   return make("a", { href: `#/trends?drive=${encodeURIComponent(drive)}&from=${from}&to=${to}` }, "Trend");
 }
 
-// Ask for a note, and tell the gateway that somebody has seen an alarm.
+// Ask for a note, and acknowledge an alarm.
 async function acknowledge({ id, drive, line, text }) {
   const field = make("input", { id: "ack-note", maxlength: MOST_NOTE, "data-first": true });
   const contents = [
     make("p", {}, named(drive || `line ${line}`), ": ", named(text)),
-    make("label", { class: "field", for: "ack-note" }, "Note, if any", field),
+    make("label", { class: "field", for: "ack-note" }, "Note (optional)", field),
   ];
   if (!(await confirmForm("Acknowledge this alarm?", contents, "Acknowledge"))) return;
   try {
     await send("api/acknowledge", () => ({ alarm: id, note: field.value.trim() }));
   } catch (error) {
-    await tell("The alarm is not acknowledged", [make("p", { class: "bad" }, error.message)]);
+    await tell("The alarm was not acknowledged", [make("p", { class: "bad" }, error.message)]);
   }
   await show();
 }

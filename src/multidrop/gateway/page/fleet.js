@@ -1,5 +1,5 @@
-// The fleet that this gateway looks at: its gateways, who is master of each line, and the last moves.
-// What is old is marked so, with its age; what a gateway does not answer is a dash.
+// The fleet: its gateways, the master of each line, and the latest moves.
+// Old data are marked with their age; missing answers are dashes.
 
 import { get } from "./api.js";
 import * as clock from "./clock.js";
@@ -20,11 +20,11 @@ const TABLES = {
     ],
   ],
   lines: ["Lines", ["Line", "Port", "Master", "Since"]],
-  moves: ["Last moves", ["Line", "Time", "From", "To"]],
+  moves: ["Latest moves", ["Line", "Time", "From", "To"]],
 };
 
 let newest = null,
-  silent = new Set(), // gateways that do not answer: nobody may poll their lines
+  silent = new Set(), // gateways that do not answer: their lines may be unpolled
   ordered = [], // lines
   cameAt = 0, // by this device's own clock
   why = "",
@@ -61,7 +61,7 @@ function card(id, title, heads) {
   );
 }
 
-// Ask for the fleet, and draw what is known with its age meanwhile.
+// Fetch the fleet; until then draw the previous data with their age.
 export function show() {
   draw();
   if (!isAsking) ask();
@@ -93,11 +93,11 @@ function draw() {
   const members = Object.entries(gateways),
     free = ordered.filter(([, { master }]) => master === null).length,
     unsure = ordered.filter(([, { master }]) => silent.has(master)).length,
-    others = unsure ? `, ${unsure} whose master does not answer` : "",
+    others = unsure ? `, ${unsure} with a master that does not answer` : "",
     more = ordered.length > MOST_LINES ? `; the first ${MOST_LINES} are shown` : "";
   note("gateways", members.flatMap(troubles).join("; "), true);
   note("lines", `${ordered.length} lines, ${free} without a master${others}${more}`, free + unsure > 0);
-  note("moves", "A dash stands for a master that nobody saw.", false);
+  note("moves", "A dash means that no master was seen.", false);
   drawTable("gateways", members.map(gateway));
   drawTable("lines", ordered.slice(0, MOST_LINES).map(line));
   drawTable("moves", moves.map(move));
@@ -116,10 +116,10 @@ function troubles([name, { says }]) {
 }
 
 function drawAge(age, isOld) {
-  const seen = age === null ? "Nothing of the fleet was seen yet" : `Seen ${clock.lasting(age * 1000)} ago`,
+  const seen = age === null ? "The fleet has not been seen yet" : `Seen ${clock.lasting(age * 1000)} ago`,
     reason = why || newest?.trouble,
     place = find("#fleet-age");
-  const said = isOld ? `${seen}${reason ? `: ${reason}` : ""}` : "Looked at once a second.";
+  const said = isOld ? `${seen}${reason ? `: ${reason}` : ""}` : "Updated once a second.";
   put(place, `${said}${said.endsWith(".") ? "" : "."} Times are ${clock.zoneName()}.`);
   setClass(place, "bad", isOld);
   setClass(find("#fleet"), "stale", isOld);
@@ -141,7 +141,7 @@ function drawTable(id, made) {
   );
 }
 
-// Return the cells of a gateway. What it does not say itself is not known.
+// Return the cells of a gateway; values that it does not report are unknown.
 function gateway([name, { host, session, began_ms: began, lines, says }]) {
   const spool = says?.spool;
   return [

@@ -1,4 +1,4 @@
-// What the gateway recorded: series of a span of time, and links that save them.
+// The recorded history: series of a time range, and links to download them.
 
 import { get, query } from "./api.js";
 import { holdsFor } from "./store.js";
@@ -51,16 +51,16 @@ function withoutPauses(series, longest) {
 // Return the unit of a series: a name may have been another drive's when it was recorded.
 export const unitOf = (told, spec) => told.unit ?? unit(spec);
 
-// Return true where a series is of the same unit as its register is now.
+// Return true if a series has the present unit of its register.
 export const isPresent = (told, spec) => unitOf(told, spec) === unit(spec);
 
-// Return a sentence about each series of which a part is not drawn, since it has another unit.
+// Return a sentence for each series with a part in another unit, which is not drawn.
 export const leftOut = series =>
   Object.entries(series)
     .filter(([, told]) => told.left_out?.length)
     .map(([name, told]) => {
       const others = told.left_out.map(other => other || "no unit").join(", ");
-      return `${name} was recorded in ${others} too, which is not drawn.`;
+      return `${name} was also recorded in ${others}; that is not drawn.`;
     });
 
 export const exportLink = (labels, from, to, format) =>

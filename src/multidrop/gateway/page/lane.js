@@ -11,7 +11,7 @@ const LANES = [
 ];
 let serial = 0;
 
-// Draw the alarms of these drives between two times into a place.
+// Draw the alarms of these drives between two times.
 export async function draw(place, from, to, drives) {
   const mine = ++serial;
   if (!drives.length) {
@@ -37,16 +37,16 @@ export async function draw(place, from, to, drives) {
           { class: "bars" },
           since > from ? unknown(since, from, to) : null,
           there.map(alarm => bar(alarm, from, to)),
-          there.length || since > from ? null : make("span", { class: "none" }, "none known"),
+          there.length || since > from ? null : make("span", { class: "none" }, "none"),
         ),
       );
     }),
   );
 }
 
-// Return a bar over the time of which the gateway, which began later, knows nothing.
+// Return a bar over the time before the gateway started.
 function unknown(since, from, to) {
-  const text = "not known: the gateway began later",
+  const text = "unknown: the gateway started later",
     shown = make("span", { class: "unknown", title: text }, text);
   shown.style.left = 0;
   shown.style.width = `${Math.min(1, (since - from) / (to - from)) * 100}%`;

@@ -10,7 +10,7 @@ import { count, milliseconds, share, UNKNOWN } from "./values.js";
 
 let shown = "";
 
-// Ask for the hour and draw everything anew.
+// Fetch the last hour and redraw everything.
 export async function show() {
   if (!store.plant) return;
   let told = {},
@@ -61,10 +61,10 @@ function figures({ used = null, planned = null, rate = null, p99 = null, misses:
   mark.hidden = planned === null;
   bar.append(part, mark);
   const pairs = [
-    ["Wire used", [share(used), bar]],
+    ["Line time used", [share(used), bar]],
     [
       "Planned",
-      [share(planned), isOver ? make("small", { class: "warn" }, " more is used than planned") : null],
+      [share(planned), isOver ? make("small", { class: "warn" }, " more than planned") : null],
     ],
     ["Exchanges", [rate === null ? UNKNOWN : `${rate.toFixed(1)} /s`]],
     ["Delay, 99 % within", [milliseconds(p99)]],
@@ -92,7 +92,7 @@ function delays(line, told) {
       make(
         "table",
         { class: "plain delays" },
-        tableHead(["Drive", "Half within", "99 % within", "", "Missed"]),
+        tableHead(["Drive", "50 % within", "99 % within", "", "Missed"]),
         make(
           "tbody",
           {},

@@ -1,12 +1,12 @@
-// The way to the gateway: one request for a frame under way, and how old what it brought is.
+// The connection to the gateway: one pending request for a frame, and the frame's age.
 
 import { get } from "./api.js";
 import { store, takeFrame, takePlant } from "./store.js";
 
-const PATIENCE_MS = 25000; // the gateway answers after 20 s where there is nothing new
+const PATIENCE_MS = 25000; // the gateway answers after 20 s without news
 const AGAIN_MS = 500;
 const NONE = -1; // the number of no frame
-const HIDDEN_MS = 1000; // a tab that nobody sees asks once a second, and holds no connection
+const HIDDEN_MS = 1000; // a hidden tab asks once a second and holds no connection
 
 export const link = { why: "" };
 let under = null; // what cancels the request under way
@@ -27,7 +27,7 @@ function learnSkew(date, sent, received) {
 
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
-// Return the gateway's time in ms; the later one by two clocks, for this device's may be set back.
+// Return the gateway's time in ms, the later of two clocks because this device's may be set back.
 export const now = () =>
   Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
@@ -75,7 +75,7 @@ export async function run() {
   }
 }
 
-// Return what changed since frame `n`, a whole frame where that is not remembered, or null without news.
+// Return the changes since frame `n`, a whole frame if the gateway has forgotten it, or null without news.
 async function newer(n) {
   const sent = Date.now();
   under = new AbortController();
@@ -93,5 +93,5 @@ async function newer(n) {
     );
   }
   const body = await response.json().catch(() => null);
-  throw new Error(body?.error ?? `The gateway answers ${response.status}.`);
+  throw new Error(body?.error ?? `The gateway answered with status ${response.status}.`);
 }

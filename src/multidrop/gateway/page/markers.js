@@ -1,4 +1,4 @@
-// Two markers in the trends, A and B: values at each, and what lies between.
+// Two markers in trends, A and B: values at each, and what lies between.
 
 import * as clock from "./clock.js";
 import { colour, fill, find, make, named, tableHead } from "./dom.js";
@@ -22,7 +22,7 @@ export const buttons = () =>
       "button",
       {
         type: "button",
-        title: `Marker ${name}: at the cursor; arrow keys move it; Delete takes it away`,
+        title: `Marker ${name}: at the cursor; arrow keys move it; Delete removes it`,
         "aria-label": `Marker ${name}`,
         id: `mark-${name}`,
         onclick: () => place(name),
@@ -87,7 +87,7 @@ export function mark(u) {
 // Return the mean of a column at a time, while it holds, or null in a gap.
 const at = (u, column, ms, holdMs) => (ms === null ? null : heldAt(u, column, ms / 1000, holdMs));
 
-// Write the table of what the markers stand on.
+// Write the table of the values at the markers.
 export function draw() {
   const place = find("#marks");
   if (marks.A === null && marks.B === null) {

@@ -17,7 +17,7 @@ export function misses(minutes) {
   }
   const reasons = [...sums.keys()].sort((a, b) => sums.get(b) - sums.get(a)),
     total = [...sums.values()].reduce((a, b) => a + b, 0);
-  if (!minutes.length) return make("p", { class: "note" }, "No whole minute is counted yet.");
+  if (!minutes.length) return make("p", { class: "note" }, "No full minute counted yet.");
   const head = make("h3", {}, `Missed in the last hour: ${total} of ${asked}`);
   if (!total) return make("section", {}, head);
   const most = Math.max(...minutes.map(m => Object.values(m.misses).reduce((a, b) => a + b, 0)));

@@ -15,7 +15,7 @@ const RANGES = [
   [3600, "1 h"],
   [86400, "24 h"],
 ];
-const FROM_HISTORY = 600; // seconds: longer ranges are asked for, shorter ones are drawn from frames
+const FROM_HISTORY = 600; // seconds: longer ranges are fetched, shorter ones drawn from frames
 const ANEW_MS = 5000;
 const POINTS = 400;
 const SYNC = "panel";
@@ -186,7 +186,7 @@ function under(u, specs) {
 const until = () => (isLive(now()) ? store.time : now());
 const needsHistory = () => range > FROM_HISTORY;
 
-// Ask for the recorded past: all of a long range, or what was before this page's first frame.
+// Fetch the recorded past: all of a long range, or the part before this page's first frame.
 async function fetchPast() {
   const mine = ++serial,
     to = until(),
@@ -218,7 +218,7 @@ function link(labels, from, to) {
   if (csv && labels.length) csv.href = exportLink(labels, from, to, "csv");
 }
 
-// Draw the newest samples; ranges that are asked for are drawn when they come.
+// Draw the newest samples; fetched ranges are drawn when they arrive.
 export function draw() {
   for (const { plot, specs, box } of plots) {
     const tables = specs.map(r => samples(r));

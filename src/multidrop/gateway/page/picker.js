@@ -8,8 +8,8 @@ import { unit, words } from "./values.js";
 const MOST_DRIVES = COLOURS.length * DASHES.length;
 
 const NOTE =
-  "The band is the least and the largest value of each point, the line their mean: nothing between two " +
-  "points is left out. A gap is where no value came. Drag to look closer.";
+  "The band shows the smallest and largest value at each point, the line the mean. A gap has no values. " +
+  "Drag to zoom in.";
 
 let chosen = [],
   registers = [],
@@ -24,7 +24,7 @@ export function begin(into, what) {
 
 let wanted = null; // named by an address before the plant was known
 
-// Keep what is chosen as far as this plant has it, and choose something where nothing is.
+// Keep the selection as far as this plant has it; select a default if it is empty.
 export function takePlant() {
   chosen = chosen.filter(name => store.drives.has(name));
   if (wanted !== null) choose(wanted);
@@ -37,7 +37,7 @@ export function takePlant() {
   draw();
 }
 
-// Choose this drive, in the place of those before.
+// Select only this drive.
 export function choose(name) {
   if (!store.plant) wanted = name;
   if (!store.drives.has(name)) return;
@@ -86,7 +86,7 @@ export function draw() {
     make(
       "details",
       { open: isOpen },
-      make("summary", {}, "What is shown"),
+      make("summary", {}, "Quantities"),
       make("h2", {}, "Drives"),
       names.length > 8 ? filter : null,
       list,

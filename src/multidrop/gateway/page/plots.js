@@ -6,7 +6,7 @@ import { number } from "./values.js";
 
 export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
 export const DASHES = [[], [6, 4], [2, 3], [10, 3, 2, 3]]; // a series has a shape too, not its colour alone
-const RIGHT = 28; // px: half the text of a time that stands at the very end
+const RIGHT = 28; // px: half the width of a time label at the end
 const FONT = "11px system-ui, DejaVu Sans, sans-serif";
 
 export const isThere = () => Boolean(globalThis.uPlot);
@@ -84,7 +84,7 @@ export const line = (index, label) => ({
   points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
 
-// Return a short piece of the line of this index, to stand beside its name.
+// Return a short piece of the line of this index for the legend.
 export function swatch(index) {
   const mark = make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }),
     pen = mark.getContext("2d");
@@ -103,7 +103,7 @@ export function join(tables) {
   return there.length === 1 ? there[0] : globalThis.uPlot.join(there);
 }
 
-// Return a sentence about a series for who does not see the plot.
+// Return a sentence about a series for screen readers.
 export function summary(what, values, unit, digits) {
   const there = values.filter(value => value !== null && value !== undefined);
   if (!there.length) return `${what}: no values`;

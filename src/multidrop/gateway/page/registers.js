@@ -1,4 +1,4 @@
-// All registers of the chosen drive: value, unit, place in the manual, and a way to write where it may be.
+// All registers of the selected drive: value, unit, place in the manual, and a button to write.
 
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
@@ -60,7 +60,7 @@ function row({ register, value, age }) {
 const isOffered = ({ name: register, access }) =>
   (access === "setting" || register === key(name, "setpoint")) && mayWrite(name, register);
 
-// Return the register's place in the manual, and what may be asked of it.
+// Return the register's place in the manual, its range and period.
 function about({ place, access, least, most, step, period_s: period, ...register }) {
   const isLimited = typeof least === "number" && typeof most === "number";
   return [

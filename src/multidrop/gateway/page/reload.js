@@ -1,4 +1,4 @@
-// The plant file, read again: asked for first, and told of with every mistake that is in it.
+// Reload of the plant file, with a confirmation and a list of all mistakes.
 
 import { confirm, send, tell } from "./ask.js";
 import { glyph, make, named } from "./dom.js";
@@ -6,8 +6,8 @@ import { store } from "./store.js";
 
 const PATIENCE_MS = 60000; // a plan of many lines is long work
 const WHAT =
-  "What is polled becomes what the file says now. No motor is started or stopped; the drives that leave go " +
-  "on as they are. Where anything in the file is wrong, the plant goes on as before.";
+  "Polling follows the new file. No motor is started or stopped, and motors of removed drives keep their " +
+  "state. If the file has a mistake, nothing changes.";
 
 // Return whether this page's user may have the file read again.
 export const mayReload = () => store.plant?.file === true && store.plant.may?.role === "write";
@@ -15,14 +15,14 @@ export const mayReload = () => store.plant?.file === true && store.plant.may?.ro
 // Ask, and have the plant file read again.
 export async function reload() {
   const file = () => named(store.plant.name);
-  if (!(await confirm(["Read ", file(), " again?"], [make("p", {}, WHAT)], ["Read ", file()]))) return;
-  tell(["Reading ", file(), " …"], [make("p", {}, "The plant is polled meanwhile.")]);
+  if (!(await confirm(["Reload ", file(), "?"], [make("p", {}, WHAT)], ["Reload ", file()]))) return;
+  tell(["Reloading ", file(), " …"], [make("p", {}, "Polling continues.")]);
   let shown;
   try {
     shown = outcome(await send("api/reload", () => ({ confirm: true }), { patience: PATIENCE_MS }));
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
-    const title = isRefused ? "The file was not read" : "It is not known that the file was read";
+    const title = isRefused ? "The file was not reloaded" : "It is unknown whether the file was reloaded";
     shown = [title, make("p", { class: "bad" }, glyph("fault"), ` ${error.message}`)];
   }
   dispatchEvent(new Event("reloaded"));
@@ -33,13 +33,13 @@ export async function reload() {
 function outcome({ done, text, mistakes = [], restart = [] }) {
   if (done === true) {
     const waits = restart.length
-      ? [make("p", {}, "What waits for a restart:"), list(restart, "")]
-      : [make("p", {}, "Nothing in it waits for a restart.")];
+      ? [make("p", {}, "Needs a restart:"), list(restart, "")]
+      : [make("p", {}, "No restart is needed.")];
     return [text, waits];
   }
   const count = mistakes.length === 1 ? "1 mistake" : `${mistakes.length} mistakes`;
   return [
-    mistakes.length ? `The file has ${count}` : "The file was not read",
+    mistakes.length ? `The file has ${count}` : "The file was not reloaded",
     [make("p", {}, `${text[0].toUpperCase()}${text.slice(1)}.`), list(mistakes, "bad")],
   ];
 }
@@ -48,7 +48,7 @@ const list = (sentences, kind) =>
   sentences.length
     ? make(
         "ul",
-        { class: "outcome", tabindex: "0", "aria-label": "Sentences" }, // keys scroll it
+        { class: "outcome", tabindex: "0", "aria-label": "Messages" }, // keys scroll it
         sentences.map(sentence =>
           make("li", { class: kind }, kind ? glyph("fault") : null, named(sentence)),
         ),

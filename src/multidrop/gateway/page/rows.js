@@ -85,7 +85,7 @@ function stateWord(is, drive, age) {
   return age === null ? "silent, never answered" : `silent for ${clock.lasting(age)}`;
 }
 
-// Return a drive's frequency or setpoint in hertz, whatever its sign, or null where it is not that of now.
+// Return the absolute value of a drive's frequency or setpoint in hertz, or null if it is old.
 function hertz(name, part, t) {
   const register = key(name, part),
     found = register && reading(name, register, t);
@@ -95,7 +95,7 @@ function hertz(name, part, t) {
     : null;
 }
 
-// Return the frequency of a full bar, the same for all drives, or null where there is no bar.
+// Return the frequency of a full bar, the same for all drives, or null without bars.
 export function fullBar(t) {
   const shown = [...store.drives.keys()].flatMap(name => {
     const actual = hertz(name, "frequency", t);
@@ -118,7 +118,7 @@ function drawBar(r, t, full) {
   if (!r.set.hidden) r.set.style.left = length(set);
 }
 
-// Draw a row anew; a full bar is so many hertz. Return true where the state is another one.
+// Update a row; `full` is the frequency of a full bar in hertz. Return true if the state has changed.
 export function drawRow(r, t, full) {
   const drive = store.frame?.drives[r.name],
     is = state(r.name),

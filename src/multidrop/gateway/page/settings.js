@@ -1,4 +1,4 @@
-// Times, theme, rights and keys: what a person sets for this browser.
+// Settings of this browser: times, theme, rights, and a list of keys.
 
 import { post } from "./api.js";
 import { askToken, tell } from "./ask.js";
@@ -10,20 +10,20 @@ import { count } from "./values.js";
 
 const THEME = "multidrop-theme";
 const THEMES = [
-  ["", "as the system"],
+  ["", "same as system"],
   ["light", "light"],
   ["dark", "dark"],
 ];
 const keys = () => [
   ["↑ ↓", "another drive"],
-  ["Enter", "open it"],
+  ["Enter", "open the drive"],
   ["/", "filter"],
   [`1 to ${document.querySelectorAll("nav a:not([hidden])").length}`, "views"],
-  ["s", "stop the chosen drive (asks)"],
-  ["Shift S", "stop all drives (asks)"],
+  ["s", "stop the selected drive (asks first)"],
+  ["Shift S", "stop all drives (asks first)"],
   ["u", "UTC or local time"],
-  ["a, b", "markers in the trends"],
-  ["Esc", "close; back from a zoom"],
+  ["a, b", "markers in trends"],
+  ["Esc", "close; undo a zoom"],
 ];
 
 export function begin() {
@@ -45,8 +45,8 @@ function kept() {
 
 function labelClock() {
   find("#clock").title = clock.isUtc()
-    ? "All times are UTC. Press for local time."
-    : "All times are this device's local time. Press for UTC.";
+    ? "All times are UTC. Press to switch to local time."
+    : "All times are this device's local time. Press to switch to UTC.";
 }
 
 function setTheme(name) {
@@ -90,7 +90,7 @@ async function show() {
     make(
       "p",
       {},
-      `You may ${may.role ?? "look"}; ${count(may.write?.length ?? 0, "register")} may be written here. ` +
+      `Your right: ${may.role ?? "look"}. You may write ${count(may.write?.length ?? 0, "register")}. ` +
         `Version ${store.plant?.version ?? "–"}.`,
     ),
     make(
@@ -100,13 +100,13 @@ async function show() {
     ),
   ];
   const choice = await tell("Settings", contents, [
-    ...(mayReload() ? [["reload", "Read the plant file again", "calm"]] : []),
+    ...(mayReload() ? [["reload", "Reload the plant file", "calm"]] : []),
     ["token", "Enter a token", "calm"],
     ["forget", "Sign out", "calm"],
   ]);
   if (choice === "reload") await reload();
   if (choice === "token")
-    await askToken("A token gives the right to stop or to write. The gateway's keeper makes them.");
+    await askToken("A token gives the right to stop or to write. Ask the gateway's administrator for one.");
   if (choice === "forget") {
     await post("api/forget", {}).catch(error =>
       tell("Not signed out", make("p", { class: "bad" }, error.message)),

@@ -1,18 +1,18 @@
-// Stops: of all drives and of one. This file needs the dialog and nothing else of the page.
+// Stops of all drives and of one. This file needs only the dialog, no other part of the page.
 
 import { STOP, confirm, send, tell } from "./ask.js";
 import { fill, find, glyph, make, named } from "./dom.js";
 
 const HOW =
-  "A stop goes ahead of all polling and is repeated until the drive confirms it. " +
-  "Motors come down as their drives are set.";
-const SENT = "The stop is being sent.";
+  "A stop is sent before all polling and repeated until the drive confirms it. " +
+  "Each motor slows down as set in its drive.";
+const SENT = "Sending the stop.";
 const TAKEN =
-  "The gateway has taken the stop. If a drive does not answer, its stop is repeated for 30 s, and its " +
-  "outcome is shown after that.";
-const UNTAKEN = "The gateway has not taken the stop";
-const HARD = "Use the hard stop at the machine if a motor must stand now.";
-const HARD_NOW = "Use the hard stop at the machine now. This page goes on waiting for the gateway.";
+  "The gateway has accepted the stop. If a drive does not answer, its stop is repeated for 30 s; the " +
+  "outcome is shown then.";
+const UNTAKEN = "The gateway has not accepted the stop";
+const HARD = "Use the hard-wired stop at the machine if a motor must stop now.";
+const HARD_NOW = "Use the hard-wired stop at the machine now. This page keeps waiting for the gateway.";
 const TAKEN_MS = 1500; // within which a gateway that works confirms that it has taken a stop
 
 // Return what "Stop all" stops in the view that is shown: its label, its name, and its requests.
@@ -35,13 +35,13 @@ function target() {
     label: "Stop this plant",
     what: here,
     where:
-      "Only the drives of this plant are stopped, and none of the fleet's: for those, run " +
+      "This stops the drives of this plant only. To stop the fleet, run " +
       "`multidrop fleet stop --all`. ",
     requests: [own],
   };
 }
 
-// Show on the button what it stops.
+// Label the button with its target.
 export function showTarget() {
   const { label, what } = target();
   find("#stopall").textContent = label;
@@ -78,7 +78,7 @@ function showProgress(what, isShown) {
   if (isShown) open();
   const waiting = new Set(); // timers of requests that are not confirmed
   const late = () => {
-    show([UNTAKEN], `No confirmation came within ${TAKEN_MS / 1000} s. ${HARD_NOW}`, true);
+    show([UNTAKEN], `No confirmation within ${TAKEN_MS / 1000} s. ${HARD_NOW}`, true);
     if (!words.closest("dialog[open]")) open();
   };
   return () => {
@@ -119,12 +119,12 @@ async function ending(path, body, watch) {
   }
 }
 
-// Return what to show of a stop of which a request failed: that, and what became of the others.
+// Return title and contents for a stop with a failed request: the failure and the other results.
 function failure(error, ends) {
   const isRefused = error.status >= 400 && error.status < 500;
   const others = ends.filter(end => end.told).map(end => outcome(end.told));
   return {
-    title: isRefused ? "The stop was not sent" : "It is not known that the stop was sent",
+    title: isRefused ? "The stop was not sent" : "It is unknown whether the stop was sent",
     contents: [
       make("p", { class: "bad" }, glyph("fault"), ` ${error.message} ${HARD}`),
       ...others.flatMap(({ title, contents }) => [make("p", {}, `${title}.`), ...contents]),
@@ -152,7 +152,7 @@ function outcome(told) {
       ? "The drive is stopped"
       : `All ${rows.length} drives are stopped`
     : rows.length
-      ? `${failed.length} of ${rows.length} drives not known to be stopped`
+      ? `${failed.length} of ${rows.length} drives are not confirmed as stopped`
       : "No drive was stopped";
   const contents = [
     items.length ? make("ul", { class: "outcome" }, items) : null,
@@ -163,18 +163,18 @@ function outcome(told) {
 
 const WHOLE_MS = 8000; // in which the other parts of the page should be there
 
-// Say so where the other parts of the page could not be loaded: nothing else would.
+// Report if other parts of the page were not loaded.
 setTimeout(() => {
   if (document.body.dataset.begun) return;
   find("#notice").textContent =
-    "This page could not be loaded whole. Stop all works; load it again for the rest.";
+    "This page was not fully loaded. Stop all works; reload the page for the rest.";
   find("#notice").classList.add("bad");
   find("#notice").hidden = false;
 }, WHOLE_MS);
 
 find("#stopall").addEventListener("click", stopAll);
 addEventListener("hashchange", showTarget);
-// Stop all lies behind an open dialog, and is at hand all the same: in place of what else is asked.
+// Stop all works behind an open dialog too, in place of the dialog's question.
 find("#ask").addEventListener("click", event => {
   const isIn = element => {
     const { left, right, top, bottom } = element.getBoundingClientRect();
@@ -195,7 +195,7 @@ export function stopKey({ key, code, shiftKey }) {
 }
 
 addEventListener("keydown", event => {
-  // Where nothing is typed the key is at hand like the button, behind a dialog too.
+  // The key works like the button, unless the user types text.
   const isTyped = event.target.closest?.("input, select, textarea");
   const isOther = event.ctrlKey || event.metaKey || event.altKey || event.repeat;
   if (stopKey(event) === "all" && !isOther && !isTyped) stopAll();

@@ -1,16 +1,16 @@
 // The plant and its newest values, as the gateway sends them, and a short past of each for plots.
-// A value is never without its time, and never new where it is not.
+// Each value has its time, and an old value never looks new.
 
 import { Ring } from "./ring.js";
 
 const SAMPLES = 2e6; // of all registers together
 const UNPOLLED_S = 5; // for which a value of a register holds that is no longer polled
 const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
-const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
-const UNSEEN_MS = 5000; // between two frames: what was then is not known
+const LOOK_MS = 60000; // in which the gateway reads all registers of a viewed drive
+const UNSEEN_MS = 5000; // between two frames: values in between are unknown
 export const LIVE_MS = 1500; // a frame comes each second at least
 
-// `time` of the frame is in ms of the gateway's clock, and `came` in ms of one that nobody sets.
+// `time` of the frame is in ms of the gateway's clock, `came` in ms of a monotonic clock.
 export const store = { plant: null, frame: null, time: 0, came: 0, isLost: false, drives: new Map() };
 store.lines = new Map();
 const watchers = [];
@@ -40,7 +40,7 @@ export function takePlant(plant) {
         good: known("good"),
         pasts: known("pasts"),
         newest: new Map(), // {ms, status} of each register's newest request
-        seen: null, // when its newest value was asked for, in ms
+        seen: null, // request of its newest value, in ms
       });
     }
   }
@@ -76,7 +76,7 @@ export function takeFrame(told) {
   }
 }
 
-// Nobody saw what came from this time (ms) on, as where the page slept: no line is to be drawn over it.
+// Values after this time (ms) were missed, for example while the page slept: no line is drawn over the gap.
 function leaveGap(ms) {
   for (const { pasts } of store.drives.values()) for (const ring of pasts.values()) ring.add(ms, NaN);
 }
@@ -91,7 +91,7 @@ function merged(before, changes) {
   return result;
 }
 
-// A row is [value, ms, "ok"], or [null, ms, status, last good value, its ms] where the newest request failed.
+// A row is [value, ms, "ok"], or [null, ms, status, last good value, its ms] if the newest request failed.
 function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
   drive.newest.set(register, { ms, status });
   if (value !== null) drive.good.set(register, { value, ms });
@@ -107,17 +107,17 @@ function most() {
   return Math.max(120, Math.min(6000, Math.floor(SAMPLES / registers)));
 }
 
-// Return what is known of a register now, or null where nothing ever was:
+// Return the present reading of a register, or null if there never was one:
 // {value, ms, status, age (ms), isOld}. `now` is the gateway's time; a value is old when the gateway says so,
-// a second after it where the newest request failed, or when the frame itself is old. A time to come is one
-// of before the gateway's clock was set back.
+// a second after it if the newest request failed, or when the frame itself is old. A time in the future is
+// from before the gateway's clock was set back.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
     newest = drive?.newest.get(register);
   const good = drive?.good.get(register);
   if (!good)
     return newest ? { value: null, ...newest, age: now - newest.ms, isOld: true } : null;
-  const status = newest ? newest.status : "no more polled";
+  const status = newest ? newest.status : "no longer polled";
   const age = (isLive(now) ? store.time : now) - good.ms;
   return {
     value: good.value,
@@ -135,7 +135,7 @@ export function takeOthers(drive, values) {
   others = { drive, values: values ?? {} };
 }
 
-// Return the reading of a register, polled or looked at.
+// Return the reading of a register, polled or read for viewing.
 export function known(drive, register, t) {
   const polled = reading(drive, register, t),
     row = others.drive === drive ? others.values[register] : undefined;
@@ -152,7 +152,7 @@ export const holdsFor = (name, register) =>
 
 export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
 
-// Return the age of the drive's newest good reply in ms, or null where there never was one.
+// Return the age of the drive's newest good reply in ms, or null without one.
 export function driveAge(name, now) {
   const seen = store.drives.get(name)?.seen ?? null;
   return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
@@ -169,13 +169,13 @@ export function state(name) {
   return is === "unknown" && drive?.values?.[key(name, "frequency")]?.[0] === 0 ? "still" : is;
 }
 
-// Return what else a drive says, or why its state is not known.
+// Return a drive's note, or why its state is unknown.
 export const noteOf = name => store.frame?.drives[name]?.note ?? "";
 
 // Return the register that has this part in the drive, "frequency" for one, or null.
 export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
 
-// Return what is and was wrong: what lasts first, the gravest before the others.
+// Return the alarms: active ones first, the most serious before the others.
 export const alarms = () => store.frame?.alarms ?? [];
 
 export const lasting = () => alarms().filter(alarm => alarm.ended === null);

@@ -1,4 +1,4 @@
-// The head of the page: plant, views, how old the frame is, clock, rights, and the strip of what is wrong.
+// The head of the page: plant, views, age of the frame, clock, rights, and the strip of alarms.
 
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
@@ -8,12 +8,12 @@ import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
 import { count } from "./values.js";
 
 const DEAD_MS = 3000;
-const SKEW_MS = 2000; // a viewer's clock that is so wrong is told of
+const SKEW_MS = 2000; // a larger error of the viewer's clock is shown
 let told = "";
 let shownStrip = "",
-  ages = []; // [element, time in ms or null] of what the strip shows
+  ages = []; // [element, alarm] of each age in the strip
 
-// Say what the plant file holds, wherever the head shows it.
+// Show the plant in the head.
 export function showPlant() {
   const { plant } = store;
   const name = plant.name.replace(/\.toml$/, "");
@@ -28,7 +28,7 @@ export function showPlant() {
   put(find("#role"), `${plant.demo ? "simulated, " : ""}may ${plant.may?.role ?? "look"}`);
 }
 
-// Draw the head anew. Called a few times a second.
+// Update the head. Called a few times a second.
 export function drawTop() {
   const t = now(),
     age = t - store.time,
@@ -56,16 +56,16 @@ function drawNotice(isNow, age) {
   if (store.isLost) parts.push(link.why.replace(/\.?$/, "."));
   else if (store.frame && age > LIVE_MS) parts.push("The gateway sends no new values.");
   if (store.frame && !isNow)
-    parts.push(`What is shown is of ${clock.when(store.time)} ${clock.zoneName()}.`);
+    parts.push(`The values shown are from ${clock.when(store.time)} ${clock.zoneName()}.`);
   const wrong = store.plant?.mistakes?.length ?? 0;
   const mistakes = wrong === 1 ? "a mistake" : `${wrong} mistakes`;
-  if (wrong) parts.push(`The plant file has ${mistakes}; the plant before it goes on.`);
+  if (wrong) parts.push(`The plant file has ${mistakes}; the previous plant stays in use.`);
   for (const trouble of store.frame?.troubles ?? []) parts.push(`${trouble}.`);
   const off = correction();
   if (Math.abs(off) > SKEW_MS) {
     parts.push(
       `This device's clock is ${clock.lasting(Math.abs(off))} ${off > 0 ? "slow" : "fast"}; ` +
-        "times here are the gateway's.",
+        "times shown here are the gateway's.",
     );
   }
   const notice = find("#notice");
@@ -77,11 +77,11 @@ function drawNotice(isNow, age) {
 function tellChange(isNow) {
   const words = store.frame === null && !store.isLost ? "" : isNow ? "live" : "old";
   if (words && words !== told && (told || words === "old"))
-    say(words === "live" ? "Values are live again." : "Values are old: no new ones come.");
+    say(words === "live" ? "Values are live again." : "Values are old: no new values arrive.");
   told = words || told;
 }
 
-// Show what is wrong, newest first, each with its full text; a click opens the drive.
+// Show the active alarms with their full text; a click opens the drive.
 function drawStrip(t) {
   const alarms = lasting(),
     most = innerWidth < 641 ? 2 : 5;
@@ -101,12 +101,12 @@ function drawStrip(t) {
   for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, t)}`);
 }
 
-// Return the words for a plant where no alarm lasts.
+// Return the text of a plant without active alarms.
 function calm() {
   if (!store.frame) return "No values yet.";
   const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;
-  const others = unknown ? `, ${unknown} of unknown state` : "";
-  return `${count(store.drives.size, "drive")}, no fault known, none silent${others}.`;
+  const others = unknown ? `, ${unknown} in unknown state` : "";
+  return `${count(store.drives.size, "drive")}, no known fault, none silent${others}.`;
 }
 
 function buildStrip(alarms, more) {

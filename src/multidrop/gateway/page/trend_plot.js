@@ -9,7 +9,7 @@ import { COLOURS, heldAt, join, line, makePlot, summary, swatch, wide } from "./
 import { holdsFor, store } from "./store.js";
 import { number, words } from "./values.js";
 
-// Make the plot of one quantity of these drives. `set` shows the span that was dragged over.
+// Make the plot of one quantity of these drives. `set` shows the range selected by a drag.
 export function makeTrend(place, { register, unit, drives }, told, { view, set, count, stepMs }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
   const out = make("output"),
@@ -86,7 +86,7 @@ function widest(values, digits) {
   return Math.max(...ends.map(value => number(value, digits).length));
 }
 
-// Return the drives with what they had at the cursor; without a cursor, which line is whose, where they are
+// Return the legend: each drive's value at the cursor; without a cursor the names, if there are
 // several. It takes the same room then: else the plot would move under the cursor that comes.
 function under(u, { drives, marks, widths, holds, spec }) {
   const i = u.cursor.idx ?? null,

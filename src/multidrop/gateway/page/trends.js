@@ -21,7 +21,7 @@ const RANGES = [
 ];
 const LEAST_MS = 1000;
 const ANEW_MS = 5000;
-const SETTLE_MS = 150; // of several clicks the last one is asked for
+const SETTLE_MS = 150; // only the last of several clicks is fetched
 
 const view = { from: 0, to: 0, follows: true, back: [] };
 let plots = [],
@@ -29,8 +29,8 @@ let plots = [],
   waiting = null,
   serial = 0,
   isShown = false,
-  isDragged = false, // over a plot, which must not be made anew meanwhile
-  isDue = false; // drawing, once the mouse is let go
+  isDragged = false, // over a plot, which must not be rebuilt then
+  isDue = false; // drawing, after the mouse button is released
 
 export function begin() {
   onPlant(() => {
@@ -45,7 +45,7 @@ export function begin() {
     ["▶", "Later", () => pan(0.5)],
     ["−", "Zoom out", () => zoom(2)],
     ["+", "Zoom in", () => zoom(0.5)],
-    ["Back", "Back to the span before", back],
+    ["Back", "Back to the previous range", back],
   ];
   fill(
     find("#trends"),
@@ -55,7 +55,7 @@ export function begin() {
       { class: "card plots" },
       make(
         "div",
-        { class: "ranges", role: "group", "aria-label": "Span of time" },
+        { class: "ranges", role: "group", "aria-label": "Time range" },
         buttons,
         steps.map(([sign, name, what]) =>
           make("button", { type: "button", "aria-label": name, title: name, onclick: what }, sign),
@@ -96,7 +96,7 @@ export function hide() {
 
 function set(from, to, follows) {
   const isSame = Math.abs(from - view.from) + Math.abs(to - view.to) < (view.to - view.from) / 1000;
-  if (isSame && !follows) return; // each plot tells of a drag
+  if (isSame && !follows) return; // each plot reports a drag
   if (view.to) view.back.push([view.from, view.to, view.follows]);
   view.back.splice(0, view.back.length - 50);
   Object.assign(view, { from, to: Math.max(to, from + LEAST_MS), follows });
@@ -125,14 +125,14 @@ async function askDates() {
   from.dataset.first = "";
   const check = () =>
     to.setCustomValidity(
-      clock.parsed(to.value) > clock.parsed(from.value) ? "" : "The end is not after the begin.",
+      clock.parsed(to.value) > clock.parsed(from.value) ? "" : "The end must be after the start.",
     );
   for (const field of [from, to]) field.addEventListener("input", check);
   const contents = [
     make("label", { class: "field", for: from.id }, `From, ${clock.zoneName()}`, from),
     make("label", { class: "field", for: to.id }, `To, ${clock.zoneName()}`, to),
   ];
-  if (await confirmForm("Which time?", contents, "Show", ""))
+  if (await confirmForm("Time range", contents, "Show", ""))
     set(clock.parsed(from.value), clock.parsed(to.value), false);
 }
 
@@ -143,7 +143,7 @@ export function back() {
   ask();
 }
 
-// Ask for what is chosen, soon; a later question makes an earlier one's answer void.
+// Fetch the selection soon; a later request supersedes an earlier one.
 function ask() {
   clearTimeout(waiting);
   showSpan();
@@ -182,7 +182,7 @@ async function fetchAll() {
     labels = wanted();
   if (!isShown || !store.plant) return;
   drawLane(find("#lane"), view.from, view.to, picker.showsFaults() ? picker.drives() : []);
-  let note = labels.length ? "" : "Choose a drive and a quantity.";
+  let note = labels.length ? "" : "Select a drive and a quantity.";
   told = { series: {} };
   try {
     if (labels.length)
@@ -215,7 +215,7 @@ function letGo() {
   if (isDue) draw();
 }
 
-// Draw what was told last; on another size, theme or time zone too.
+// Draw the last answer; also after a change of size, theme or time zone.
 export function draw() {
   isDue = isDragged;
   if (isDue) return;

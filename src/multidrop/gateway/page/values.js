@@ -1,4 +1,4 @@
-// Values as texts. What is not known is a dash, never a nought; what is old carries its time.
+// Values as texts. An unknown value is a dash, never 0; an old one has its time.
 
 import * as clock from "./clock.js";
 import { make, setClass } from "./dom.js";
@@ -47,7 +47,7 @@ function bits(value, names) {
 export const unit = register =>
   register?.unit && register.kind !== "words" && register.kind !== "bits" ? register.unit : "";
 
-// Return a text with the register's unit, where it has one.
+// Return a text with the register's unit, if any.
 export const withUnit = (told, register) => (unit(register) ? `${told} ${unit(register)}` : String(told));
 
 // Return a register's name with its unit, as the head of a plot or a field.
@@ -69,7 +69,7 @@ export function showValue(parts, reading, register, isDated = true, isNamed = is
   const isThere = reading !== null && reading.value !== null;
   const isOld = isThere && reading.isOld;
   set(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
-  // a number without a unit says what it is
+  // a number without a unit needs its name
   const isBare = !unit(register) && register?.kind === "number" && isNamed;
   set(parts.unit, isThere ? (isBare ? words(register.name) : unit(register)) : "");
   set(parts.age, isOld && isDated ? `${clock.lasting(reading.age)} old` : "");
