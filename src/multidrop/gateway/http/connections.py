@@ -32,6 +32,12 @@ ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
 STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may be a stop too
+BACKLOG = 64  # pending connections: all are accepted at once, before MOST_OPEN applies
+_WHY = {
+    errno.EADDRINUSE: "another program listens there",
+    errno.EACCES: "this user has no permission",
+    errno.EADDRNOTAVAIL: "this machine does not have this address",
+}
 
 
 class Rank(IntEnum):
@@ -259,15 +265,6 @@ class Watched:
                 await JsonResponse({"error": ENDS}, 503)(scope, receive, send)
         finally:
             self._connections.finish(client)
-
-
-BACKLOG = 64  # pending connections: all are accepted at once, before MOST_OPEN applies
-
-_WHY = {
-    errno.EADDRINUSE: "another program listens there",
-    errno.EACCES: "this user has no permission",
-    errno.EADDRNOTAVAIL: "this machine does not have this address",
-}
 
 
 def listen(host: str, port: int) -> CountingSocket:

@@ -14,6 +14,11 @@ from starlette.responses import Response
 from multidrop.gateway.http.rights import Caller
 from multidrop.printable import plain_whole
 
+MOST_BYTES = 64 * 1024  # of a body
+BODY_S = 10.0  # time limit for a body
+STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
+_log = logging.getLogger("multidrop.gateway")
+
 
 class Denied(Exception):
     """A refused request: HTTP status and a sentence."""
@@ -30,13 +35,6 @@ class JsonResponse(Response):
 
     def render(self, content: Any) -> bytes:
         return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
-
-
-MOST_BYTES = 64 * 1024  # of a body
-BODY_S = 10.0  # time limit for a body
-STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
-
-_log = logging.getLogger("multidrop.gateway")
 
 
 def caller_of(request: Request) -> Caller:

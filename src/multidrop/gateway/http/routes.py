@@ -71,6 +71,8 @@ NEEDED: Mapping[str, Needed] = {
 }
 
 _log = logging.getLogger("multidrop.gateway")
+_PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
+_GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
 
 
 def make_app(gateway: Gateway) -> ASGIApp:
@@ -350,10 +352,6 @@ class _Pages:
         response = JsonResponse({})
         response.delete_cookie(COOKIE, httponly=True, samesite="strict")
         return response
-
-
-_PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
-_GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
 
 
 class FrameRoute:

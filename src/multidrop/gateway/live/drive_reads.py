@@ -21,6 +21,9 @@ READ_S = 30.0  # time limit of one read
 UNANSWERED = "no reply"
 
 Found = dict[str, list[Any]]  # by register: value or None, UTC in ms, "ok" or the reason
+ROUND_S = 2.0  # between two rounds of all drives
+ASKED_S = 30.0  # time limit of one drive's check
+_log = logging.getLogger("multidrop.gateway")
 
 
 class SideReads:
@@ -107,13 +110,6 @@ class SideReads:
         except (BusError, ValueError) as failure:
             return [None, self._utc_ms(), str(failure)]
         return [float(value) if isfinite(value) else None, self._utc_ms(), "ok"]
-
-
-PAUSE_S = 0.2  # between two drives that are asked: the polling keeps the line
-ROUND_S = 2.0  # between two looks for drives that are not known
-ASKED_S = 30.0  # that the answers of one drive may take
-
-_log = logging.getLogger("multidrop.gateway")
 
 
 class Identities:

@@ -29,6 +29,9 @@ WHOLE = -1  # in a request: the viewer has no frame
 REMEMBERED = 6  # newest frames kept: a viewer may be a second behind
 
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
+MOST_AGE_NS = round(MOST_AGE_S * 1e9)
+TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # rules of a WriteForbidden
+ANOTHER_PLANT = "the plant was read anew"
 
 
 class Encoded(NamedTuple):
@@ -256,11 +259,6 @@ class Frames:
 def _let_go(turn: asyncio.Future[None]) -> None:
     if not turn.done():
         turn.set_result(None)
-
-
-MOST_AGE_NS = round(MOST_AGE_S * 1e9)
-TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # rules of a WriteForbidden
-ANOTHER_PLANT = "the plant was read anew"
 
 
 class SeenFrames:

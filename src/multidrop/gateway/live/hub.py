@@ -1,7 +1,7 @@
 """Hub: the newest row of every register of every drive, and each drive's state from these rows.
 
-Pure: rows and times come in. Rows have times of CLOCK_MONOTONIC, which stands still while the machine sleeps:
-what was read before it slept is old when it wakes.
+Pure: takes rows and times. Rows have times of CLOCK_MONOTONIC, which stops while the machine sleeps: rows
+from before a sleep are old afterwards.
 """
 
 from __future__ import annotations
@@ -17,6 +17,23 @@ STALE_PERIODS = 3  # and at least this many periods
 
 KeptRow = tuple[int, int, float, int]  # time, monotonic time, value (meaningless in a miss), status
 Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good row, is it fresh
+RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
+UNNAMED = "it shows a fault"  # with an unknown code
+NOT_ASKED = "not asked recently"  # words of an unknown state: no fresh value at all,
+INCOMPLETE = "not all of it is known"  # or only some: there may be a fault nevertheless
+_STATES = {
+    Condition.STOPPED: STANDS,
+    Condition.RUNNING: RUNS,
+    Condition.ACCELERATING: RUNS,
+    Condition.DECELERATING: RUNS,
+    Condition.FAULT: FAULT,
+    Condition.UNKNOWN: UNKNOWN,
+}
+LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between reading two clocks
+FAULT_REGISTER = "fault"
+RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
+_TURNING = ("output_frequency", "motor_speed")  # the motor turns if one is not 0
+_ANSWERED = ("exception ", "no valid value")  # prefixes of statuses of misses with a reply
 
 
 class RegisterRows:
@@ -72,28 +89,6 @@ class FreshValues(Mapping[str, float]):
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
-
-
-RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
-UNNAMED = "it shows a fault"  # with an unknown code
-
-NOT_ASKED = "not asked recently"  # words of an unknown state: no fresh value at all,
-INCOMPLETE = "not all of it is known"  # or only some: there may be a fault nevertheless
-
-_STATES = {
-    Condition.STOPPED: STANDS,
-    Condition.RUNNING: RUNS,
-    Condition.ACCELERATING: RUNS,
-    Condition.DECELERATING: RUNS,
-    Condition.FAULT: FAULT,
-    Condition.UNKNOWN: UNKNOWN,
-}
-LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between reading two clocks
-
-FAULT_REGISTER = "fault"
-RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
-_TURNING = ("output_frequency", "motor_speed")  # the motor turns if one is not 0
-_ANSWERED = ("exception ", "no valid value")  # prefixes of statuses of misses with a reply
 
 
 class Newest(NamedTuple):

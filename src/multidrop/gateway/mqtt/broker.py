@@ -19,6 +19,11 @@ MOST_UNDER_WAY = 64  # unacknowledged messages: enough for the drives of two lin
 MOST_WAITING = 4096  # topics, more than any plant has
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
+PORTS = {"mqtt": 1883, "mqtts": 8883}
+RETRY_S = (1, 30)  # first and longest pause before reconnecting
+KEEP_ALIVE_S = 15
+FAREWELL_S = 1.0  # time limit for the last messages
+_log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class Publication(NamedTuple):
@@ -33,7 +38,7 @@ class Publication(NamedTuple):
 class Outbox:
     """Pending messages, one per topic, and a limited number of unacknowledged ones.
 
-    `send` takes a message and returns its number, or None where it cannot be sent now.
+    `send` takes a message and returns its number, or None if it cannot be sent now.
     """
 
     def __init__(self, send: Callable[[Publication], int | None]) -> None:
@@ -44,7 +49,7 @@ class Outbox:
         self.dropped = 0  # replaced by a newer one, or lost with the connection
 
     def put(self, message: Publication) -> None:
-        """Send the message as soon as there is room, in the place of an older one of its topic."""
+        """Queue the message, in place of an older one of its topic."""
         if message.topic in self._waiting or len(self._waiting) >= MOST_WAITING:
             self.dropped += 1
         if message.topic in self._waiting or len(self._waiting) < MOST_WAITING:
@@ -52,11 +57,11 @@ class Outbox:
         self.flush()
 
     def withdraw(self, topic: str) -> None:
-        """Drop what waits of a topic, if anything does: something else was said since."""
+        """Drop the pending message of a topic, if any."""
         self.dropped += self._waiting.pop(topic, None) is not None
 
     def flush(self) -> None:
-        """Send what waits, as far as there is room."""
+        """Send pending messages, up to MOST_UNDER_WAY unacknowledged ones."""
         while self._waiting and len(self._under_way) < MOST_UNDER_WAY:
             topic = next(iter(self._waiting))
             try:
@@ -86,14 +91,6 @@ class Outbox:
     @property
     def is_idle(self) -> bool:
         return not self._waiting and not self._under_way
-
-
-PORTS = {"mqtt": 1883, "mqtts": 8883}
-RETRY_S = (1, 30)  # first and longest pause before reconnecting
-KEEP_ALIVE_S = 15
-FAREWELL_S = 1.0  # time limit for the last messages
-
-_log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class Address(NamedTuple):

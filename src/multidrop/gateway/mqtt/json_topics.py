@@ -26,6 +26,13 @@ from multidrop.plant import drive_meant
 ONLINE, OFFLINE = b"online", b"offline"
 MOST_KEPT = 256  # retained messages examined per connection; others wait for the next one
 MOST_DISCOVERY = 1 << 18  # bytes of a discovery message
+EXAMPLES = {
+    "set": '{"value": 25.0, "time": UTC in ms}',
+    "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
+}
+MOST_BYTES = 65_536  # of a write or a verb
+NOTHING = b""  # removes a retained message
+_log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class KeptTopic(NamedTuple):
@@ -103,16 +110,6 @@ def _state_topic(payload: bytes) -> str:
     state = parts.get("state") if isinstance(parts, dict) else said  # older messages have it at the top
     found = state.get("state_topic") if isinstance(state, dict) else None
     return found if isinstance(found, str) else ""
-
-
-EXAMPLES = {
-    "set": '{"value": 25.0, "time": UTC in ms}',
-    "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
-}
-MOST_BYTES = 65_536  # of a write or a verb
-NOTHING = b""  # removes a retained message
-
-_log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class JsonTopics:
