@@ -74,7 +74,7 @@ def stands(gateway: Served, drive: str) -> bool:
         ("/api/act", {"drive": "pump-1", "verb": "coast"}),
     ],
 )
-def test_the_head_of_the_answer_confirms_a_stop_that_is_not_over(
+def test_head_of_the_answer_confirms_an_unfinished_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
     """A page that gets no head knows that the gateway has taken no stop."""
@@ -106,7 +106,7 @@ def test_the_head_of_the_answer_confirms_a_stop_that_is_not_over(
         connection.close()
 
 
-def test_a_stop_goes_on_when_its_asker_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_continues_when_its_client_disconnects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ends: list[str] = []
     held = threading.Event()
 
@@ -131,7 +131,7 @@ def test_a_stop_goes_on_when_its_asker_leaves(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
+def test_all_drives_are_stopped_and_verified(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
         gateway.await_state("pump-1", "runs")
@@ -144,7 +144,7 @@ def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_the_page_says_where_there_is_no_javascript_stops_all_drives(tmp_path: Path) -> None:
+def test_command_in_the_page_without_javascript_stops_all_drives(tmp_path: Path) -> None:
     page = (files("multidrop.gateway") / "page" / "index.html").read_text("utf-8")
     without = page[page.index("<noscript") : page.index("</noscript")]
     said, token = (shlex.split(command) for command in re.findall("<code>(.+)</code>", without))
@@ -181,7 +181,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 @pytest.mark.long
 @pytest.mark.slow
 @table("body", UNREADABLE.values(), ids=UNREADABLE)
-def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
+def test_stop_with_an_unreadable_body_stops_all_drives(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes
 ) -> None:
     monkeypatch.setattr(messages, "STOP_BODY_S", 0.1)
@@ -197,7 +197,7 @@ def test_a_stop_whose_body_cannot_be_read_is_one_of_all_drives(
 
 
 @pytest.mark.slow
-def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
+def test_stop_accepts_a_single_name(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
         assert [*gateway.request("POST", "/api/stop", {"drives": "pump-1"}).json] == ["pump-1"]
@@ -206,7 +206,7 @@ def test_a_drive_to_stop_may_be_named_without_a_list(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_of_strange_names_stops_the_drives_that_are_there_and_tells_of_each(tmp_path: Path) -> None:
+def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Path) -> None:
     """Half a character, a terminal's escape, and another drive's name in capitals."""
     names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
     with served(tmp_path, MAY) as gateway:
@@ -219,7 +219,7 @@ def test_a_stop_of_strange_names_stops_the_drives_that_are_there_and_tells_of_ea
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 @pytest.mark.parametrize("options", [None, [], "now", {"direction": "forward"}])
-def test_no_options_keep_a_stop_by_a_verb_back(tmp_path: Path, verb: str, options: object) -> None:
+def test_wrong_options_do_not_prevent_a_stop_verb(tmp_path: Path, verb: str, options: object) -> None:
     """Programs write null where they have none."""
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")
@@ -229,7 +229,7 @@ def test_no_options_keep_a_stop_by_a_verb_back(tmp_path: Path, verb: str, option
 
 
 @pytest.mark.slow
-def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) -> None:
+def test_stop_with_a_truncated_body_is_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
         with calling(gateway) as client:
@@ -238,7 +238,7 @@ def test_a_stop_whose_client_is_cut_off_within_its_body_is_sent(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_stop_without_the_right_is_not_sent_whatever_its_body_is(tmp_path: Path) -> None:
+def test_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY.replace('stop = "anyone"\n', "")) as gateway, calling(gateway) as client:
         start(gateway, "pump-1", "pump-2")
         client.sendall(STOP + UNREADABLE["late"])
@@ -247,7 +247,7 @@ def test_a_stop_without_the_right_is_not_sent_whatever_its_body_is(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_one_drive_is_stopped_and_the_other_runs_on(tmp_path: Path) -> None:
+def test_stop_of_one_drive_leaves_the_other_running(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
         told = gateway.post("/api/stop", {"drives": ["pump-1", "pump-9"]}).json
@@ -259,7 +259,7 @@ def test_one_drive_is_stopped_and_the_other_runs_on(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_broken_parts")
-def test_a_stop_works_while_all_parts_are_broken(tmp_path: Path) -> None:
+def test_stop_works_while_all_parts_fail(tmp_path: Path) -> None:
     with served(tmp_path, BROKEN) as gateway:
         assert isinstance(gateway.gateway.feeds["mqtt"], BrokenFeed)
         start(gateway, "pump-1", "pump-2")
@@ -336,7 +336,7 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -> None:
+def test_commands_from_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> None:
     """A command whose thread begins only after the stop was called finds that out."""
     begun: list[threading.Thread] = []
 
@@ -366,7 +366,7 @@ def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None:
+def test_stop_is_sent_without_free_threads(tmp_path: Path) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:
             raise RuntimeError("can't start new thread")
@@ -385,7 +385,7 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> None:
+def test_stop_of_a_silent_drive_says_so_and_delays_no_other(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -401,7 +401,7 @@ def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_many_stops_of_a_silent_drive_hold_no_other_up(tmp_path: Path) -> None:
+def test_many_stops_of_a_silent_drive_delay_no_other(tmp_path: Path) -> None:
     """Each of them was repeated for 30 s, and the stop of another drive waited for its turn among them."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(40) as callers:
         start(gateway, "pump-1", "pump-2")
@@ -417,9 +417,7 @@ def test_many_stops_of_a_silent_drive_hold_no_other_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_of_many_coasts_of_a_silent_drive_one_is_repeated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     repeated: list[float | None] = []
     stop = commands.stop_drive_by
 
@@ -441,7 +439,7 @@ def test_of_many_coasts_of_a_silent_drive_one_is_repeated(
 
 
 @pytest.mark.long
-def test_a_stop_of_a_drive_that_runs_again_is_no_part_of_its_line_s_before(tmp_path: Path) -> None:
+def test_stop_of_a_restarted_drive_is_a_new_stop(tmp_path: Path) -> None:
     """That one goes on for a silent drive alone, and has seen this one stand."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
@@ -460,7 +458,7 @@ def test_a_stop_of_a_drive_that_runs_again_is_no_part_of_its_line_s_before(tmp_p
 
 
 @pytest.mark.slow
-def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
+def test_verbs_and_writes_report_their_results(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
 
@@ -537,7 +535,7 @@ def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(
 
 
 @pytest.mark.usefixtures("_broken_parts")
-def test_a_part_that_cannot_begin_is_one_sentence(tmp_path: Path) -> None:
+def test_part_that_cannot_start_is_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
         (
             "library",

@@ -99,7 +99,7 @@ def reload_as(gateway: Served, serve: str) -> Any:
 # ---- history ----
 
 
-def test_a_history_that_hangs_at_the_start_comes_later(tmp_path: Path, fifos: Fifos) -> None:
+def test_history_that_hangs_at_the_start_starts_later(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway:
         assert_stops_and_polls(gateway)
@@ -112,7 +112,7 @@ def test_a_history_that_hangs_at_the_start_comes_later(tmp_path: Path, fifos: Fi
         assert gateway.get("/api/history?series=pump-1.status&from=0&to=1").status == 200
 
 
-def test_a_history_that_hangs_amid_a_reload_comes_later(tmp_path: Path, fifos: Fifos) -> None:
+def test_history_that_hangs_during_a_reload_starts_later(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE) as gateway:
         assert reload_as(gateway, SERVE + HISTORY)["done"] is True
@@ -125,7 +125,7 @@ def test_a_history_that_hangs_amid_a_reload_comes_later(tmp_path: Path, fifos: F
         assert gateway.gateway.feeds == {}  # nobody wants it any more
 
 
-def test_a_history_that_cannot_begin_when_its_disk_answers_is_dead(tmp_path: Path, fifos: Fifos) -> None:
+def test_history_that_fails_when_its_disk_answers_is_dead(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway, pytest.MonkeyPatch.context() as patch:
         patch.setattr(historian, "History", fail)
@@ -167,9 +167,7 @@ def test_a_disk_that_hangs_while_rows_are_written_is_reported(
         go_on.set()
 
 
-def test_an_export_that_hangs_keeps_no_gateway_from_its_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hung_export_does_not_prevent_shutdown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, begun = threading.Event(), threading.Event()
 
     def pieces() -> Iterator[bytes]:
@@ -192,7 +190,7 @@ def test_an_export_that_hangs_keeps_no_gateway_from_its_end(
 # ---- the plant file ----
 
 
-def test_a_plant_file_that_hangs_ends_one_reload_alone(
+def test_hung_plant_file_fails_only_its_reload(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, SERVE) as gateway:
@@ -214,7 +212,7 @@ def test_a_plant_file_that_hangs_ends_one_reload_alone(
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_a_later_reload_waits_for_none_that_hangs(tmp_path: Path, fifos: Fifos) -> None:
+def test_later_reload_does_not_wait_for_a_hung_one(tmp_path: Path, fifos: Fifos) -> None:
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
@@ -233,7 +231,7 @@ def test_a_later_reload_waits_for_none_that_hangs(tmp_path: Path, fifos: Fifos) 
 # ---- audit log and ledger ----
 
 
-def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(
+def test_only_stops_are_sent_if_the_audit_log_hangs_at_the_start(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (settings, gateway_module):
@@ -248,7 +246,7 @@ def test_an_audit_log_that_hangs_at_the_start_lets_stops_alone_through(
         assert gateway.frame()["troubles"][0].startswith("audit log: ")
 
 
-def test_an_audit_log_that_hangs_amid_a_reload_changes_nothing(
+def test_audit_log_that_hangs_during_a_reload_changes_nothing(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, SERVE) as gateway:

@@ -215,7 +215,7 @@ def test_rights_names_and_tokens_take_effect_at_once_and_the_rest_after_a_restar
         assert write("pump-2").json["done"] is True
 
 
-def test_who_counts_as_being_here_is_not_widened_before_the_restart(tmp_path: Path) -> None:
+def test_local_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
     with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
@@ -268,7 +268,7 @@ def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path
             assert begun_ns <= read_ns <= boottime_ns()
 
 
-def test_what_was_looked_at_before_a_reload_is_not_shown_after_it(
+def test_reads_before_a_reload_are_not_shown_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The name may be another drive's now, and this one answers no more."""
@@ -289,7 +289,7 @@ def test_what_was_looked_at_before_a_reload_is_not_shown_after_it(
         assert values() == []
 
 
-def test_who_may_look_is_not_widened_while_it_listens_where_it_did(tmp_path: Path) -> None:
+def test_look_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
     """Those who reach the address of before are others than those who will reach the new one."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
     with served(tmp_path, serve) as gateway:

@@ -56,7 +56,7 @@ def status_of(port: int, unit: int) -> list[int]:
 IN_EFFECT = {"done": True, "text": "plant.toml is in effect", "mistakes": [], "restart": []}
 
 
-def test_a_modbus_server_begins_changes_and_ends(gateway: Served) -> None:
+def test_modbus_server_starts_changes_and_ends_with_the_file(gateway: Served) -> None:
     first, second = free_port(), free_port()
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
@@ -91,7 +91,7 @@ def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_a_part_that_fails_in_another_way_changes_nothing(
+def test_unexpected_failure_of_a_part_changes_nothing(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = free_port()
@@ -110,7 +110,7 @@ def test_a_part_that_fails_in_another_way_changes_nothing(
 
 
 @pytest.mark.slow
-def test_a_part_whose_port_is_lost_meanwhile_is_told(
+def test_part_that_loses_its_port_during_a_reload_is_reported(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The new plant is not taken up, and another program has the old port by then."""
@@ -141,9 +141,7 @@ def test_a_part_whose_port_is_lost_meanwhile_is_told(
 
 
 @pytest.mark.slow
-def test_a_part_that_takes_its_time_to_open_holds_no_stop_up(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_part_delays_no_stop(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     opens, goes_on = threading.Event(), threading.Event()
     build = parts_module.build
 

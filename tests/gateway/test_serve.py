@@ -29,7 +29,7 @@ UNITS = sorted((Path(__file__).parents[2] / "packaging").glob("*.service"))
 
 
 @pytest.mark.long
-def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -> None:
+def test_service_manager_gets_ready_alive_and_stopping(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(PATIENCE)
@@ -119,7 +119,7 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_stop_waits_for_no_log_that_nobody_reads(tmp_path: Path) -> None:
+def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
     """Somebody pressed Ctrl-S in the terminal, or the journal stands still."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()

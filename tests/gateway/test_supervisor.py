@@ -174,7 +174,7 @@ def test_a_task_that_is_released_is_not_dead() -> None:
     assert asyncio.run(live()) == {}
 
 
-def test_a_task_that_is_kept_again_is_not_dead_any_more() -> None:
+def test_task_that_is_kept_again_is_alive() -> None:
     async def live() -> list[dict[str, str]]:
         found = []
         await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
@@ -189,7 +189,7 @@ def test_a_task_that_is_kept_again_is_not_dead_any_more() -> None:
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-def test_what_work_raises_is_raised_and_ends_no_loop(failure: BaseException) -> None:
+def test_errors_of_work_are_raised_and_the_loop_continues(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 
@@ -221,7 +221,7 @@ def test_work_that_hangs_is_given_up_reported_and_forgotten() -> None:
     asyncio.run(live())
 
 
-def test_where_there_is_no_thread_left_work_raises_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_raises_an_error_without_free_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 

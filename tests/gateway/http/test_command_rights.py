@@ -53,14 +53,14 @@ def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_who_may_only_look_sends_nothing_by_any_way(way: str) -> None:
+def test_look_right_sends_nothing(way: str) -> None:
     by_verb = NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED
     expected = dict.fromkeys(VERBS, by_verb) | {"write": NOT_ALLOWED, "stop all": NOT_ALLOWED}
     assert rules_of(ALL, way, Right.LOOK) == expected
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_who_may_stop_stops_and_does_nothing_else(way: str) -> None:
+def test_stop_right_only_stops(way: str) -> None:
     rules = rules_of(ALL, way, Right.STOP)
     moving = [rules[verb] for verb in VERBS if verb not in STOPPING]
     assert {*moving} == {NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED}
@@ -69,7 +69,7 @@ def test_who_may_stop_stops_and_does_nothing_else(way: str) -> None:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_what_is_not_listed_is_refused_to_writers_too(way: str) -> None:
+def test_unlisted_writes_are_refused_to_writers(way: str) -> None:
     rules = rules_of(May(), way, Right.WRITE)
     listed = {verb: rules[verb] for verb in VERBS if verb != "stop"}
     assert {*listed.values()} == {NEVER_THIS_WAY if way == "modbus" else NOT_LISTED}

@@ -63,7 +63,7 @@ def descriptors(pid: int) -> int:
 @pytest.mark.long
 @pytest.mark.parametrize("sent", usually(*SLOW), ids=["silent", "headers", "body"])
 @pytest.mark.parametrize("way", usually("http", "https"))
-def test_a_stop_gets_in_beside_500_slow_clients(tmp_path: Path, sent: bytes, way: str) -> None:
+def test_stop_is_accepted_beside_500_slow_clients(tmp_path: Path, sent: bytes, way: str) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
     keys = 'certificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n' if way == "https" else ""
@@ -200,7 +200,7 @@ def test_the_one_that_was_idle_for_longest_makes_room(
     assert not is_ended(pairs[MOST_OPEN + 1])  # the newest one is never the one that goes
 
 
-def test_a_new_connection_is_given_time_for_its_request_beside_busy_ones(
+def test_new_connection_has_time_for_its_request_beside_busy_ones(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     """It may bring a stop: the next one that comes must not end it."""
@@ -234,7 +234,7 @@ def test_a_greedy_client_goes_before_those_that_are_idle_and_a_stop_goes_last(
     assert len(connections) == MOST_OPEN
 
 
-def test_who_takes_none_of_its_answers_for_long_is_ended(
+def test_client_that_reads_no_answers_is_closed(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -331,7 +331,7 @@ def test_a_request_that_outlasts_the_gateway_is_answered(
     assert "Traceback" not in caplog.text
 
 
-def test_a_client_that_sends_ahead_is_known_until_it_has_its_answers(tmp_path: Path) -> None:
+def test_client_that_sends_ahead_is_marked_until_answered(tmp_path: Path) -> None:
     go_on = asyncio.Event()
 
     async def after(n: int) -> None:

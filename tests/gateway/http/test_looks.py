@@ -31,7 +31,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
         yield found
 
 
-def test_the_description_has_what_the_plant_file_and_the_manual_say(gateway: Served) -> None:
+def test_description_has_data_of_plant_file_and_manual(gateway: Served) -> None:
     plant = gateway.get("/api/plant").json
     assert plant["name"] == "plant.toml"
     assert plant["may"] == {"role": "look", "write": [], "verbs": []}
@@ -126,7 +126,7 @@ def test_a_fault_is_told_in_the_drives_words(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
+def test_unpolled_registers_are_read_while_a_drive_is_viewed(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
@@ -149,7 +149,7 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
+def test_viewing_does_not_read_a_silent_drive(gateway: Served) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
     gateway.await_state("pump-2", "silent")
     asked: list[object] = []

@@ -85,7 +85,7 @@ def test_each_caller_may_what_the_table_says(tmp_path: Path, serve: str, address
 
 
 @pytest.mark.parametrize("way", ["authorization", "cookie"])
-def test_a_wrong_token_is_refused_whatever_anybody_may(tmp_path: Path, way: str) -> None:
+def test_wrong_token_is_refused_even_if_none_is_needed(tmp_path: Path, way: str) -> None:
     wrong = {way: {"authorization": "Bearer wrong", "cookie": "multidrop=wrong"}[way]}
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
@@ -108,7 +108,7 @@ def test_a_wrong_token_is_refused_whatever_anybody_may(tmp_path: Path, way: str)
             assert gateway.get(path).status == 200
 
 
-def test_a_token_is_not_checked_where_there_are_none(tmp_path: Path) -> None:
+def test_token_is_ignored_without_a_token_file(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS, tokens=()) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         for path in LOOKS:
@@ -252,7 +252,7 @@ def test_texts_that_are_no_unicode_are_answered_like_others(open_gateway: Served
     assert odd in unknown.json["error"]
 
 
-def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) -> None:
+def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Served) -> None:
     told = open_gateway.post("/api/token", {"token": open_gateway.secrets[Right.WRITE]})
     assert told.json == {"name": "writer", "role": "write"}
     cookie = told.headers["set-cookie"]
@@ -266,7 +266,7 @@ def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) 
     assert "Max-Age=0" in gone
 
 
-def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
+def test_five_wrong_tokens_a_minute_are_checked(tmp_path: Path) -> None:
     """Neither a right token on another address nor any stop is held up by them."""
     now = [1000.0]
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
@@ -292,7 +292,7 @@ def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("told", [{}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}])
-def test_nobody_behind_a_proxy_counts_as_being_here(tmp_path: Path, told: dict[str, str]) -> None:
+def test_callers_behind_a_proxy_are_not_local(tmp_path: Path, told: dict[str, str]) -> None:
     """It is on this machine itself, and may be wrong about its clients."""
     with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
         assert gateway.post(*STOP, **told).status == 401
@@ -300,7 +300,7 @@ def test_nobody_behind_a_proxy_counts_as_being_here(tmp_path: Path, told: dict[s
         assert gateway.gateway.commands.called == 0
 
 
-def test_nobody_behind_a_proxy_is_shut_out_in_the_name_of_another_address(tmp_path: Path) -> None:
+def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) -> None:
     """A proxy such as HAProxy adds a header of its own behind the one that its client sent."""
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
         for at in range(MOST_WRONG):
@@ -317,7 +317,7 @@ def test_nobody_behind_a_proxy_is_shut_out_in_the_name_of_another_address(tmp_pa
         assert gateway.get("/api/plant", **anna | {"x_forwarded_for": "10.0.0.66"}).status == 429
 
 
-def test_a_token_that_was_taken_away_shuts_nobody_out(tmp_path: Path) -> None:
+def test_revoked_token_blocks_nobody(tmp_path: Path) -> None:
     """A browser goes on sending its cookie with every frame."""
     with served(tmp_path, CLOSED) as gateway:
         old = {"cookie": "multidrop=taken-away"}
@@ -336,7 +336,7 @@ def guard_clock(gateway: Served, now: list[float]) -> None:
 
 
 @pytest.mark.slow
-def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
+def test_audit_log_has_caller_and_way(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         writer = {"authorization": gateway.bearer(Right.WRITE)}

@@ -76,7 +76,7 @@ def test_a_trip_that_only_a_fault_record_tells_is_a_fault(tmp_path: Path) -> Non
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_a_reset_ends_such_a_fault_and_an_old_record_is_none(tmp_path: Path) -> None:
+def test_reset_ends_a_recorded_fault_and_an_old_record_is_no_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT)
     past = "last fault overheat, which may still be in force"
@@ -91,7 +91,7 @@ def test_a_reset_ends_such_a_fault_and_an_old_record_is_none(tmp_path: Path) -> 
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_an_unknown_state_says_why_and_a_yd1000_shows_its_trips(tmp_path: Path) -> None:
+def test_unknown_state_has_a_reason_and_yd1000_shows_trips(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "yd1000", '["output_frequency", "status", "fault_record_1"]')
     take(hub, 10, output_frequency=0, status=0, fault_record_1=1)
     shown = hub.seen("pump-1")
@@ -144,7 +144,7 @@ def seen(events: Alarms) -> list[tuple[str, str, int, int | None]]:
 
 
 @pytest.mark.parametrize("standing", [STANDS, Shown("unknown", None)])
-def test_a_motor_that_stopped_though_nobody_stopped_it_is_an_alarm(standing: Shown) -> None:
+def test_motor_that_stops_without_a_command_is_an_alarm(standing: Shown) -> None:
     events = Alarms()
     for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
         events.look(time, "pump-1", shown, 0)
@@ -172,7 +172,7 @@ def test_a_fault_is_no_stop_of_its_own() -> None:
     assert {kind for _, kind, _, _ in seen(events)} == {"fault", "silent"}
 
 
-def test_the_gravest_comes_first_and_what_was_acknowledged_last() -> None:
+def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(2, "pump-2", RUNS, 0)
@@ -303,7 +303,7 @@ def test_a_long_file_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert past_of(path) == [ALARM]
 
 
-def test_a_disk_that_takes_nothing_is_reported_and_written_whole_later(tmp_path: Path) -> None:
+def test_failing_disk_is_reported_and_rewritten_later(tmp_path: Path) -> None:
     folder = tmp_path / "none"
     kept = started(folder / "alarms.jsonl")
     kept.note(ALARM)
@@ -381,7 +381,7 @@ def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
         assert "there is no such port" in alarm["text"]
 
 
-def test_a_stop_that_was_called_here_is_no_alarm_and_another_is(tmp_path: Path) -> None:
+def test_stop_from_here_is_no_alarm_and_another_one_is(tmp_path: Path) -> None:
     serve = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
     with served(tmp_path, serve) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -418,5 +418,5 @@ def test_a_stop_that_was_called_here_is_no_alarm_and_another_is(tmp_path: Path) 
         (BusError("pump-1.coast: no stop of start"), "pump-1.coast: no stop of start"),
     ],
 )
-def test_no_page_says_what_a_program_would_call(failure: BusError, said: str) -> None:
+def test_page_texts_have_no_function_names(failure: BusError, said: str) -> None:
     assert in_words(str(failure), failure) == said

@@ -93,7 +93,9 @@ def test_who_is_known_is_not_asked() -> None:
     assert bus.names == ["pump-2"] * 2
 
 
-def test_another_drive_is_told_of_once_and_no_failure_ends_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_wrong_identity_is_logged_once_and_failures_do_not_end_the_check(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     stranger = WriteForbidden(
         "nothing is written to fan-1: it is no CHE", rule="it does not look like its family"
     )

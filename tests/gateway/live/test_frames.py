@@ -60,7 +60,7 @@ def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: l
     assert made == [1, 2]
 
 
-def test_what_changed_is_found_once_for_all_who_have_the_same_frame(
+def test_changes_are_computed_once_per_known_frame(
     frames: Frames, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compared: list[int] = []
@@ -128,7 +128,7 @@ def test_nothing_is_made_for_nobody(frames: Frames, clock: Clock, made: list[int
     assert made == []
 
 
-def test_a_viewer_who_comes_late_gets_the_newest_and_no_other(frames: Frames, clock: Clock) -> None:
+def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -> None:
     async def watch() -> None:
         first = await frames.after(-1)
         assert first is not None
@@ -171,9 +171,7 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_what_changed_makes_the_newer_one_of_the_older_and_says_nothing_else(
-    before: dict[str, Any], now: dict[str, Any]
-) -> None:
+def test_changes_turn_the_old_frame_into_the_new_one(before: dict[str, Any], now: dict[str, Any]) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -182,7 +180,7 @@ def test_what_changed_makes_the_newer_one_of_the_older_and_says_nothing_else(
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_each_viewer_has_the_newest_whole_however_late_it_comes(
+def test_viewer_ends_with_the_newest_frame_however_late(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
     """A second number says for how many frames a viewer stays away; there is another plant in the middle."""
@@ -255,7 +253,7 @@ def test_a_viewer_too_many_is_told_so(frames: Frames, monkeypatch: pytest.Monkey
     assert json.loads(sent[1]["body"]) == {"error": "0 viewers wait already"}
 
 
-def test_a_frame_is_made_of_what_was_just_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_follows_the_check_for_alarms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The drives are gone through once in 0.2 s, for alarms and for the frame: of rows from just before."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()

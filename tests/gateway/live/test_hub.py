@@ -91,9 +91,7 @@ def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub)
     ("status", "frequency", "state"),
     [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
 )
-def test_a_state_is_what_the_family_makes_of_its_registers(
-    hub: Hub, status: int, frequency: int, state: str
-) -> None:
+def test_state_follows_the_family(hub: Hub, status: int, frequency: int, state: str) -> None:
     hub.take(all_of(10, status, frequency))
     assert hub.state("pump-1") == state
     assert hub.seen("pump-1").fault is None
@@ -114,7 +112,7 @@ def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
     assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
 
 
-def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub, clock: HubClock) -> None:
+def test_drive_is_silent_after_many_lost_replies_not_one(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     for at in range(11, 20):
         hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))
@@ -140,7 +138,7 @@ def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
     assert hub.state("pump-1") == "unknown"
 
 
-def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -> None:
+def test_line_is_lost_if_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     assert lost_of(hub, "hall") is None
     hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
@@ -162,7 +160,7 @@ def test_values_grow_old_where_nothing_comes(hub: Hub, clock: HubClock) -> None:
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
 
 
-def test_what_was_read_before_the_machine_slept_is_not_fresh(hub: Hub, clock: HubClock) -> None:
+def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None:
     """The monotonic clock, and so each row's age by it, stood still meanwhile."""
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
@@ -193,7 +191,7 @@ def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> No
         assert is_fresh(hub)
 
 
-def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path, clock: HubClock) -> None:
+def test_rarely_read_values_stay_fresh_longer(tmp_path: Path, clock: HubClock) -> None:
     path = written(tmp_path).path
     path.write_text(path.read_text().replace("100 ms", "10 s"))
     hub = Hub(Plant.load(path), clock)
@@ -205,9 +203,7 @@ def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path, clock: HubClock
 
 
 @pytest.mark.slow
-def test_what_an_overfull_line_reads_holds_until_three_rounds_are_over(
-    tmp_path: Path, clock: HubClock
-) -> None:
+def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path, clock: HubClock) -> None:
     path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
     hub = Hub(Plant.load(path), clock)
@@ -239,7 +235,7 @@ def test_one_long_pause_lets_no_value_hold_for_longer(hub: Hub, clock: HubClock)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
 
 
-def test_what_a_line_that_is_slower_than_planned_reads_holds_for_three_of_its_rounds(hub: Hub) -> None:
+def test_values_of_a_slower_line_stay_fresh_for_three_real_rounds(hub: Hub) -> None:
     for at in (0, 50, 90, 150):
         hub.take(all_of(at, FORWARD, 25))
     assert holds_s(hub) == pytest.approx(3 * 4)  # the shorter one of the latest two rounds
@@ -252,13 +248,13 @@ def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:
     assert "pump-9" not in list(hub.drives)
 
 
-def test_a_plant_that_is_taken_over_keeps_what_is_known(hub: Hub) -> None:
+def test_reload_keeps_rows_of_unchanged_drives(hub: Hub) -> None:
     hub.take(all_of(10, FORWARD, 25))
     hub.adopt(hub.plant)
     assert hub.state("pump-1") == "runs"
 
 
-def test_a_late_row_of_the_drive_that_had_a_name_is_no_value_of_the_one_that_has_it(tmp_path: Path) -> None:
+def test_late_row_of_a_previous_drive_is_ignored(tmp_path: Path) -> None:
     now = [0]
     hub = Hub(written(tmp_path, "", "pump-1", "pump-2"), lambda: (now[0], 0))
     now[0] = 20 * PERIOD
@@ -306,7 +302,7 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
 
 
 @pytest.mark.parametrize(("status", "is_over"), [(STANDBY, True), (9, True), (TRIPPED, False)])
-def test_a_fault_lasts_while_only_some_of_its_drive_is_known(
+def test_fault_stays_while_its_drive_is_partly_known(
     hub: Hub, clock: HubClock, status: int, is_over: bool
 ) -> None:
     """A busy line misses its status for a second, and reads its current: nobody saw the fault go."""

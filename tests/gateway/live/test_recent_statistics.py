@@ -75,7 +75,7 @@ def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_another_line_of_a_name_is_not_set_against_the_one_before(recent: RecentStatistics) -> None:
+def test_readings_of_another_line_of_the_same_name_are_not_compared(recent: RecentStatistics) -> None:
     """A reading of it may come while its plant is being adopted."""
     recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})

@@ -72,12 +72,12 @@ def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_frames_that_nobody_had_yet_and_those_of_another_process(times: Times) -> None:
+def test_unknown_and_foreign_frames_give_a_whole_frame(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 
 
-def test_what_a_stop_overtook_counts_for_its_drive_alone(times: Times) -> None:
+def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
     times.frames.note(7)
     times.stopped["pump-1"] = times.now_ns  # the frame may be older: in doubt nothing is sent
     assert times.rule(7) == OVERTAKEN
@@ -152,9 +152,7 @@ def commands(gateway: Served) -> list[tuple[str, float]]:
 
 
 @pytest.mark.parametrize(("path", "body"), [("/api/act", START), ("/api/write", WRITE)])
-def test_a_command_that_was_held_up_for_too_long_is_not_sent(
-    tmp_path: Path, path: str, body: dict[str, object]
-) -> None:
+def test_command_delayed_too_long_is_not_sent(tmp_path: Path, path: str, body: dict[str, object]) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
         with held_up(gateway, path, {**body, "seen": seen}) as client:
@@ -177,7 +175,7 @@ def test_a_stop_that_was_held_up_as_long_is_sent(tmp_path: Path) -> None:
         assert not motor.goal
 
 
-def test_a_start_of_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
+def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
     """A proxy that sends a start again, or lets a stop overtake it, starts nothing."""
     writer = {}
     with served(tmp_path, MAY) as gateway:
@@ -198,7 +196,7 @@ def test_a_start_of_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
         assert gateway.command("/api/act", START, **writer).json["done"] is True
 
 
-def test_a_command_that_waits_for_its_thread_until_it_is_too_late_is_not_sent(tmp_path: Path) -> None:
+def test_command_that_waits_too_long_for_its_thread_is_not_sent(tmp_path: Path) -> None:
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -220,9 +218,7 @@ def test_a_command_that_waits_for_its_thread_until_it_is_too_late_is_not_sent(tm
         assert commands(gateway) == []
 
 
-def test_a_stop_that_is_called_as_a_start_begins_ends_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_called_as_a_start_begins_prevents_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with served(tmp_path, MAY) as gateway:
         act = commands_module.carry_out_verb
 
@@ -237,7 +233,7 @@ def test_a_stop_that_is_called_as_a_start_begins_ends_it(
 
 
 @pytest.mark.slow
-def test_a_frame_of_a_gateway_that_was_started_again_is_none_of_its_own(tmp_path: Path) -> None:
+def test_frame_of_a_previous_process_is_refused(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
     with served(tmp_path, MAY) as gateway:
@@ -249,7 +245,7 @@ def test_a_frame_of_a_gateway_that_was_started_again_is_none_of_its_own(tmp_path
 
 
 @pytest.mark.parametrize("verb", ["start", "jog", "reset_fault", "set_frequency"])
-def test_what_may_move_a_motor_says_what_was_seen(tmp_path: Path, verb: str) -> None:
+def test_commands_that_may_move_a_motor_name_a_frame(tmp_path: Path, verb: str) -> None:
     with served(tmp_path, MAY) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         options = {"hz": 20.0} if verb == "set_frequency" else {}
@@ -262,7 +258,7 @@ def test_what_may_move_a_motor_says_what_was_seen(tmp_path: Path, verb: str) -> 
         assert gateway.gateway.commands.called == 0
 
 
-def test_a_stop_by_any_verb_says_nothing_of_what_was_seen(tmp_path: Path) -> None:
+def test_stops_need_no_frame(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         for verb in ("stop", "coast"):
             told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json

@@ -43,7 +43,7 @@ def number(words: list[int], at: int) -> int:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_page_has_a_unit_for_what_has_a_scale_alone(model: str) -> None:
+def test_only_scaled_values_have_a_unit(model: str) -> None:
     drive = MODELS[model](1)
     told = describe(
         Hub(plant(line("/dev/null", polled(drive, drive.readings())))),
@@ -80,7 +80,7 @@ def test_a_metric_of_raw_counts_says_so() -> None:
     assert [labels["unit"] for _, labels, _ in values.samples] == ["Hz", "raw count"]
 
 
-def test_home_assistant_writes_raw_counts_as_what_they_are() -> None:
+def test_home_assistant_writes_raw_counts() -> None:
     topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
     details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
     found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]

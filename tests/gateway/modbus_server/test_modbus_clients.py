@@ -245,7 +245,7 @@ def test_what_came_is_looked_at_for_a_while_before_others_have_their_turn() -> N
     run_controlled(main())
 
 
-def test_a_client_that_takes_no_answers_is_read_on_and_fills_no_memory(
+def test_client_that_reads_no_answers_is_still_read_within_bounds(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)

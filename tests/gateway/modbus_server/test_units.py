@@ -88,7 +88,7 @@ def test_address_0_is_no_unit() -> None:
     }
 
 
-def test_the_common_block_is_nobody_s_own() -> None:
+def test_common_block_must_not_overlap_registers() -> None:
     class Parameters(Drive):
         frequency_source = setting(0xF003)
 

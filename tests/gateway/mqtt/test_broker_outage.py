@@ -100,7 +100,7 @@ def watched(slots: Slots) -> dict[str, list[Slot]]:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually("gone", "frozen"))
-def test_nothing_of_the_polling_changes_and_what_was_dropped_is_counted(tmp_path: Path, kind: str) -> None:
+def test_polling_is_unchanged_and_dropped_messages_are_counted(tmp_path: Path, kind: str) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, gateway_of(tmp_path, broker) as (gateway, slots):
         until(lambda: figures(gateway)["connected"] == 2.0)

@@ -32,7 +32,7 @@ def configuration(state_topic: object) -> bytes:
     return json.dumps({"state_topic": state_topic}).encode()
 
 
-def test_a_drive_that_is_no_more_is_taken_back_whatever_comes_first() -> None:
+def test_removed_drive_is_deleted_in_any_order_of_messages() -> None:
     messages = [
         ("works/old fan/available", b"online"),
         ("homeassistant/device/works-old_20_fan/config", configuration("works/old fan")),
@@ -42,7 +42,7 @@ def test_a_drive_that_is_no_more_is_taken_back_whatever_comes_first() -> None:
     assert heard(*messages, GATEWAY) == expected
 
 
-def test_what_is_kept_of_drives_that_are_there_stays() -> None:
+def test_retained_messages_of_present_drives_stay() -> None:
     mine = [
         ("works/pump-1/available", b"online"),
         ("homeassistant/device/works-pump-1/config", configuration("works/pump-1")),
@@ -134,7 +134,7 @@ def live_and_die(broker: Broker, folder: Path, listener: Listener) -> None:
         listener.wait_for(lambda one: (one.topic, one.payload) == ("multidrop/gateway", b"offline"))
 
 
-def test_a_gateway_takes_back_what_a_killed_one_left(broker: Broker, tmp_path: Path) -> None:
+def test_messages_left_by_a_killed_gateway_are_deleted(broker: Broker, tmp_path: Path) -> None:
     for topic in ("elsewhere/old/available", "multidrop/hall/old/available"):
         publish(broker, topic, b"online", "-r")
     foreign = discovery_topic("multidrop", "old")

@@ -90,9 +90,7 @@ def now_ms() -> int:
     return time.time_ns() // 1_000_000
 
 
-def test_a_drive_s_newest_values_are_kept_for_who_comes_later(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_newest_values_are_retained(broker: Broker, listener: Listener, start: Start) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
@@ -108,9 +106,7 @@ def test_a_drive_s_newest_values_are_kept_for_who_comes_later(
     }
 
 
-def test_a_value_that_is_not_fresh_is_null_and_a_silent_drive_is_offline(
-    listener: Listener, start: Start
-) -> None:
+def test_stale_value_is_null_and_silent_drive_is_offline(listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/pump-1/available", b"online"))
     known.hub.values[("pump-1", "output_frequency")] = None
@@ -130,9 +126,7 @@ def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Sta
     listener.wait_for(has("multidrop/gateway", b"online"))
 
 
-def test_who_comes_later_hears_that_the_gateway_is_gone(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_offline_message_is_retained(broker: Broker, listener: Listener, start: Start) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
@@ -145,7 +139,7 @@ def test_who_comes_later_hears_that_the_gateway_is_gone(
         later.close()
 
 
-def test_what_there_was_to_say_without_a_connection_is_counted(tmp_path: Path) -> None:
+def test_messages_without_a_connection_are_counted(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(f"mqtt://127.0.0.1:{free_port()}", sparkplug="works"), inside(tmp_path))
     running = Running(part)
@@ -173,7 +167,7 @@ def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> 
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
-def test_who_can_say_nothing_is_away_and_still_stops(
+def test_failing_publisher_is_offline_and_still_stops(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     """The values that the broker keeps would pass for the present, for it has a connection."""
@@ -197,7 +191,7 @@ def test_who_can_say_nothing_is_away_and_still_stops(
 
 
 @pytest.mark.slow
-def test_who_can_say_nothing_is_away_on_a_new_connection_too(listener: Listener, start: Start) -> None:
+def test_failing_publisher_is_offline_on_a_new_connection_too(listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
@@ -211,9 +205,7 @@ def test_who_can_say_nothing_is_away_on_a_new_connection_too(listener: Listener,
 
 
 @pytest.mark.slow
-def test_a_broker_that_stands_still_holds_up_nothing(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_frozen_broker_delays_nothing(broker: Broker, listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
     broker.signal(signal.SIGSTOP)
@@ -268,9 +260,7 @@ def test_a_fresh_write_is_carried_out_once(broker: Broker, listener: Listener, s
 
 
 @pytest.mark.parametrize("age_ms", [60_000, -60_000])
-def test_a_command_that_was_held_up_is_not_carried_out(
-    broker: Broker, listener: Listener, start: Start, age_ms: int
-) -> None:
+def test_delayed_command_is_refused(broker: Broker, listener: Listener, start: Start, age_ms: int) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     sent_ms = now_ms() - age_ms
@@ -283,9 +273,7 @@ def test_a_command_that_was_held_up_is_not_carried_out(
 
 
 @pytest.mark.parametrize("topic", ["multidrop/pump-1/set/setpoint", "multidrop/pump-1/act"])
-def test_a_command_that_the_broker_keeps_is_not_carried_out(
-    broker: Broker, listener: Listener, start: Start, topic: str
-) -> None:
+def test_retained_command_is_refused(broker: Broker, listener: Listener, start: Start, topic: str) -> None:
     sent = {"value": 25, "verb": "start", "drive": "pump-1", "time": now_ms() + 1000}
     publish(broker, topic, json.dumps(sent).encode(), "-r")
     known, _ = start(commands=True)
@@ -405,9 +393,7 @@ def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
-def test_what_is_no_verb_or_starts_a_motor_under_two_names_is_refused(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_unknown_verb_or_ambiguous_drive_is_refused(broker: Broker, listener: Listener, start: Start) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
@@ -418,9 +404,7 @@ def test_what_is_no_verb_or_starts_a_motor_under_two_names_is_refused(
     assert known.commands.noted == []
 
 
-def test_a_command_that_may_be_older_than_a_reload_is_not_carried_out(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listener, start: Start) -> None:
     """Its drive's name may be that of another one now."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -432,7 +416,7 @@ def test_a_command_that_may_be_older_than_a_reload_is_not_carried_out(
 
 
 @pytest.mark.parametrize(("after_ms", "is_taken"), [(-3000, False), (0, False), (1900, False), (2500, True)])
-def test_a_command_that_may_be_older_than_a_stop_is_not_carried_out(
+def test_command_older_than_a_stop_is_refused(
     broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool
 ) -> None:
     """A broker that held it up gives it after the stop; its sender's clock may be fast by 2 s."""
@@ -538,7 +522,7 @@ def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-def test_without_the_key_a_broker_s_commands_are_nobody_s(tmp_path: Path, is_retained: bool) -> None:
+def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
     """It may send what nobody asked it for."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
@@ -702,7 +686,7 @@ def test_registers_with_the_names_of_components_keep_them_apart() -> None:
     assert json.loads(command.render(value="FAST", now=lambda: datetime.now(UTC)))["value"] == 7
 
 
-def test_a_number_that_is_not_polled_has_no_state() -> None:
+def test_unpolled_number_has_no_state() -> None:
     drive = InvtCHE(1, name="a")
     assert (
         not {"state_topic", "value_template"}
@@ -726,7 +710,7 @@ def test_binary_sensors_say_what_is_known(state: str, problem: str, running: str
     assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
 
 
-def test_a_choice_without_a_name_is_unknown_and_not_the_one_before() -> None:
+def test_choice_without_a_name_is_unknown() -> None:
     """Home Assistant ignores a state that is no option, and shows the one before it."""
     part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
     values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
@@ -746,7 +730,7 @@ def test_two_gateways_have_no_id_of_one_another() -> None:
 # ---- settings ----
 
 
-def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_the_settings_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="broker = ") as told:
         MqttSettings("http://x", prefix="a/+", every="soon", sparkplug="a/b", node="#")
     sentences = str(told.value).splitlines()
@@ -754,7 +738,7 @@ def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
     assert sentences[0].startswith('broker = "http://x" is not a broker\'s URL; write broker = "mqtt://')
 
 
-def test_authorities_that_are_none_are_told_before_anything_is_polled(tmp_path: Path) -> None:
+def test_invalid_authorities_are_reported_before_polling(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "text.pem").write_text("no certificate\n", "ascii")
     plant = inside(tmp_path).plant
@@ -768,7 +752,7 @@ def test_authorities_that_are_none_are_told_before_anything_is_polled(tmp_path: 
         assert [one for one in settings.check(plant) if "authorities" in one] == told
 
 
-def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
+def test_drive_name_that_cannot_be_a_topic_is_reported(tmp_path: Path) -> None:
     plant = inside(tmp_path).plant
     odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway", "stop"))
     plant = replace(plant, lines=(replace(plant.lines[0], drives=odd),))
@@ -790,7 +774,7 @@ def test_topics_of_others_are_refused(topics: dict[str, str]) -> None:
         MqttSettings(**topics)
 
 
-def test_a_plant_file_s_name_that_cannot_be_an_edge_node_is_told(tmp_path: Path) -> None:
+def test_file_name_that_cannot_be_an_edge_node_is_reported(tmp_path: Path) -> None:
     plant = replace(inside(tmp_path).plant, path=tmp_path / "a+b.toml")
     assert MqttSettings().check(plant) == MqttSettings(sparkplug="works", node="hall").check(plant) == []
     (sentence,) = MqttSettings(sparkplug="works").check(plant)
@@ -879,7 +863,7 @@ def test_a_drive_that_left_while_the_broker_was_away_is_taken_back_when_it_is_th
     assert topics.outbox.emptied() == set()
 
 
-def test_what_is_kept_of_a_drive_that_left_is_taken_back(
+def test_retained_messages_of_a_removed_drive_are_deleted(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     known, running = start(home_assistant=True)

@@ -99,7 +99,7 @@ def test_commands_go_through_the_rules(broker: Broker, start: Start) -> None:
 
 
 @pytest.mark.slow
-def test_a_command_that_the_broker_keeps_is_not_carried_out(broker: Broker, start: Start) -> None:
+def test_retained_command_is_refused(broker: Broker, start: Start) -> None:
     listener = Listener(broker)
     try:
         body = json.dumps({"value": 25.0, "time": now_ms() + 1000}).encode()

@@ -41,7 +41,7 @@ def test_no_more_than_the_bound_is_under_way_and_the_newest_of_a_topic_is_sent()
     assert outbox.is_idle
 
 
-def test_what_waits_says_what_is_so_when_it_is_sent() -> None:
+def test_pending_message_is_made_when_it_is_sent() -> None:
     wire, now = Wire(), [b"old"]
     outbox = Outbox(wire.send)
     wire.is_open = False
@@ -62,7 +62,7 @@ def test_a_message_that_cannot_be_made_holds_up_no_other() -> None:
     assert outbox.is_idle
 
 
-def test_a_lost_connection_forgets_what_waits_and_counts_it() -> None:
+def test_lost_connection_drops_and_counts_pending_messages() -> None:
     wire = Wire()
     outbox = Outbox(wire.send)
     for topic in range(MOST_UNDER_WAY + 3):

@@ -71,7 +71,7 @@ def test_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
     assert (born["state"], born["fault"]) == ("fault", "перегрев")
 
 
-def test_a_fault_in_words_is_said_of_a_drive_whose_own_number_of_it_is_not_polled(tmp_path: Path) -> None:
+def test_fault_is_published_in_words_without_a_polled_number(tmp_path: Path) -> None:
     """Its register called `fault` is a number without names."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
@@ -217,7 +217,7 @@ def test_commands_of_a_host(broker: Broker, host: Host, node: tuple[Any, Running
 @pytest.mark.parametrize(
     ("name", "noted"), [(b"Device Control/Stop", [("stop", ["pump-1"])]), (b"setpoint", [])]
 )
-def test_a_stop_is_sent_whatever_is_wrong_with_the_rest_of_its_payload(
+def test_stop_in_an_invalid_payload_is_sent(
     tmp_path: Path, damage: bytes, name: bytes, noted: list[object]
 ) -> None:
     """A group, a name that is no UTF-8, and a metric that was cut off, behind a boolean metric."""
@@ -235,9 +235,7 @@ def test_a_stop_is_sent_whatever_is_wrong_with_the_rest_of_its_payload(
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-def test_a_write_that_the_broker_kept_is_not_carried_out_and_a_stop_is(
-    tmp_path: Path, *, is_retained: bool
-) -> None:
+def test_retained_write_is_refused_and_retained_stop_is_sent(tmp_path: Path, *, is_retained: bool) -> None:
     """It comes at every connection, and it may be fresh when it comes first."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
@@ -253,7 +251,7 @@ def test_a_write_that_the_broker_kept_is_not_carried_out_and_a_stop_is(
     assert known.commands.noted == [*written, ("stop", ["pump-1"])]
 
 
-def test_another_plant_is_a_death_of_what_left_and_a_birth_of_the_rest(
+def test_reload_sends_deaths_of_removed_drives_and_births_of_others(
     broker: Broker, host: Host, node: tuple[Any, Running]
 ) -> None:
     known, running = node

@@ -70,7 +70,7 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 
-def test_a_single_miss_is_no_warning_and_many_are(opened: Opener, gateway: FakeGateway) -> None:
+def test_many_misses_warn_and_one_does_not(opened: Opener, gateway: FakeGateway) -> None:
     gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
     gateway.changes = {"lines": {name: line | {"misses": 1} for name, line in lines().items()}}
     page = opened()
@@ -83,7 +83,7 @@ def test_a_single_miss_is_no_warning_and_many_are(opened: Opener, gateway: FakeG
     page.locator(".linehead .warn").first.wait_for()
 
 
-def test_a_drive_at_rest_whose_state_is_unknown_is_no_fault(opened: Opener, gateway: FakeGateway) -> None:
+def test_drive_at_rest_with_unknown_state_is_not_a_fault(opened: Opener, gateway: FakeGateway) -> None:
     why = "the outputs are not programmed"
     gateway.drive_changes = {name: {"state": "unknown", "note": why} for name in ("pump-4", "pump-1")}
     page = opened("#/drives/pump-4")

@@ -32,7 +32,7 @@ def test_a_file_has_one_job_and_short_lines() -> None:
         assert path.suffix == ".html" or re.match(r"// [A-Z]|/\* [A-Z]", lines[0]), path.name
 
 
-def test_whatever_is_named_is_there_and_whatever_is_there_is_named() -> None:
+def test_named_files_and_existing_files_are_the_same() -> None:
     text = "".join(path.read_text("utf-8") for path in OURS)
     named = set(re.findall(r'(?:from "\./|"page/)([\w./-]+)"', text))
     there = {path.relative_to(str(PAGE)).as_posix() for path in Path(str(PAGE)).rglob("*") if path.is_file()}

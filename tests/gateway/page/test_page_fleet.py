@@ -57,7 +57,7 @@ def test_its_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
     until(page, f"{lag} === '\"Lag \"'")  # beside the value: the table's head is not there
 
 
-def test_what_is_old_is_marked_with_its_age_and_why(opened: Opener, gateway: FakeGateway) -> None:
+def test_old_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     await_note(page, "Looked at once a second")
     gateway.fleet = {"age_s": 40.0, "trouble": "no connection to nats://a:4222"}
@@ -71,7 +71,7 @@ def test_what_is_old_is_marked_with_its_age_and_why(opened: Opener, gateway: Fak
     until_met(page, lambda: page.evaluate(style) == "normal")
 
 
-def test_it_grows_old_by_itself_where_the_gateway_is_gone(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_grows_old_when_the_gateway_is_lost(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     await_note(page, "Looked at once a second")
     gateway.kill()
@@ -79,7 +79,7 @@ def test_it_grows_old_by_itself_where_the_gateway_is_gone(opened: Opener, gatewa
     assert "The gateway cannot be reached" in page.locator("#fleet-age").inner_text()
 
 
-def test_before_the_first_look_nothing_is_shown(opened: Opener, gateway: FakeGateway) -> None:
+def test_nothing_is_shown_before_the_first_answer(opened: Opener, gateway: FakeGateway) -> None:
     gateway.fleet = {"age_s": None, "trouble": "no such server", "gateways": {}, "lines": {}, "moves": []}
     page = opened("#/fleet")
     await_note(page, "The fleet has not been seen yet: no such server")

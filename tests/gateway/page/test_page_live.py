@@ -118,7 +118,7 @@ SET_BACK = """([name, register, known]) => import('/page/store.js').then(s => {
 })"""
 
 
-def test_nothing_gets_young_where_the_gateway_s_clock_is_set_back(opened: Opener) -> None:
+def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> None:
     page = opened()
     until(page, LIVE)
     value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", True])
@@ -135,7 +135,7 @@ def test_nothing_gets_young_where_the_gateway_s_clock_is_set_back(opened: Opener
     assert not is_old
 
 
-def test_what_a_slow_line_read_seconds_ago_is_not_old(
+def test_values_of_a_slow_line_stay_fresh_for_seconds(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The period is what was asked for; how long a value holds, the gateway knows."""
@@ -148,7 +148,7 @@ def test_what_a_slow_line_read_seconds_ago_is_not_old(
     assert page.locator("tr.drive", has_text="pump-2").locator(".value.old").count() == 0
 
 
-def test_what_is_not_well_beside_the_lines_is_told(opened: Opener, gateway: FakeGateway) -> None:
+def test_troubles_besides_the_lines_are_shown(opened: Opener, gateway: FakeGateway) -> None:
     gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
     page = opened()
     notice = page.locator("#notice")
@@ -168,7 +168,7 @@ def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> Non
     )
 
 
-def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway: FakeGateway) -> None:
+def test_unknown_values_are_a_dash_and_never_zero(opened: Opener, gateway: FakeGateway) -> None:
     rows = {"output_frequency": [None, 0, "no reply"], "output_current": [None, 0, "not asked yet"]}
     drive = {"state": "unknown", "fault": None, "seen": None, "ages_ms": [0], "values": rows}
     gateway.changes = {"drives": {"pump-1": drive}, "lines": {}}
@@ -189,7 +189,7 @@ def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway:
 
 
 @pytest.mark.parametrize("off_s", [-90, 90])
-def test_a_wrong_clock_of_the_viewer_is_told_and_ages_stay_right(opened: Opener, off_s: int) -> None:
+def test_viewers_wrong_clock_is_shown_and_ages_stay_right(opened: Opener, off_s: int) -> None:
     page = opened(live=False)
     page.add_init_script(f"const now = Date.now; Date.now = () => now() + {off_s * 1000}")
     page.reload()
@@ -271,7 +271,7 @@ def test_a_network_that_changes_while_the_page_is_loaded_costs_a_moment(opened: 
     assert page.locator("#stopall").is_enabled()
 
 
-def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Opener) -> None:
+def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -> None:
     page = opened(live=False)
     page.route("**/page/api.js", lambda route: route.abort())
     page.reload()
@@ -280,7 +280,7 @@ def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Ope
     assert page.locator("#stopall").is_disabled()
 
 
-def test_no_line_is_drawn_over_what_the_page_did_not_see(opened: Opener) -> None:
+def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
     """A laptop slept for an hour."""
     page = opened()
     seen = page.evaluate("""() => import('/page/store.js').then(({ store, takeFrame }) => {
@@ -326,9 +326,7 @@ def test_no_value_of_another_drive_or_in_another_unit_goes_on_under_its_name(
 
 
 @pytest.mark.parametrize("name", ["pump-1", "conveyor-2", "labeller", "tower-fan-2", "a" * 40])
-def test_a_phone_shows_each_drive_s_age_and_what_it_missed(
-    opened: Opener, gateway: FakeGateway, name: str
-) -> None:
+def test_phone_shows_ages_and_misses_of_each_drive(opened: Opener, gateway: FakeGateway, name: str) -> None:
     if len(name) == 40:
         gateway.renamed["pump-1"] = name
     page = opened(size="phone")

@@ -31,9 +31,7 @@ def told(page: Any, title: str) -> None:
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-def test_the_keyboard_alone_reads_it_again_and_all_mistakes_are_told(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_reload_by_keyboard_lists_all_mistakes(opened: Opener, gateway: FakeGateway) -> None:
     mistakes = [f"plant.toml: [[line]] {n}: port is missing" for n in range(30)]
     text = "the plant goes on as before: the file has mistakes"
     gateway.reloaded = {"done": False, "text": text, "mistakes": mistakes, "restart": []}
@@ -59,7 +57,7 @@ def test_the_keyboard_alone_reads_it_again_and_all_mistakes_are_told(
     assert gateway.posts == [("/api/reload", {"confirm": True})]
 
 
-def test_where_there_is_no_file_or_no_right_it_is_not_offered(opened: Opener, gateway: FakeGateway) -> None:
+def test_reload_is_not_offered_without_a_file_or_right(opened: Opener, gateway: FakeGateway) -> None:
     for changed in ({"file": False}, {"may": {"role": "stop", "write": [], "verbs": []}}):
         gateway.plant_changes = changed
         page = opened()

@@ -182,7 +182,7 @@ def test_drives_that_did_not_stop_are_named(opened: Opener, gateway: FakeGateway
     told(page, "All 31 drives are stopped")
 
 
-def test_a_stop_that_may_not_have_arrived_is_not_called_sent(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_with_a_lost_answer_is_shown_as_unknown(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.kill()
     page.locator("#stopall").click()
@@ -196,7 +196,7 @@ UNTAKEN = "The gateway has not accepted the stop"
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_a_frozen_gateway_is_told_of_within_two_seconds(
+def test_frozen_gateway_is_shown_within_two_seconds(
     opened: Opener, gateway: FakeGateway, is_closed: bool
 ) -> None:
     gateway.is_held = threading.Event()
@@ -226,7 +226,7 @@ def test_a_stop_that_was_taken_is_waited_for(opened: Opener, gateway: FakeGatewa
     told(page, "All 31 drives are stopped")
 
 
-def test_a_frozen_gateway_is_told_of_after_a_verb_that_stops(opened: Opener, gateway: FakeGateway) -> None:
+def test_frozen_gateway_is_shown_after_a_stop_verb(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     held: list[Any] = []
     page.route("**/api/act", lambda route: held.append(route))
@@ -237,7 +237,7 @@ def test_a_frozen_gateway_is_told_of_after_a_verb_that_stops(opened: Opener, gat
     page.locator("#outcomes li").wait_for()
 
 
-def test_a_token_that_is_typed_is_no_frozen_gateway(opened: Opener, gateway: FakeGateway) -> None:
+def test_typing_a_token_does_not_look_like_a_frozen_gateway(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -397,7 +397,7 @@ def test_the_keys_that_stop_are_the_same_on_every_layout(opened: Opener) -> None
     }
 
 
-def test_the_key_is_at_hand_behind_a_dialog_but_where_something_is_typed(opened: Opener) -> None:
+def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     page.keyboard.press("Shift+S")  # in the field

@@ -46,7 +46,7 @@ def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener) -> Non
     until_met(page, lambda: shown.count() == 31)
 
 
-def test_bars_of_all_drives_have_one_scale_which_is_told(opened: Opener, gateway: FakeGateway) -> None:
+def test_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
     """A drive that may be set to 320 Hz has no shorter bar than another one at the same frequency."""
     gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}
     rows = {"output_frequency": [41.0, 0], "frequency_setpoint": [48.0, 0]}
@@ -74,7 +74,7 @@ def line_of_one(number: int, most: float) -> dict[str, Any]:
     return line | {"drives": [drive | {"registers": registers}]}
 
 
-def test_a_motor_s_speed_is_not_called_its_frequency(opened: Opener, gateway: FakeGateway) -> None:
+def test_motor_speed_is_not_labelled_frequency(opened: Opener, gateway: FakeGateway) -> None:
     line = line_of_one(0, 50)
     (drive,) = line["drives"]
     names = {"output_frequency": "motor_speed"}
@@ -138,7 +138,7 @@ def test_why_a_port_is_lost_is_shown_whole(
     assert head.evaluate("head => head.scrollWidth - head.clientWidth") <= 0
 
 
-def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
+def test_problems_have_shape_and_word_besides_colour(opened: Opener) -> None:
     page = opened()
     state = cell(page, "conveyor-2", "state")
     assert state.inner_text().strip() == "overcurrent in acceleration"
@@ -269,7 +269,7 @@ def test_dates_are_chosen_and_an_end_before_the_begin_is_refused(opened: Opener)
     until_met(page, lambda: page.locator("#span").inner_text() == span)
 
 
-def test_on_a_phone_several_drives_are_chosen_at_once_and_told_apart(opened: Opener) -> None:
+def test_phone_selects_and_distinguishes_several_drives(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000", size="phone")
     until(page, DRAWN)
     heads = page.locator("#trend-plots .plothead output")
@@ -300,7 +300,7 @@ def test_no_more_drives_are_chosen_than_there_are_lines_to_tell_apart(opened: Op
     assert not boxes.nth(24).is_checked()
 
 
-def test_a_time_of_which_the_gateway_knows_nothing_is_not_shown_as_one_without_faults(
+def test_time_before_the_gateway_started_is_not_shown_as_fault_free(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     """It began in the middle of the hour that is shown."""
@@ -316,7 +316,7 @@ def test_a_time_of_which_the_gateway_knows_nothing_is_not_shown_as_one_without_f
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
-def test_another_unit_is_another_plot_and_what_is_left_out_is_told(
+def test_other_units_have_their_own_plot_and_omissions_are_listed(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.recorded = {
@@ -336,7 +336,7 @@ def test_another_unit_is_another_plot_and_what_is_left_out_is_told(
     assert " %, last " in said
 
 
-def test_a_drive_is_not_drawn_in_a_unit_of_before(opened: Opener, gateway: FakeGateway) -> None:
+def test_values_in_a_previous_unit_are_not_drawn(opened: Opener, gateway: FakeGateway) -> None:
     gateway.recorded = {"pump-2.output_current": {"unit": "%", "left_out": ["A"]}}
     page = opened("#/drives/pump-2")
     page.locator(".panel .ranges button", has_text="1 h").click()
@@ -467,7 +467,7 @@ def test_lines_show_wire_misses_by_reason_and_delays(opened: Opener) -> None:
     assert "3 of 5120" in line.locator("tr", has_text="labeller").inner_text()
 
 
-def test_the_log_shows_who_wrote_what_and_what_it_became(opened: Opener) -> None:
+def test_log_shows_callers_writes_and_results(opened: Opener) -> None:
     page = opened("#/log")
     rows = page.locator("#log-list tbody tr")
     rows.first.wait_for()

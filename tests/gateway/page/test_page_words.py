@@ -36,7 +36,7 @@ TELL_NUMBERS = """async numbers => {
 }"""
 
 
-def test_a_number_is_told_with_its_digits_or_as_the_float_that_it_is(opened: Opener) -> None:
+def test_numbers_have_their_digits_and_floats_their_own(opened: Opener) -> None:
     single = struct.unpack(">f", struct.pack(">f", 0.1))[0]  # as the core delivers it: 0.10000000149011612
     told = {
         (12.5, 1): "12.5",
@@ -64,7 +64,7 @@ def test_plots_and_markers_tell_floats_too(opened: Opener, gateway: FakeGateway)
     until_met(page, lambda: re.fullmatch(fraction, cell.inner_text()) is not None)
 
 
-def test_a_gateway_that_stays_away_is_told_of_in_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
+def test_lost_gateway_is_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     with page.expect_event("requestfailed", lambda request: request.url.endswith("/api/plant")):
         gateway.kill()
@@ -98,9 +98,7 @@ def test_faults_that_come_before_the_first_frame_last_for_as_long_as_they_do(
     assert lasted.inner_text() == "87 min so far"
 
 
-def test_what_lasted_when_the_gateway_died_is_not_known_to_last_on(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/faults")
     lasted = page.locator("#faults td").get_by_text("so far").first
     lasted.wait_for()
@@ -168,7 +166,7 @@ def test_the_hour_ends_with_its_newest_minute(opened: Opener, gateway: FakeGatew
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_names_that_differ_at_their_ends_are_told_apart(
+def test_names_that_differ_at_their_ends_look_different(
     opened: Opener, gateway: FakeGateway, size: str
 ) -> None:
     names = [f"conveyor-of-the-bottling-hall-south-no-{n:02}" for n in (1, 2)]
@@ -192,7 +190,7 @@ def test_an_old_register_has_its_age_like_a_new_one(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_what_was_looked_at_is_old_once_nobody_answers(opened: Opener, gateway: FakeGateway) -> None:
+def test_viewed_registers_grow_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
     """It may be looked at once a minute, and is new for so long only while its drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")

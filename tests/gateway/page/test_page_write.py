@@ -36,7 +36,7 @@ def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: Fak
     assert "frequency setpoint = 31.5 Hz: held by the drive" in page.locator("#outcomes").inner_text()
 
 
-def test_a_value_out_of_range_or_none_is_not_sent(opened: Opener, gateway: FakeGateway) -> None:
+def test_invalid_values_are_not_sent(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     for value in ("50.5", "-1", ""):
@@ -47,7 +47,7 @@ def test_a_value_out_of_range_or_none_is_not_sent(opened: Opener, gateway: FakeG
     assert gateway.posts == []
 
 
-def test_what_a_write_became_is_said_in_the_gateways_words(opened: Opener, gateway: FakeGateway) -> None:
+def test_result_of_a_write_is_shown_in_the_gateways_words(opened: Opener, gateway: FakeGateway) -> None:
     gateway.outcomes = {"pump-1": {"done": False, "text": "the drive took 30.0 Hz instead"}}
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
@@ -57,9 +57,7 @@ def test_what_a_write_became_is_said_in_the_gateways_words(opened: Opener, gatew
     assert "the drive took 30.0 Hz instead" in page.locator("#outcomes").inner_text()
 
 
-def test_a_write_whose_answer_is_lost_is_not_called_sent_nor_sent_again(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_write_with_a_lost_answer_is_unknown_and_not_repeated(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.abort())
     page.get_by_role("button", name="start").click()
@@ -71,7 +69,7 @@ def test_a_write_whose_answer_is_lost_is_not_called_sent_nor_sent_again(
 CUT_SHORT = '{"done": tr'
 
 
-def test_an_answer_that_breaks_off_is_no_answer(opened: Opener, gateway: FakeGateway) -> None:
+def test_truncated_answer_does_not_count(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.fulfill(status=200, body=CUT_SHORT))
     page.route("**/api/audit*", lambda route: route.fulfill(status=200, body=CUT_SHORT))
@@ -242,9 +240,7 @@ def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, ga
     until_met(page, lambda: gateway.posts)
 
 
-def test_a_plant_that_is_read_anew_behind_the_dialog_ends_a_start(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_reload_behind_the_dialog_cancels_a_start(opened: Opener, gateway: FakeGateway) -> None:
     """Under the name that was confirmed may be another drive now."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
@@ -260,7 +256,7 @@ def test_a_plant_that_is_read_anew_behind_the_dialog_ends_a_start(
     until_met(page, lambda: gateway.posts)
 
 
-def test_a_verb_that_stops_is_sent_whatever_came_before(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_verb_is_sent_after_a_stop_or_reload(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="emergency stop").click()
     gateway.stops = {"pump-1": 1}
@@ -310,7 +306,7 @@ def test_set_frequency_shows_value_and_span_and_refuses_before_sending(
     ]
 
 
-def test_a_write_is_bounded_by_what_other_registers_hold(opened: Opener, gateway: FakeGateway) -> None:
+def test_write_is_limited_by_values_of_other_registers(opened: Opener, gateway: FakeGateway) -> None:
     gateway.maximum_hz = 45.0
     page = opened("#/drives/pump-1")
     page.locator(".registers tr", has_text="maximum frequency").get_by_text("45.0").wait_for()
