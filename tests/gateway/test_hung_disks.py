@@ -1,4 +1,4 @@
-"""File systems that hang, such as FIFOs: polling and stops go on, /health says why, and the gateway ends."""
+"""Hung file systems: polling and stops continue, /health reports them, and the gateway ends."""
 
 from __future__ import annotations
 

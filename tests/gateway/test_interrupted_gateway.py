@@ -1,4 +1,4 @@
-"""Whatever interrupts the start or the end of a gateway: it ends, and nothing is sent afterwards."""
+"""A gateway interrupted at its start or end: it ends, and sends nothing afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts that a plant file, read again, adds, changes or takes away: each begins, changes or ends with it."""
+"""Parts that a reloaded plant file adds, changes or removes."""
 
 from __future__ import annotations
 

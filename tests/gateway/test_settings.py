@@ -1,4 +1,4 @@
-"""The table `[serve]`: what it may say, and all mistakes in it at once."""
+"""The table `[serve]`: its keys, and all mistakes at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rights that Commands looks at itself: no way in has to, and none is let off."""
+"""Rights checked by Commands, for every way of sending commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connections of slow and silent clients: they keep nobody out, and end."""
+"""Slow and silent HTTP clients: they delay nobody and are closed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exports over HTTP: how many there are at a time, and what they hold up."""
+"""Exports over HTTP: their limit, and their effect on other requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Identities: drives are asked what they are before they are stopped, and a stop then asks nothing first."""
+"""Identities are checked before the first stop, so a stop is sent at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of the last hour: made of readings, of which only the newest are kept."""
+"""Statistics of the last hour, from few stored readings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that the network holds up or doubles: none is carried out when nobody means it any more."""
+"""Commands delayed or repeated by a network are not sent."""
 
 from __future__ import annotations
 

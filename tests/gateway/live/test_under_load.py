@@ -1,4 +1,4 @@
-"""A gateway beside all its users at once: nothing is wrong with what they get, and all drives are stopped."""
+"""A gateway with all kinds of users at once: answers are right and all drives are stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages about the Modbus server: their plant files are taken, and their tables are what the code has."""
+"""The pages about the Modbus server: plant files load, and tables match the code."""
 
 from __future__ import annotations
 

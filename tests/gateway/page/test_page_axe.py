@@ -1,4 +1,4 @@
-"""Nobody is shut out: axe-core finds nothing in any view, at any size, in either theme."""
+"""Accessibility: axe-core finds no violation in any view, size and theme."""
 
 from __future__ import annotations
 

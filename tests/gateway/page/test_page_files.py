@@ -1,4 +1,4 @@
-"""The page's files: nothing that a text could turn into markup, nothing that its CSP forbids, all there."""
+"""The page's files: no markup from texts, nothing forbidden by the CSP, no file missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The view of a fleet: what is old is marked, what a gateway does not say is a dash, and it may be away."""
+"""The view of a fleet: old data are marked, and missing answers are dashes."""
 
 from __future__ import annotations
 

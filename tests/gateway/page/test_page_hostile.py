@@ -1,4 +1,4 @@
-"""Hostile pages in Chromium: whatever they try, nothing is read and no write reaches the simulated wire."""
+"""Hostile pages in Chromium: they read nothing, and no write reaches the simulated wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page shows what the drives said last, and how old that is."""
+"""The page shows the newest values of the drives and their ages."""
 
 from __future__ import annotations
 

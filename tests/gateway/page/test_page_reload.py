@@ -1,4 +1,4 @@
-"""The plant file is read again where a writer confirms it, and every mistake in it is told."""
+"""Reload of the plant file by a writer, and the list of all mistakes in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stop is at the same place always, asks once, is sent at once, and is told of as it was."""
+"""Stop all: always at the same place, one question, sent at once, with its result."""
 
 from __future__ import annotations
 

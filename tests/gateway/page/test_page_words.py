@@ -1,4 +1,4 @@
-"""Words, counts and marks say what is so: of one drive, a plant that has just begun, a gateway that died."""
+"""Words, counts and marks of a single drive, a new plant and a lost gateway."""
 
 from __future__ import annotations
 

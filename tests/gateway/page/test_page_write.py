@@ -1,4 +1,4 @@
-"""Nothing is written unasked: one register of one drive, confirmed by name, sent once, told of as it was."""
+"""A write: one register of one drive, confirmed by name, sent once, with its result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting for what a page shows: from outside, because its CSP forbids code that is made of texts."""
+"""Waits for the state of a page, from outside because its CSP forbids evaluated code."""
 
 from __future__ import annotations
 

@@ -1,8 +1,11 @@
-"""Leftovers at a broker: the next gateway takes back what a killed one left there, and nothing else."""
+"""Retained messages of removed drives are deleted; commands delayed by a frozen broker are refused."""
 
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -10,9 +13,12 @@ from typing import Any
 
 import pytest
 from brokers import FAN, Broker, Listener, Running, inside, mosquitto, publish, without_fan
-from peers import require_module
+from gateways import served
+from lines import until
+from peers import require_module, require_program
 from tables import table
 
+from multidrop.gateway.http.rights import Right
 from multidrop.gateway.mqtt.home_assistant import discovery_topic
 from multidrop.gateway.mqtt.json_topics import MOST_DISCOVERY, MOST_KEPT, RetainedTopics
 from multidrop.gateway.mqtt.part import build
@@ -159,3 +165,62 @@ def test_messages_left_by_a_killed_gateway_are_deleted(broker: Broker, tmp_path:
             }
     finally:
         listener.close()
+
+
+SERVE = """[serve.may]
+stop = "anyone"
+write = ["pump-1.setpoint"]
+verbs = ["pump-1.start"]
+[serve.mqtt]
+broker = "{}"
+commands = true
+"""
+
+
+@pytest.mark.long
+def test_a_start_that_a_broker_held_up_does_not_follow_a_stop(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with mosquitto(tmp_path) as broker, served(tmp_path, SERVE.format(broker.address)) as gateway:
+        listener = Listener(broker, "multidrop/#")
+        command = [
+            require_program("mosquitto_pub"),
+            "-p",
+            str(broker.port),
+            "-t",
+            "multidrop/pump-1/act",
+            "-l",
+        ]
+        publisher = subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
+        assert publisher.stdin
+
+        def start() -> None:
+            assert publisher.stdin
+            sent = {"verb": "start", "drive": "pump-1", "time": time.time_ns() // 1_000_000}
+            publisher.stdin.write(json.dumps(sent) + "\n")
+            publisher.stdin.flush()
+
+        def told() -> str:
+            found = listener.wait_for(lambda one: one.topic == "multidrop/pump-1/told")
+            return str(json.loads(found.payload)["text"])
+
+        motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
+        try:
+            listener.wait_for(lambda one: one.topic == "multidrop/gateway" and one.payload == b"online")
+            value = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
+            writer = {"authorization": gateway.bearer(Right.WRITE)}
+            assert gateway.command("/api/write", value, **writer).json["done"] is True
+            start()
+            assert told() == "pump-1: start is done"
+            until(lambda: motor.goal)
+
+            broker.signal(signal.SIGSTOP)
+            start()
+            assert gateway.post("/api/stop").json["pump-1"]["done"] is True
+            broker.signal(signal.SIGCONT)
+            assert told().startswith("not sent: it ")
+            assert not motor.goal
+        finally:
+            broker.signal(signal.SIGCONT)
+            publisher.stdin.close()
+            publisher.wait()
+            listener.close()

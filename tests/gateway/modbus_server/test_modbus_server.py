@@ -1,4 +1,4 @@
-"""The answer to each request: values, every exception code, and what of it reaches a drive."""
+"""The answer to each request: values, exception codes, and writes that reach a drive."""
 
 from __future__ import annotations
 

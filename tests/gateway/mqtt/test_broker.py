@@ -1,7 +1,4 @@
-"""A broker that is frozen or gone changes nothing of the polling; what it did not get is counted.
-
-`BROKER_OUT_S=60 pytest -n 0 tests/gateway/mqtt/test_broker_outage.py` lets it be away for a minute.
-"""
+"""The connection to a broker: outbox, acknowledgements, and brokers that freeze or disappear."""
 
 from __future__ import annotations
 
@@ -10,15 +7,16 @@ import os
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
-from brokers import Broker, Listener, mosquitto
+from brokers import Broker as BrokerProcess
+from brokers import Listener, mosquitto
 from examples import usually
 from gateways import Served, plant_text, running, tokens
 from lines import HOST_LATE, until
@@ -26,8 +24,163 @@ from peers import require_module
 
 from multidrop import Batch, InvtCHE, Plant
 from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.mqtt.broker import (
+    MOST_UNDER_WAY,
+    MOST_WAITING,
+    Broker,
+    Login,
+    Outbox,
+    Publication,
+    parse_broker,
+)
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import Simulator, Wire, simulated
+
+
+class BreakableConnection:
+    """A connection that can be broken."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, bytes]] = []
+        self.is_open = True
+
+    def send(self, message: Publication) -> int | None:
+        if not self.is_open:
+            return None
+        self.sent.append((message.topic, message.make()))
+        return len(self.sent)
+
+
+def said(topic: str, text: bytes = b"") -> Publication:
+    return Publication(topic, lambda: text)
+
+
+def test_no_more_than_the_bound_is_under_way_and_the_newest_of_a_topic_is_sent() -> None:
+    wire = BreakableConnection()
+    outbox = Outbox(wire.send)
+    for round in range(100):
+        for topic in range(50):
+            outbox.put(said(f"{topic}", b"%d" % round))
+    assert len(wire.sent) == MOST_UNDER_WAY
+    assert outbox.dropped == 100 * 50 - MOST_UNDER_WAY - 50
+    number = 0
+    while number < len(wire.sent):
+        number += 1
+        outbox.acknowledge([number])
+    assert wire.sent[MOST_UNDER_WAY:] == [
+        (f"{at % 50}", b"99") for at in range(MOST_UNDER_WAY, MOST_UNDER_WAY + 50)
+    ]
+    assert outbox.is_idle
+
+
+def test_pending_message_is_made_when_it_is_sent() -> None:
+    wire, now = BreakableConnection(), [b"old"]
+    outbox = Outbox(wire.send)
+    wire.is_open = False
+    outbox.put(Publication("state", lambda: now[0]))
+    now[0], wire.is_open = b"new", True
+    outbox.flush()
+    assert wire.sent == [("state", b"new")]
+
+
+def test_a_message_that_cannot_be_made_holds_up_no_other() -> None:
+    wire = BreakableConnection()
+    outbox = Outbox(wire.send)
+    outbox.put(Publication("told", "\ud800".encode))
+    outbox.put(said("state"))
+    assert wire.sent == [("state", b"")]
+    assert outbox.dropped == 1
+    outbox.acknowledge([1])
+    assert outbox.is_idle
+
+
+def test_lost_connection_drops_and_counts_pending_messages() -> None:
+    wire = BreakableConnection()
+    outbox = Outbox(wire.send)
+    for topic in range(MOST_UNDER_WAY + 3):
+        outbox.put(said(f"{topic}"))
+    outbox.forget()
+    assert (outbox.dropped, outbox.is_idle) == (MOST_UNDER_WAY + 3, True)
+    outbox.put(said("next"))
+    assert wire.sent[-1] == ("next", b"")
+
+
+def test_messages_that_arrive_together_make_room_at_once() -> None:
+    wire = BreakableConnection()
+    outbox = Outbox(wire.send)
+    for topic in range(3 * MOST_UNDER_WAY):
+        outbox.put(said(f"{topic}"))
+    outbox.acknowledge(range(1, MOST_UNDER_WAY + 1))
+    assert len(wire.sent) == 2 * MOST_UNDER_WAY
+    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # of a connection before
+    assert len(wire.sent) == 2 * MOST_UNDER_WAY
+
+
+def test_no_more_topics_wait_than_the_bound_and_the_others_are_counted() -> None:
+    """Whoever sends commands names the topics of their answers."""
+    wire = BreakableConnection()
+    outbox = Outbox(wire.send)
+    wire.is_open = False
+    for at in range(MOST_WAITING + 10):
+        outbox.put(said(f"{at}"))
+    assert outbox.dropped == 10
+    outbox.put(said("0", b"newer"))  # a topic that waits already has its place
+    assert outbox.dropped == 11
+    wire.is_open = True
+    outbox.flush()
+    for number in range(1, MOST_WAITING + 1):
+        outbox.acknowledge([number])
+    assert [topic for topic, _ in wire.sent] == [f"{at}" for at in range(MOST_WAITING)]
+    assert wire.sent[0] == ("0", b"newer")
+
+
+class Silent:
+    """A speaker that says nothing."""
+
+    def will(self) -> Publication:
+        return Publication("gone", bytes)
+
+    def topics(self) -> list[tuple[str, int]]:
+        return []
+
+    def connected(self) -> None: ...
+
+    def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None: ...
+
+    def pass_over(self) -> int:
+        return 0
+
+
+class Loop:
+    """An event loop that carries out what it is called for when the test says so."""
+
+    def __init__(self) -> None:
+        self.calls: list[Callable[[], None]] = []
+
+    def is_closed(self) -> bool:
+        return False
+
+    def call_soon_threadsafe(self, what: Callable[..., None], *given: Any) -> None:
+        self.calls.append(lambda: what(*given))
+
+    def step(self) -> None:
+        self.calls.pop(0)()
+
+
+def test_the_loop_is_woken_once_for_messages_that_arrive_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    require_module("paho.mqtt.client")
+    broker, loop, told = Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()), Loop(), list[int]()
+    monkeypatch.setattr(broker, "_loop", loop)
+    monkeypatch.setattr(broker.outbox, "acknowledge", told.extend)
+    for number in range(20):
+        broker._client.on_publish(broker._client, None, number, 0, None)
+    assert (len(loop.calls), told) == (1, [])
+    loop.step()
+    assert told == list(range(20))
+    broker._client.on_publish(broker._client, None, 20, 0, None)
+    loop.step()
+    assert told[20:] == [20]
+
 
 OUT_S = float(os.environ.get("BROKER_OUT_S", "1.5"))
 PERIOD_S = 0.25  # of each drive
@@ -70,7 +223,7 @@ class Slots:
 
 
 @contextmanager
-def gateway_of(folder: Path, broker: Broker) -> Iterator[tuple[Served, Slots]]:
+def gateway_of(folder: Path, broker: BrokerProcess) -> Iterator[tuple[Served, Slots]]:
     sims = {name: simulated(InvtCHE(n, name=name, baudrate=38400)) for n, name in enumerate(DRIVES, 1)}
     with Simulator([Wire(list(sims.values()), unpaced=True)]) as simulator:
         text = plant_text(simulator.wires[0].path, DRIVES, SERVE.format(broker.address))

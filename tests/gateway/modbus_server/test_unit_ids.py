@@ -1,4 +1,4 @@
-"""Unit ids: a drive's address where that is its alone, and all clashes at once where it is not."""
+"""Unit ids: a drive's address if it is unique; all clashes are reported at once."""
 
 from __future__ import annotations
 
