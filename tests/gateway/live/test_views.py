@@ -144,7 +144,7 @@ def test_unpolled_registers_are_read_while_a_drive_is_viewed(
     assert asked["asked"] > 0
     assert sum(count for _, count in asked["delays"]["counts"]) == asked["delays"]["replies"]
     monkeypatch.setattr(drive_reads, "LOOKED_S", -1.0)
-    until(lambda: not gateway.gateway.drive_reads.under_way)
+    until(lambda: not gateway.gateway.side_reads.under_way)
 
 
 @pytest.mark.long

@@ -65,7 +65,7 @@ def test_axe_finds_nothing(
             page.keyboard.press("Escape")
             page.locator("#more").click()
             page.get_by_role("button", name="Reload the plant file").click()
-            page.get_by_role("button", name="Read bottling plant.toml").click()
+            page.get_by_role("button", name="Reload bottling plant.toml").click()
             page.get_by_role("heading", name="The file has 40 mistakes").wait_for()
         else:
             page.evaluate("view => { location.hash = view }", view)

@@ -25,7 +25,7 @@ def await_note(page: Any, text: str) -> None:
 
 def test_gateways_lines_and_moves(opened: Opener) -> None:
     page = opened("#/fleet")
-    await_note(page, "Looked at once a second")
+    await_note(page, "Updated once a second")
     first, second, third = cells(page, "gateways")
     assert first[:10] == ["gw-1", "pc-hall-1", "working", "4", "2.1 s", "81 MB", "2", "1.4 s", "0", "5"]
     assert second[:9] == ["gw-2", "pc-hall-2", "no answer", "4", NONE, NONE, NONE, NONE, NONE]
@@ -35,7 +35,7 @@ def test_gateways_lines_and_moves(opened: Opener) -> None:
     assert [line[0] for line in lines] == [f"hall-{n}" for n in (1, 4, 7, 10, 2, 3, 5, 6, 8, 9, 11, 12)]
     assert {line[2] for line in lines[1:4]} == {"gw-2, no answer"}
     assert {line[2] for line in lines[4:]} == {"gw-1", "gw-3"}
-    note = "12 lines, 1 without a master, 3 whose master does not answer"
+    note = "12 lines, 1 without a master, 3 with a master that does not answer"
     assert page.locator("#fleet-lines-note.bad").inner_text() == note
     assert [[row[0], *row[2:]] for row in cells(page, "moves")] == [
         ["hall-3", "gw-2", "gw-1"],
@@ -48,7 +48,7 @@ def test_gateways_lines_and_moves(opened: Opener) -> None:
 def test_its_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
     page = opened("#/fleet")
     page.set_viewport_size({"width": width, "height": 844})
-    await_note(page, "Looked at once a second")
+    await_note(page, "Updated once a second")
     tables = page.locator("#fleet .scroll")
     until_met(page, lambda: tables.count() == 3)
     wide = "tables => tables.map(table => table.scrollWidth - table.clientWidth)"
@@ -59,7 +59,7 @@ def test_its_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
 
 def test_old_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
-    await_note(page, "Looked at once a second")
+    await_note(page, "Updated once a second")
     gateway.fleet = {"age_s": 40.0, "trouble": "no connection to nats://a:4222"}
     await_note(page, "Seen ")
     told = page.locator("#fleet-age.bad").inner_text()
@@ -67,13 +67,13 @@ def test_old_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeG
     style = "getComputedStyle(document.querySelector('#fleet-gateways td')).fontStyle"
     assert page.evaluate(style) == "italic"
     gateway.fleet = {}
-    await_note(page, "Looked at once a second")
+    await_note(page, "Updated once a second")
     until_met(page, lambda: page.evaluate(style) == "normal")
 
 
 def test_fleet_grows_old_when_the_gateway_is_lost(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
-    await_note(page, "Looked at once a second")
+    await_note(page, "Updated once a second")
     gateway.kill()
     await_note(page, "Seen")
     assert "The gateway cannot be reached" in page.locator("#fleet-age").inner_text()
@@ -123,7 +123,7 @@ def test_without_a_fleet_there_is_no_such_view(opened: Opener, gateway: FakeGate
 def test_it_is_reached_by_its_key(opened: Opener) -> None:
     page = opened()
     page.keyboard.press("6")
-    await_note(page, "Looked at once a second")
+    await_note(page, "Updated once a second")
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
 
 

@@ -27,8 +27,8 @@ def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
         until(page, "document.querySelectorAll('tr.drive.stands').length === 2")
         until_met(page, lambda: cell(page, "pump-1", "frequency").inner_text().strip() == "0.00Hz")
         for view, text in (
-            ("lines", "Wire used"),
-            ("faults", "Lasting: 0"),
+            ("lines", "Line time used"),
+            ("faults", "Active: 0"),
             ("log", "No writes yet."),
         ):
             page.evaluate("view => { location.hash = `#/${view}` }", view)

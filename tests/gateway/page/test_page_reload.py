@@ -40,14 +40,14 @@ def test_reload_by_keyboard_lists_all_mistakes(opened: Opener, gateway: FakeGate
     press_enter(page)
     tab_to(page, READ_AGAIN)
     press_enter(page)
-    told(page, "Read bottling plant.toml again?")
+    told(page, "Reload bottling plant.toml?")
     press_enter(page)  # Cancel has the focus
     assert gateway.posts == []
     page.locator("#more").focus()
     press_enter(page)
     tab_to(page, READ_AGAIN)
     press_enter(page)
-    tab_to(page, "Read bottling plant.toml")
+    tab_to(page, "Reload bottling plant.toml")
     press_enter(page)
     told(page, "The file has 30 mistakes")
     assert page.locator("#ask .outcome li").all_inner_texts() == mistakes
@@ -81,7 +81,7 @@ def test_a_broken_file_and_a_good_one_before_the_gateway_itself(page: Any, tmp_p
         def read() -> None:
             page.locator("#more").click()
             page.get_by_role("button", name=READ_AGAIN).click()
-            page.get_by_role("button", name="Read plant.toml").click()
+            page.get_by_role("button", name="Reload plant.toml").click()
 
         path.write_text(good.replace('"invt-che"', '"invt-chf"').replace("= 38400", '= "fast"'))
         read()
@@ -90,7 +90,7 @@ def test_a_broken_file_and_a_good_one_before_the_gateway_itself(page: Any, tmp_p
         assert shown == list(gateway.gateway.reload.mistakes)
         page.keyboard.press("Escape")
         notice = page.locator("#notice").get_by_text(
-            "The plant file has 3 mistakes; the plant before it goes on."
+            "The plant file has 3 mistakes; the previous plant stays in use."
         )
         notice.wait_for()
         assert page.locator("tr.drive").count() == 2

@@ -176,7 +176,7 @@ def test_drives_that_did_not_stop_are_named(opened: Opener, gateway: FakeGateway
     page.get_by_role("button", name="Stop all 31 drives").click()
     told(page, "1 of 31 drives are not confirmed as stopped")
     assert page.locator("#ask .outcome li").all_inner_texts() == ["pump-3: no reply; it may still run"]
-    assert "hard stop" in page.locator("#ask").inner_text()
+    assert "hard-wired stop" in page.locator("#ask").inner_text()
     gateway.outcomes = {}
     page.get_by_role("button", name="Send the stop again").click()
     told(page, "All 31 drives are stopped")
@@ -207,7 +207,7 @@ def test_frozen_gateway_is_shown_within_two_seconds(
     if is_closed:
         page.get_by_role("button", name="Close").click()
     told(page, UNTAKEN)
-    assert "Use the hard stop at the machine now." in page.locator("#ask p.bad").inner_text()
+    assert "Use the hard-wired stop at the machine now." in page.locator("#ask p.bad").inner_text()
     gateway.is_held.set()
     told(page, "All 31 drives are stopped")
 
@@ -244,7 +244,7 @@ def test_typing_a_token_does_not_look_like_a_frozen_gateway(opened: Opener, gate
     page.get_by_role("button", name="Stop all 31 drives").click()
     page.get_by_label("Token").fill("right")
     page.wait_for_timeout(2500)
-    assert title(page).inner_text() == "Who are you?"
+    assert title(page).inner_text() == "Sign in with a token"
     press_enter(page)
     told(page, "All 31 drives are stopped")
 
@@ -350,7 +350,7 @@ def test_nothing_that_comes_later_takes_the_place_of_a_stop_s_question(
     if case == "a reload":
         page.locator("#more").click()
         page.get_by_role("button", name="Reload the plant file").click()
-        page.get_by_role("button", name="Read bottling plant.toml").click()
+        page.get_by_role("button", name="Reload bottling plant.toml").click()
     else:
         page.get_by_role("button", name="Change frequency setpoint").click()
         page.get_by_label("New value, Hz").fill("31.5")

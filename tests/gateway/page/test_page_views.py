@@ -158,7 +158,7 @@ def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None
     assert re.search(r"538|53\d|54\d", rows.nth(3).inner_text())
     assert rows.nth(7).locator(".value").inner_text() == "runs (1)"
     assert rows.nth(8).locator(".value").inner_text() == "ready, at setpoint"
-    page.get_by_text("half within 4.1 ms, 99 % within 6.1 ms").wait_for()
+    page.get_by_text("50 % within 4.1 ms, 99 % within 6.1 ms").wait_for()
     assert "Missed 4 of 5120 values" in page.locator("#delays").inner_text()
     looked_at = rows.nth(10).locator(".value")  # just now
     until_met(page, lambda: looked_at.get_attribute("class") == "value")
@@ -306,7 +306,7 @@ def test_time_before_the_gateway_started_is_not_shown_as_fault_free(
     """It began in the middle of the hour that is shown."""
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     lanes = page.locator("#lane .bars")
-    until_met(page, lambda: lanes.all_inner_texts() == ["none known"] * 2)
+    until_met(page, lambda: lanes.all_inner_texts() == ["none"] * 2)
     gateway.knows_since = 1764077400000
     page.get_by_role("button", name="Later").click()
     page.get_by_role("button", name="Back to the previous range").click()
@@ -329,7 +329,7 @@ def test_other_units_have_their_own_plot_and_omissions_are_listed(
     heads = page.locator("#trend-plots .plothead b")
     wanted = ["output frequency, Hz", "output current, A", "output current, %"]
     until_met(page, lambda: heads.all_inner_texts() == wanted)
-    note = "pump-1.output_current was recorded in A, no unit too, which is not drawn."
+    note = "pump-1.output_current was also recorded in A, no unit; that is not drawn."
     assert page.locator("#trend-note").inner_text() == note
     said = page.locator("#trend-plots .plotbox").all()[2].get_attribute("aria-label")
     assert said.startswith("output current. pump-1: ")
@@ -438,7 +438,7 @@ def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: F
 
 def test_faults_that_last_and_that_ended(opened: Opener) -> None:
     page = opened("#/faults")
-    page.get_by_text("Lasting: 3").wait_for()
+    page.get_by_text("Active: 3").wait_for()
     lasting = page.locator("#fault-list section").nth(0).locator("tbody tr")
     assert [row.split("\t")[1] for row in lasting.all_inner_texts()] == [
         "conveyor-2",

@@ -123,7 +123,7 @@ def test_one_drive_is_one(opened: Opener, gateway: FakeGateway) -> None:
     page.keyboard.press("Escape")
     page.get_by_role("button", name="Settings").click()
     settings = page.locator("#ask").inner_text()
-    assert "1 register may be written here." in settings
+    assert "You may write 1 register." in settings
     assert "1 to 5" in settings
     page.keyboard.press("Escape")
     page.evaluate("location.hash = '#/lines'")

@@ -62,7 +62,7 @@ def test_write_with_a_lost_answer_is_unknown_and_not_repeated(opened: Opener, ga
     page.route("**/api/act", lambda route: route.abort())
     page.get_by_role("button", name="start").click()
     page.get_by_role("button", name="start pump-1").click()
-    assert "not known whether it was carried out" in page.locator("#outcomes li").inner_text()
+    assert "The outcome is unknown." in page.locator("#outcomes li").inner_text()
     assert gateway.posts == []
 
 
@@ -77,7 +77,7 @@ def test_truncated_answer_does_not_count(opened: Opener, gateway: FakeGateway) -
     page.get_by_role("button", name="start pump-1").click()
     outcome = page.locator("#outcomes li").inner_text()
     assert "The gateway's answer was cut off." in outcome
-    assert "not known whether it was carried out" in outcome
+    assert "The outcome is unknown." in outcome
     page.locator("#writes").get_by_text("The gateway's answer was cut off.").wait_for()
 
 
