@@ -275,7 +275,7 @@ def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -
     page = opened(live=False)
     page.route("**/page/api.js", lambda route: route.abort())
     page.reload()
-    page.locator("#notice").get_by_text("Stop all does nothing").wait_for()
+    page.locator("#notice").get_by_text("Stop all does not work").wait_for()
     assert page.locator("#link.stale").inner_text() == "connecting"
     assert page.locator("#stopall").is_disabled()
 

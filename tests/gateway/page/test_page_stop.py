@@ -151,7 +151,7 @@ def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGa
     page.route("**/page/vendor/*", lambda route: route.abort())
     page.route("**/api/frame*", lambda route: route.abort())
     page.reload()
-    page.locator("#notice").get_by_text("could not be loaded whole").wait_for()
+    page.locator("#notice").get_by_text("was not fully loaded").wait_for()
     page.locator("#stopall").click()
     assert title(page).inner_text() == "Stop all drives?"
     page.get_by_role("button", name="Stop all drives").click()
@@ -221,7 +221,7 @@ def test_a_stop_that_was_taken_is_waited_for(opened: Opener, gateway: FakeGatewa
     until_met(page, lambda: gateway.posts)
     page.wait_for_timeout(2500)
     assert title(page).inner_text() == "Stopping all 31 drives …"
-    assert "The gateway has taken the stop." in page.locator("#ask").inner_text()
+    assert "The gateway has accepted the stop." in page.locator("#ask").inner_text()
     gateway.is_held.set()
     told(page, "All 31 drives are stopped")
 
