@@ -50,7 +50,7 @@ class RegisterRows:
 
     @property
     def holds_ns(self) -> int:
-        """How long a value stays current.
+        """The time for which a value stays current.
 
         The line may be slower than planned. One long interval is only a pause: the shorter of two counts.
         """
