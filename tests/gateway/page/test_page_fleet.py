@@ -134,7 +134,7 @@ def test_stop_all_names_what_it_stops(opened: Opener, gateway: FakeGateway) -> N
     stopall.click()
     assert page.locator("#ask-title").inner_text() == "Stop all 31 drives of bottling plant?"
     asked = page.locator("#ask").inner_text()
-    assert "none of the fleet's" in asked
+    assert "drives of this plant only" in asked
     assert "multidrop fleet stop --all" in asked
     page.get_by_role("button", name="Stop all 31 drives of bottling plant").click()
     page.get_by_role("heading", name="All 31 drives are stopped").wait_for()

@@ -274,10 +274,10 @@ def test_phone_selects_and_distinguishes_several_drives(opened: Opener) -> None:
     until(page, DRAWN)
     heads = page.locator("#trend-plots .plothead output")
     assert heads.all_inner_texts() == ["", ""]  # one drive needs no legend
-    page.get_by_text("Quantities").click()
+    page.get_by_text("Drives and quantities").click()
     for name in ("pump-1", "filler-1"):
         page.get_by_label(name, exact=True).check()  # which the list is not folded up by
-    page.get_by_text("Quantities").click()
+    page.get_by_text("Drives and quantities").click()
     until_met(page, lambda: heads.first.locator("canvas").count() == 3)
     assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
     marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
@@ -340,7 +340,7 @@ def test_values_in_a_previous_unit_are_not_drawn(opened: Opener, gateway: FakeGa
     gateway.recorded = {"pump-2.output_current": {"unit": "%", "left_out": ["A"]}}
     page = opened("#/drives/pump-2")
     page.locator(".panel .ranges button", has_text="1 h").click()
-    page.locator("#past-note").get_by_text("pump-2.output_current was recorded in A too").wait_for()
+    page.locator("#past-note").get_by_text("pump-2.output_current was also recorded in A").wait_for()
     said = page.locator("#plots .plotbox")
     until_met(page, lambda: "Hz, last" in (said.first.get_attribute("aria-label") or ""))
     assert said.nth(1).get_attribute("aria-label") == "output current: no values"

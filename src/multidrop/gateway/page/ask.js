@@ -157,7 +157,7 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
       make("label", { for: "token", class: "field" }, "Token", field),
       wrong && make("p", { id: "token-wrong", class: "bad" }, wrong),
     ];
-    if (!(await confirmForm("Sign in with a token", contents, yes, kind))) return false;
+    if (!(await confirmForm("Sign in", contents, yes, kind))) return false;
     try {
       await post("api/token", { token: field.value, ...(kind === STOP ? { to: "stop" } : {}) });
       dispatchEvent(new Event("signed"));

@@ -86,7 +86,7 @@ export function draw() {
     make(
       "details",
       { open: isOpen },
-      make("summary", {}, "Quantities"),
+      make("summary", {}, "Drives and quantities"),
       make("h2", {}, "Drives"),
       names.length > 8 ? filter : null,
       list,
