@@ -492,8 +492,8 @@ NOTES = """
 Where the document errs or is silent, the safest reading is taken:
 
 - The example of function 04 has the checksum of function 03's, and its reply a
-  byte count of 10H for 5 registers: a reply must have the byte count that was
-  asked for.
+  byte count of 10H for 5 registers: a reply must have the byte count of the
+  request.
 - The example of function 06"""
 
 
@@ -510,7 +510,7 @@ def test_a_sheet_leaves_indented_lines_of_notes_as_they_are(run: Run, tmp_path: 
 def test_a_sheet_wraps_its_notes_as_paragraphs(run: Run) -> None:
     _, out, _ = run("models", "erman-er-g-220")
     assert NOTES in out
-    assert "no refusal.\n\nNo ranges, defaults" in out
+    assert "refuse others.\n\nNo ranges, defaults" in out
 
 
 # ---- signals ----

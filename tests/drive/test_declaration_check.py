@@ -405,10 +405,10 @@ def test_method_without_verb_decorator_is_reported(name: str) -> None:
     script.__name__ = name
     control = command(2, harmless=(0,))
     (mistake,) = mistakes_in(control=control, **{name: script})
-    assert mistake == f"{name}: it is no verb, and a call of it would send nothing: write @verb above it"
+    assert mistake == f"{name}: without the decorator @verb a call would send nothing; write @verb above it"
     declare(control=control, **{name: verb(script)})
 
 
 def test_mistake_in_a_subclass_of_a_family_is_reported() -> None:
-    with pytest.raises(DeclarationError, match=r"^Ours\.stop: it is no verb"):
+    with pytest.raises(DeclarationError, match=r"^Ours\.stop: without the decorator @verb"):
         type("Ours", (InnovertIBD,), {"stop": lambda self: None})

@@ -108,7 +108,7 @@ def test_what_lacks_is_counted_with_its_reason(bench: Any, tmp_path: Path) -> No
     assert lacking == {
         "its register type press_counter has no table": (3, 2),
         "its format s48 has no number format": (2, 1),
-        "its address is none from N to N": (2, 1),
+        "its address is not from N to N": (2, 1),
     }
 
 
@@ -236,5 +236,5 @@ def test_a_text_of_one_character_a_register_is_its_low_bytes() -> None:
     assert version.encode("4.1") == bytes.fromhex("0034 002E 0031 0000 0000")
     with pytest.raises(ValueError, match="holds 5 characters, not 6"):
         version.encode("4.18.1")
-    with pytest.raises(ValueError, match="order = 'A' of a text is none of 'AB', 'BA' and 'B'"):
+    with pytest.raises(ValueError, match="order = 'A' of a text is not 'AB', 'BA' or 'B'"):
         Text(1, 1, order="A")

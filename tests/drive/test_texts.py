@@ -141,7 +141,7 @@ def test_a_text_that_no_request_reads_is_refused(details: tuple[int, int], sente
 
 
 def test_a_text_s_other_mistakes() -> None:
-    with pytest.raises(ValueError, match="order = 'CDAB' of a text is none of 'AB', 'BA' and 'B'"):
+    with pytest.raises(ValueError, match="order = 'CDAB' of a text is not 'AB', 'BA' or 'B'"):
         text(1, 2, order="CDAB")
     with pytest.raises(ValueError, match="a text is in holding or input registers, and 'coil' is neither"):
         text(1, 2, table=COIL)

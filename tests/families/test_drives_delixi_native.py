@@ -291,7 +291,7 @@ def test_what_the_document_does_not_have(name: str) -> None:
 @pytest.mark.parametrize("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
 def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
-    with pytest.raises(NotVerified, match=r"the fault reset.*the fault stands: overcurrent"):
+    with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):
         wire.drive.reset_fault()
     assert wire.sent == [RESET]  # once
 

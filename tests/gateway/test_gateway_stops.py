@@ -494,8 +494,8 @@ def test_verbs_and_writes_report_their_results(tmp_path: Path) -> None:
         assert act("start", direction="up") == "direction = 'up' is neither forward nor reverse"
         assert act("start", at=5) == "start has no option 'at'; it has direction"
         assert act("set_frequency") == "set_frequency needs a frequency: hz = 20.0"
-        assert act("set_frequency", hz="fast") == "hz = 'fast' is no number"
-        assert act("set_frequency", hz=10**400).endswith("0 is no number")
+        assert act("set_frequency", hz="fast") == "hz = 'fast' is not a number"
+        assert act("set_frequency", hz=10**400).endswith("0 is not a number")
         assert act("set_frequency", hz=None) == "set_frequency needs a frequency: hz = 20.0"
         assert act("set_frequency", hz=20) == (
             "pump-1 takes its setpoint in percent of P0.04: "

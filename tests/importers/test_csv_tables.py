@@ -69,7 +69,7 @@ def test_where_a_register_is(
 def test_a_number_in_a_bit_table_that_cannot_be_sent_is_lost(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,103247,float\nb,5,uint16\n")
     assert list(entries(device)) == ["b"]
-    assert told(device) == ["a: its address is none from 0 to 65535"]
+    assert told(device) == ["a: its address is not from 0 to 65535"]
 
 
 def test_numbers_beside_bare_hex_may_be_hex(tmp_path: Path) -> None:
@@ -254,9 +254,9 @@ def test_a_unit_id_of_modbus_tcp_is_an_address(tmp_path: Path, unit: int) -> Non
         ("name,x\na,1\n", "no column is called address; the first line names the columns, and it is name, x"),
         ("name,address\n", "has no row with an address"),
         ("name,address\na,\n", "a: its row has no address"),
-        ("name,address,slave\na,1,900\n", "a: it cannot be read: slave = '900' is no unit id"),
-        ("name,address\na,1-2\n", 'a: it cannot be read: "1-2" is no address'),
-        ("device,m,900\n", "row 1: device = '900' is no unit id"),
+        ("name,address,slave\na,1,900\n", "a: it cannot be read: slave = '900' is not a unit id"),
+        ("name,address\na,1-2\n", 'a: it cannot be read: "1-2" is not an address'),
+        ("device,m,900\n", "row 1: device = '900' is not a unit id"),
         ("device,m,1\npoll,file,0,1,BE_BE\nref,a,0,uint16,r\n", "a: its table file is not known"),
     ],
 )

@@ -172,7 +172,7 @@ def test_a_package_without_its_controller_is_read_at_an_unknown_address(
     ("text", "reason"),
     [
         (CONTROLLER, "`modbus_controller:` has no entity: none of sensor, binary_sensor"),
-        ("modbus_controller: {address: 300}\n", "modbus_controller: address = '300' is no unit id"),
+        ("modbus_controller: {address: 300}\n", "modbus_controller: address = '300' is not a unit id"),
         (node(FAST, VOLTS.replace("read", "custom")), "volts: its register_type custom is not known"),
         (node(FAST, VOLTS.replace("address: 3", "id: 3")), "volts: it has no address"),
     ],

@@ -180,7 +180,7 @@ def test_platforms_of_before_2021_are_read(tmp_path: Path) -> None:
         ("modbus: !include modbus.yaml\n", "`modbus:` stands in another file: !include modbus.yaml"),
         ("modbus:\n  - {type: tcp, host: h}\n", "`modbus:` has no sensors, binary_sensors"),
         ("modbus:\n  - sensors: !include s.yaml\n", "sensors: '!include s.yaml' stands in another file"),
-        ("modbus:\n  - sensors: [{name: a, slave: 300, address: 1}]\n", "slave = '300' is no unit id"),
+        ("modbus:\n  - sensors: [{name: a, slave: 300, address: 1}]\n", "slave = '300' is not a unit id"),
         ("modbus:\n  - sensors: [{name: a}]\n", "a: it has no address"),
         (
             "modbus:\n  - sensors: [{name: a, address: x}]\n",

@@ -143,7 +143,7 @@ def test_home_assistant(tmp_path: Path) -> None:
     assert found["alarm"]["part"] == "0"
     assert told(device) == [
         "Odd: its type custom has no number format",
-        "Far_1: its address is none from 0 to 65535",
+        "Far_1: its address is not from 0 to 65535",
         "Many: it cannot be read: virtual_count = 5000 is not 0 to 1000",
         "Zone: a climate has no counterpart",
     ]
@@ -293,7 +293,7 @@ def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: py
         ("a.toml", "a = 1", "has no [[inputs.modbus]] (Telegraf): it has a"),
         ("a.toml", "[[inputs.modbus]]", "[[inputs.modbus]] has no field"),
         ("a.toml", "a = ", "is not TOML"),
-        ("a.xls", "a", "its suffix is none of .csv"),
+        ("a.xls", "a", "its suffix is not one of .csv"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path: Path, name: str, text: str, told: str) -> None:
@@ -367,7 +367,7 @@ def test_the_line_of_telegraf_and_esphome(tmp_path: Path) -> None:
 def test_a_controller_that_is_no_address_is_named(tmp_path: Path) -> None:
     plugin = '[[inputs.modbus]]\ncontroller = "{}"\n'
     for controller in ("tcp://gate:99999", "tcp://gate:modbus", "tcp://[fe80::1"):
-        named = rf"t\.conf: controller = '{re.escape(controller)}' is no address: "
+        named = rf"t\.conf: controller = '{re.escape(controller)}' is not an address: "
         with pytest.raises(ValueError, match=named):
             devices(tmp_path, "t.conf", plugin.format("tcp://hall") + plugin.format(controller))
 

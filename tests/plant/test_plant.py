@@ -362,7 +362,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + '[[line.drive]]\nname = "I"\nmodel = "innovert-ibd"\naddress = 1\nforward_bit = 2.5',
-            'line "L", drive "I": forward_bit = 2.5 is no whole number from 2 to 3',
+            'line "L", drive "I": forward_bit = 2.5 is not a whole number from 2 to 3',
         ),
         (
             HEAD + TOY + "rated_frequency = true",

@@ -18,7 +18,7 @@ from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS, may_be_cr
 from multidrop.drive.text import Text
 
 LAST_ADDRESS = 0xFFFF
-LONGEST_TIME = 60.0  # s; a larger number was meant in ms
+LONGEST_TIME = 60.0  # s; larger numbers are probably ms
 MOST_CHARACTERS = 1000
 UNIT_IDS = range(256)  # of Modbus TCP; a serial line has fewer
 EXCEPTION_CODES = range(1, 256)
@@ -97,7 +97,7 @@ def _wrong_facts(owner: Any, rules: Rules) -> dict[str, str]:
     }
 
 
-# ---- what a class says besides its registers ----
+# ---- facts of a class, besides its registers ----
 
 _TIMES = {
     "silence": LONGEST_SILENCE,
@@ -171,7 +171,7 @@ _CLASS_RULES: Rules = (
 
 
 def fact_errors(family: Any) -> list[str]:
-    """Return a sentence for each error in what a class says besides its registers."""
+    """Return a sentence for each error in a class's facts, besides its registers."""
     wrong = _wrong_facts(family, _CLASS_RULES)
     is_known = not wrong.keys() & {"formats", "framings"}
     if is_known and family.formats and (first := family.framings[0]) not in family.formats:
@@ -315,7 +315,7 @@ _PARTED = frozenset(
         *(NumberFormat.I16, NumberFormat.I32, NumberFormat.I64),
     }
 )
-# Facts of numbers in words, with the value that says nothing.
+# Facts of numbers in words, with their defaults.
 _OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
 
 
@@ -496,7 +496,7 @@ def _meaning(register: Register[Any]) -> object:
 
 
 def request_errors(family: Any) -> list[str]:
-    """Tie registers to their scale registers; return a sentence for each error in what one request reads."""
+    """Tie registers to their scale registers; return a sentence for each error in its requests."""
     wrong = list(_scale_errors(family)) or list(_limit_errors(family))
     if wrong:
         return wrong

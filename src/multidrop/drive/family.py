@@ -39,8 +39,8 @@ A = TypeVar("A")
 class Drive(RegisterAccess):
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 if the family
-    has all of them. Baud rate, format and framing default to the family's. On a tcp:// port the framing is
+    `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 in some
+    families. Baud rate, format and framing default to the family's. On a tcp:// port the framing is
     TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s, replaces the
     standard's t3.5 if all drives on the line tolerate it; a longer silence in the family's document still
     applies. Options are facts that only the owner knows (see `options`). `ram` names registers that the owner
@@ -175,7 +175,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
-        """Return True for the document's framings, and for TCP if one of them is Modbus."""
+        """Return True for the document's framings, and for TCP if any is Modbus."""
         return framing in cls.framings or (
             framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
         )
@@ -225,7 +225,7 @@ class Drive(RegisterAccess):
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.link: Link = NO_LINK
         self.stops_called: Sequence[int] = (0,)  # its first item counts them
-        # A call's permit, which a stop ends that is called after `seen` of them.
+        # The permit of a call; any stop called after the first `seen` stops ends it.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (
@@ -358,10 +358,7 @@ class Drive(RegisterAccess):
         self._known_setpoint.value = held
 
     def begin_setpoint(self) -> Callable[[], None]:
-        """Forget the setpoint until its write ends; return a callback that restores it if nothing was sent.
-
-        See `KnownSetpoint`.
-        """
+        """Forget the setpoint until its write ends; return a callback for a write that was not sent."""
         return self._known_setpoint.begin_write()
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Known state: a drive's state, worked out from values that were read before."""
+"""Known state: a drive's state, computed from values that were read before."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ FAULT_RECORDS = ("last_fault", "fault_record_1")  # of the newest fault, which m
 
 
 class StateReader:
-    """Works out a drive's state as its family does, from values such as those of its polled rows.
+    """Computes a drive's state by its family's rules, from values such as those of polled rows.
 
-    Nothing is sent. What the family notes from one look to the next is noted for this reader alone.
+    It sends no request. Attributes that the family sets from one call to the next are kept in this reader.
     """
 
     def __init__(self, drive: Drive) -> None:
         self._drive = copy(drive)
-        self._shown: tuple[dict[str, float | None], State | None] | None = None  # by these values, last time
+        self._shown: tuple[dict[str, float | None], State | None] | None = (
+            None  # the last state, and the values that it came from
+        )
         self.has_state = type(drive).state is not Drive.state
-        """True where the family's document has a state at all."""
+        """True if the family's document defines a state."""
         self.lacks = ""
-        """The register whose value the newest look lacked; "" if it lacked none."""
+        """The register whose value was missing in the last call; "" if none was."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
-        """Return the state that these values, by register's name, show; None where they do not suffice.
+        """Return the state that these values, by register name, show; None if a value is missing.
 
-        A value is as in a row: in the register's unit, or the raw count where it has names. A status that
-        shows a fault suffices, though the fault's code is not among them: the fault has no name then. The
-        family is asked again only where one of the values that it read has changed, or where it noted
-        something.
+        A value is as in a row: in the register's unit, or the raw count of a named value. If the status
+        shows a fault and the fault's code is missing, the fault has no name. The state is computed again only
+        if a value that it depends on has changed, or if the family set an attribute.
         """
         if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
             return self._shown[1]
@@ -49,7 +50,7 @@ class StateReader:
         return found
 
     def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
-        """Return the state, and put the values that it is made of into `read`; None for one that lacks."""
+        """Return the state, or None if a value is missing; put the values that were used into `read`."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -62,7 +63,7 @@ class StateReader:
                     if register.name != FAULT:
                         self.lacks = register.name
                         return None
-                    value = 0.0  # no fault: the family shows one only where the status says so
+                    value = 0.0  # no fault code: families read it only if the status shows a fault
                 step = script.send(value if register.values is None else register.decode(value))
         except StopIteration as end:
             return _known(end.value, read)
@@ -72,16 +73,16 @@ class StateReader:
 
 
 def _known(state: object, read: Mapping[str, float | None]) -> State | None:
-    """Return a state, without what a fault's code would have told where that was not among the values."""
+    """Return a state; without the fault's name if the fault's code was missing."""
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None
 
 
 def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
-    """Return True if some values of these registers, by name, show a fault of the drive.
+    """Return True if these registers, by name, can show a fault of the drive.
 
-    A record of the newest fault shows one when it changes.
+    A record of the newest fault shows one by changing.
     """
     if {FAULT, *FAULT_RECORDS} & {*polled}:
         return True
@@ -99,6 +100,6 @@ def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
 
 
 def _choices(register: Register[Any]) -> list[float]:
-    """Return values of a register that a state may depend on."""
+    """Return the register values that a state may depend on."""
     members: list[Any] = [] if register.values is None else list(cast(Any, register.values))
     return [0.0, 1.0, *(float(member.value) for member in members)]

@@ -1,4 +1,4 @@
-"""Named verbs: a drive's verbs for programs that send a name and options, as in JSON."""
+"""Named verbs: a drive's verbs by name, with options as in JSON."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def _direction(value: object) -> Direction:
 
 def _hertz(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
-        raise ValueError(f"hz = {value!r} is no number")
+        raise ValueError(f"hz = {value!r} is not a number")
     return float(value)
 
 
 def _is_finite(value: float) -> bool:
     try:
         return isfinite(value)
-    except OverflowError:  # an int that no float holds
+    except OverflowError:  # an int too large for a float
         return False
 
 
@@ -42,15 +42,15 @@ _OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
 
 
 def verbs_of(drive: Drive) -> list[str]:
-    """Return the names of the verbs that change something and that the drive's family has."""
+    """Return the names of the drive's verbs that command it."""
     return [name for name in _OPTIONS if getattr(type(drive), name) is not getattr(Drive, name)]
 
 
 def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
     """Return the arguments of a verb: `{"direction": "reverse"}` is Direction.REVERSE, `hz` is in Hz.
 
-    An option that is None is left out. Raises ValueError for an option that is unknown, missing or wrong;
-    KeyError for an unknown verb.
+    An option that is None is left out. Raises ValueError for an unknown, missing or invalid option, KeyError
+    for an unknown verb.
     """
     takes = _OPTIONS[verb]
     for name in options:

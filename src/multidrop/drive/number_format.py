@@ -41,7 +41,7 @@ ORDERS = {
     "BADC": LOW_BYTE_FIRST,
     "DCBA": LOW_WORD_FIRST | LOW_BYTE_FIRST,
 }
-MOST_DIGITS = 9  # enough to tell any two float32 apart
+MOST_DIGITS = 9  # enough to distinguish any two float32 values
 SIGNED = frozenset({NumberFormat.I8, NumberFormat.I16, NumberFormat.I32, NumberFormat.I64})
 DECIMAL = frozenset({NumberFormat.BCD16, NumberFormat.BCD32})
 _LARGEST = {
@@ -172,7 +172,7 @@ class Coding:
 
     @cached_property
     def core_format(self) -> int:
-        """The number format with its order, for the core."""
+        """The number format and byte order as the core takes them."""
         return self.number_format + (0 if self.number_format is NumberFormat.BIT else ORDERS[self.order])
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Options: facts about one drive that only its owner knows, among them that it is what its class says."""
+"""Options: facts about one drive that only its owner knows, among them its make (`confirmed`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop
 def checked_options(
     family: str, options: Mapping[str, Option], given: Mapping[str, float]
 ) -> Mapping[str, float]:
-    """Return what was given. Raises ValueError for what is no option, or outside its span."""
+    """Return the given options. Raises ValueError for an unknown option or a value outside its span."""
     for name, value in given.items():
         if name not in options:
             known = ", ".join(options) or "none"
@@ -36,19 +36,19 @@ def checked_options(
                 f"{name} = {value!r} is outside {low:g} to {high:g} {options[name].unit}".rstrip()
             )
         if not options[name].unit and value != int(value):
-            raise ValueError(f"{name} = {value!r} is no whole number from {low:g} to {high:g}")
+            raise ValueError(f"{name} = {value!r} is not a whole number from {low:g} to {high:g}")
     return given
 
 
 def confirmation(declared_in: str, *, identifies: bool) -> Mapping[str, Option]:
-    """Return the option `confirmed` for a class that commands motors untested or unidentified."""
+    """Return the option `confirmed`, if the class is untested or cannot identify its drives."""
     if declared_in:
         return {"confirmed": _CHECKED}
     return {} if identifies else {"confirmed": _CONFIRMED}
 
 
 def doubt(family: str, declared_in: str, *, identifies: bool) -> str:
-    """Return why a drive of this class must be confirmed; nothing where it need not be."""
+    """Return why a drive of this class must be confirmed; "" if it need not be."""
     if declared_in:
         return (
             f"{declared_in} declares it, which nobody has tested: read `multidrop check "

@@ -1,4 +1,4 @@
-"""Registers: what a drive's manual says about one quantity, and its values in replies and requests.
+"""Registers: the manual's facts about one quantity, and its values in replies and requests.
 
 `Register[float]` has a unit and a step, `Register[E]` the names of an enumeration. Declare them with
 `reading`, `setting` and `command`.
@@ -31,7 +31,7 @@ from multidrop.printable import plain_number, plain_whole
 
 
 class Kept(Enum):
-    """Memory in which a drive keeps what is written; EEPROM bears a limited number of writes."""
+    """The memory that holds a written value; EEPROM tolerates a limited number of writes."""
 
     RAM = "RAM"
     EEPROM = "EEPROM"
@@ -59,11 +59,11 @@ class Table:
     read: int | None
     write: int | None
     carrier: Carrier = Carrier.WORD
-    kept: Kept = Kept.UNKNOWN  # where the function code alone decides it
+    kept: Kept = Kept.UNKNOWN  # if the function code alone decides it
 
     @property
     def read_space(self) -> tuple[Carrier, int | None]:
-        """Key of the tables that are read alike: their registers may share a request."""
+        """Key of the tables with the same function code for reads: their registers may share a request."""
         return self.carrier, self.read
 
 
@@ -79,7 +79,7 @@ ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # in the names of values
 
 
 class Worded(IntEnum):
-    """Named numbers; a name that is a code of the manual's has its meaning in words beside it."""
+    """Named numbers; if the name is a code of the manual, `words` explains it."""
 
     words: str
 
@@ -153,12 +153,12 @@ class Register(Generic[T]):
 
     @cached_property
     def words(self) -> int:
-        """Addresses that it takes in its table."""
+        """Number of addresses that it occupies in its table."""
         return WORDS[self.number_format] if self.table.carrier is Carrier.WORD else 1
 
     @cached_property
     def reach(self) -> range:
-        """Addresses that one request reads for its value: from its own to its scale register's."""
+        """Addresses that one request reads for its value, with those of its scale register."""
         own = range(self.address, self.address + self.words)
         if self.scaled_by is None:
             return own
@@ -167,7 +167,7 @@ class Register(Generic[T]):
 
     @cached_property
     def coding(self) -> Coding:
-        """Its place in the words, with its exact scale."""
+        """Its encoding in the words, with its exact scale."""
         offset = Fraction(str(self.offset))
         return Coding(self.number_format, self.order, self.part, self.invalid, self.scale, offset)
 
@@ -187,7 +187,7 @@ class Register(Generic[T]):
 
     @property
     def is_float(self) -> bool:
-        """True where the raw count is a float."""
+        """True if the raw count is a float."""
         return self.table.carrier is Carrier.WORD and self.number_format in FLOATS
 
     @property
@@ -197,19 +197,19 @@ class Register(Generic[T]):
 
     @property
     def commands(self) -> bool:
-        """True where a write may move the motor: verbs alone send it, but for what is `harmless`."""
+        """True if a write may move the motor: only verbs send it, except for its `harmless` counts."""
         if self.moves is None:
             return self.access is Access.COMMAND or self.harmless is not None
         return self.moves
 
     @cached_property
     def scale(self) -> Fraction:
-        """Exact step, 1 where it is unknown: 3 * 1/10 is 0.3, and not 0.30000000000000004."""
+        """Exact step, 1 if it is unknown: 3 * 1/10 is 0.3, not 0.30000000000000004."""
         return Fraction(str(self.step)) if self.step is not None else Fraction(1)
 
     @property
     def value_unit(self) -> str:
-        """The unit of its values: of what has no stated scale they are raw counts, and not of its `unit`."""
+        """The unit of its values: its `unit`, or "raw count" if its scale is not stated."""
         return self.unit if self.values is not None or self.step is not None else "raw count"
 
     @property
@@ -219,7 +219,7 @@ class Register(Generic[T]):
         return max(0, *(-int(part.normalize().as_tuple().exponent) for part in parts))
 
     def number_in(self, data: bytes, at: int) -> float | None:
-        """Return the number at word (coils: bit) `at` of a reply's data, as a row has it; None: no value."""
+        """Return the number at word (coils: bit) `at` of a reply's data, as in a row; None for no value."""
         raw = self.coding.raw_in(data, at)
         if raw is None or self.scaled_by is None:
             return None if raw is None else self.coding.value_of(raw)
@@ -229,14 +229,14 @@ class Register(Generic[T]):
         return self.coding.value_of(raw, int(power))
 
     def value_in(self, data: bytes, at: int) -> T | None:
-        """Return the value at word (coils: bit) `at` of a reply's data; None where there is none."""
+        """Return the value at word (coils: bit) `at` of a reply's data; None for no value."""
         number = self.number_in(data, at)
         if number is None:
             return None
         return cast(T, number) if self.values is None and not self.is_bit else self.decode(number)
 
     def decode(self, raw: float) -> T:
-        """Return the value of a raw count; a number where the enumeration has no name for it."""
+        """Return the value of a raw count; a plain number if the enumeration has no name for it."""
         if self.values is not None:
             try:
                 return self.values(int(raw))
@@ -247,7 +247,7 @@ class Register(Generic[T]):
     def encode(self, value: T) -> float:
         """Return the raw count of a value: a whole number, or in a float register the nearest float.
 
-        Raises ValueError outside the span, TypeError for what is no number.
+        Raises ValueError outside the span, TypeError unless it is a number.
         """
         if self.values is not None:
             return self._encode_name(value)
@@ -285,7 +285,7 @@ class Register(Generic[T]):
         return self.coding.count_of(value)
 
     def takes(self, value: T) -> bool:
-        """Return True where a drive may hold this value: it has a name, or is in the span."""
+        """Return True if a drive may hold this value: it has a name, or is in the span."""
         if self.values is not None:
             return isinstance(value, self.values)
         if self.span is None:
@@ -297,7 +297,7 @@ class Register(Generic[T]):
 
     @property
     def _counts(self) -> bool:
-        """True where numbers are choices or raw counts: the nearest one may mean something else."""
+        """True if numbers are choices or raw counts: the nearest one may mean something else."""
         return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
@@ -319,7 +319,7 @@ class Register(Generic[T]):
         raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")
 
     def parse(self, text: str) -> T:
-        """Return the value that a person typed: a number, or names joined by "|"; ValueError otherwise."""
+        """Return the value of a typed text: a number, or names joined by "|". Raises ValueError otherwise."""
         if self.values is None:
             try:
                 return cast(T, _number_in(text) if self.number_format in WHOLE else plain_number(text))
@@ -340,7 +340,7 @@ class Register(Generic[T]):
         return cast(T, total)
 
     def format(self, value: T) -> str:
-        """Return the value as a person reads it, with its unit."""
+        """Return the value as text, with its unit."""
         if isinstance(value, Flag):
             named = "|".join(str(member.name) for member in value)
             return ", ".join(filter(None, (named, *unnamed_bits(value)))) or "none"
@@ -350,7 +350,7 @@ class Register(Generic[T]):
         return f"{self._number(value)} {unit}".rstrip()
 
     def in_words(self, value: T) -> str:
-        """Return a named value in words that need no manual; others as `format` does."""
+        """Return a named value in plain words; other values as `format` does."""
         if isinstance(value, Flag):
             names = [_spaced(str(member.name)) for member in value]
             return ", ".join([*names, *unnamed_bits(value)]) or "none"
@@ -381,7 +381,7 @@ def _spaced(name: str) -> str:
 
 
 def _number_in(text: str) -> float:
-    """Return the number, whole ones exactly. Raises ValueError for none."""
+    """Return the number in a text, whole numbers exactly. Raises ValueError if it has none."""
     try:
         return plain_whole(text)
     except ValueError:
@@ -389,7 +389,7 @@ def _number_in(text: str) -> float:
 
 
 def _short(value: float) -> str:
-    """Return a number for a sentence; it may be larger than any float."""
+    """Return a number for a message; it may be larger than any float."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
@@ -399,7 +399,7 @@ E = TypeVar("E", bound=IntEnum | IntFlag)
 class Details(TypedDict, total=False):
     """Facts of a declaration besides address and unit; each may be left out."""
 
-    step: float | None  #: value of one raw count; None where the document does not state it
+    step: float | None  #: value of one raw count; None if the document does not state it
     offset: float  #: value of the raw count 0: value = raw * step + offset
     #: Raw counts that mean "no value". One outside the format's span names the bits: 0x8000 of an I16.
     invalid: float | tuple[float, ...]
@@ -413,10 +413,10 @@ class Details(TypedDict, total=False):
     at_most: str  #: register or option whose present value is the most
     number_format: NumberFormat  #: width, sign and kind of the number in the frame
     table: Table  #: address space and function codes
-    kept: Kept  #: RAM or EEPROM; that of the table where the table has one
+    kept: Kept  #: RAM or EEPROM; by default the table's
     ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
     default: float  #: value from the factory
-    while_running: bool  #: may be changed while the motor turns; None where not stated
+    while_running: bool  #: may be changed while the motor turns; None if not stated
     broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
     #: A write may start, stop or reset something, so only verbs write it. Unless stated, this holds for
     #: commands, and for settings that have `harmless`.
@@ -427,7 +427,7 @@ class Details(TypedDict, total=False):
     never: str  #: reason why the library never writes it
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write
     place: str  #: section of the manual
-    outside: str  #: source, where it is not the family's own document
+    outside: str  #: source, if it is not the family's own document
     note: str  #: further facts for users
 
 

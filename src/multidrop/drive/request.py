@@ -88,7 +88,7 @@ def read_request(drive: Any, table: Table, start: int, count: int) -> Message:
 def write_request(drive: Any, register: Register[Any], raw: float, address: int | None = None) -> Message:
     """Return the request that writes a raw count to a register, or to its RAM alias if it has one.
 
-    `address` replaces the drive's own address, for a broadcast. Raises ValueError if the register cannot be
+    `address` replaces the drive's own address in a broadcast. Raises ValueError if the register cannot be
     written.
     """
     table = register.table
@@ -125,8 +125,8 @@ def check_no_read(drive: Any, request: Message) -> None:
 def any_read(drive: Any, function: int, start: int, count: int) -> Message:
     """Return the request that reads addresses, declared or not, by one of the Modbus functions 01 to 04.
 
-    Raises TypeError unless all three are whole numbers. Raises ValueError for another function, for a drive
-    that does not speak Modbus, and for more addresses than one request to this family may read.
+    Raises TypeError unless all three are whole numbers. Raises ValueError for another function, a drive that
+    does not speak Modbus, and more addresses than one request to this family may read.
     """
     for name, number in (("function", function), ("start", start), ("count", count)):
         if isinstance(number, bool) or not isinstance(number, int):

@@ -13,7 +13,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.errors import BadReply, BusError, DriveException, NoReply, Unconfirmed
 
-MOST_UNANSWERED = 3  # looks in a row
+MOST_UNANSWERED = 3  # consecutive checks
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -32,12 +32,12 @@ class Write:
 
 @dataclass(frozen=True)
 class Insist(Write):
-    """A write that does no harm at any time, nor when it is repeated, such as a stop."""
+    """A write that is harmless at any time and when repeated, such as a stop."""
 
 
 @dataclass(frozen=True)
 class Pulse(Insist):
-    """A harmless write that is sent once in a call: a stop that is itself a fault."""
+    """A harmless write that is sent once a call, such as a stop that trips the drive."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def read(register: Register[Any] | Text) -> Script[Any]:
 
 
 def write(register: Register[T], value: T) -> Script[T]:
-    """Write once; return what the drive then holds where that can be read, else `value`."""
+    """Write once; return the value read back, or `value` if the register cannot be read."""
     return cast(T, (yield Write(register, value)))
 
 
@@ -68,7 +68,7 @@ def wait(seconds: float) -> Script[None]:
 
 
 def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
-    """Do a script's steps and return its result. A step's BusError or ValueError is raised in the script."""
+    """Run a script and return its result. A step's BusError or ValueError is raised in the script."""
     try:
         step = next(script)
         while True:
@@ -83,7 +83,7 @@ def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
 
 
 def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
-    """Write what does no harm when it is repeated, such as a stop, and again when the reply is lost."""
+    """Write a harmless value, such as a stop; repeat it if the reply is lost or an exception."""
     for attempt in range(1, attempts + 1):
         try:
             yield Insist(register, value)
@@ -95,10 +95,10 @@ def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
 
 
 def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
-    """Look again and again until it is true; return False when `limit` seconds have passed.
+    """Repeat a check until it is true; return False after `limit` seconds.
 
-    A motor that starts brings noise: a look without a good reply sees nothing. The third such look in a row
-    raises NoReply or BadReply.
+    A starting motor causes noise, so a check without a valid reply counts as false. The third consecutive
+    one raises NoReply or BadReply.
     """
     waited = 0.0
     unanswered = 0

@@ -63,7 +63,7 @@ class KnownSetpoint:
         self._held = value
 
     def begin_write(self) -> Callable[[], None]:
-        """Forget the setpoint until the write ends; return a callback that restores it if nothing was sent.
+        """Forget the setpoint until the write ends; return a callback for a write that was not sent.
 
         A value that another thread wrote in between stays.
         """

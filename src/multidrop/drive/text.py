@@ -15,7 +15,7 @@ _ORDERS = ("AB", "BA", "B")  # B: one character a register, in its low byte
 class Text:
     """A text of a drive: its address, its length in registers, and the order of characters in them.
 
-    Raises ValueError for what no request could read.
+    Raises ValueError if no request could read it.
     """
 
     address: int
@@ -31,7 +31,7 @@ class Text:
         if not _is_whole(self.address) or not 0 <= self.address <= _LAST_ADDRESS + 1 - self.length:
             raise ValueError(f"a text at {self.address!r}: its registers are not within 0 to FFFFH")
         if self.order not in _ORDERS:
-            raise ValueError(f"order = {self.order!r} of a text is none of 'AB', 'BA' and 'B'")
+            raise ValueError(f"order = {self.order!r} of a text is not 'AB', 'BA' or 'B'")
         if not isinstance(self.table, Table) or self.table.read not in (0x03, 0x04):
             other = self.table.name if isinstance(self.table, Table) else self.table
             raise ValueError(f"a text is in holding or input registers, and {other!r} is neither")
@@ -46,8 +46,7 @@ class Text:
     def decode(self, data: bytes) -> str:
         """Return the text of a reply's data: up to the first NUL, without spaces at its end.
 
-        Bytes above 7FH are Latin-1; what cannot be printed is shown as a question mark, for it comes from a
-        line.
+        Bytes above 7FH are Latin-1. A character that does not print becomes a question mark.
         """
         if self.order == "BA":
             data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))

@@ -17,10 +17,10 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
-# Sent only to a drive that is known to be of its family, and not after a stop was called.
+# Sent only to an identified drive, and not after a stop was called.
 MOVING = ("start", "jog", "reset_fault", "set_frequency", "release_control")
 
-# Sent to a silent drive too, again and again.
+# Sent repeatedly, also to a silent drive.
 STOPPING = ("stop", "coast", "emergency_stop")
 
 VERBS = (
@@ -36,11 +36,11 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 }
 
 
-TRIES = 150  # of a stop, while the system has no memory or descriptors for it
+TRIES = 150  # of a stop, while the system has no memory or file descriptors left
 
 
 class CalledStop(Protocol):
-    """A stop that was called, and goes on where it was left when it is carried out again."""
+    """A stop that was called; if interrupted, `carry_out` resumes it."""
 
     def carry_out(self) -> None: ...
     def interrupted(self, interruption: BaseException) -> None: ...
@@ -48,17 +48,17 @@ class CalledStop(Protocol):
 
 
 class UnattachedStop:
-    """The stop of a drive that is on no bus."""
+    """The stop of a drive that is not attached to a bus."""
 
     def __init__(self, drive: Drive, make: Callable[[], Script[Any]]) -> None:
         self._drive = drive
         self._make = make
 
     def carry_out(self) -> None:
-        """Do nothing."""
+        """Return at once."""
 
     def interrupted(self, interruption: BaseException) -> None:
-        """Do nothing."""
+        """Return at once."""
 
     def result(self) -> Any:
         """Raise NotAttached."""
@@ -68,9 +68,9 @@ class UnattachedStop:
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive; a call carries it out.
 
-    A stop takes `seconds`: it is repeated for so long until the motor is seen to stand; without it, or with
-    what is no time, for 30 s at least, and as long as the motor's ramp may take. One that is called with
-    arguments that it does not take is carried out before it raises TypeError.
+    A stop takes `seconds`: it is repeated for that long, or until the motor is seen to be at rest. Without a
+    valid `seconds` it is repeated for the duration of the motor's ramp, and at least 30 s. A stop that is
+    called with wrong arguments is carried out before it raises TypeError.
     """
 
     def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:
@@ -102,11 +102,11 @@ class _BoundVerb(Generic[P, R]):
 
 
 class _BoundMove(_BoundVerb[P, R]):
-    """One that may move the motor: a stop that is called after its first step ends it."""
+    """A verb that may move the motor: a stop that is called after its first step ends it."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> R:
-        # First, and no Python function is called for it: a signal's handler that stops the drive comes before
-        # the call of this verb, or ends it.
+        # Read the count first, without calling a Python function: a signal handler that stops the drive then
+        # runs either before this verb's call, or ends it.
         seen = self.drive.stops_called[0]
         script = self.script(*args, **kwargs)
         self.drive.check_confirmed(self.name)
@@ -114,7 +114,7 @@ class _BoundMove(_BoundVerb[P, R]):
 
 
 class _BoundStop(_BoundVerb[P, R]):
-    """One that stops the motor, whatever interrupts it from its first step on."""
+    """A verb that stops the motor, even if interrupted after its first step."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> R:
         run: CalledStop | None = None
@@ -144,7 +144,7 @@ class _BoundStop(_BoundVerb[P, R]):
     def _mistake(
         self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any
     ) -> TypeError | None:
-        """Return what is wrong with arguments that the stop does not take."""
+        """Return the error for arguments that the stop does not take."""
         if not args and not kwargs:
             return None
         try:
@@ -190,13 +190,13 @@ verb = Verb
 
 
 def verb_errors(family: Any) -> list[str]:
-    """Return a sentence for each method that has a verb's name and is none.
+    """Return a sentence for each method that has a verb's name and lacks the decorator.
 
-    A call of it would send nothing: it makes a generator that nobody carries out. A register of such a name
-    is told as that.
+    A call of such a method would only make a generator, and send no request. A register with such a name is
+    reported as a register.
     """
     return [
-        f"{name}: it is no verb, and a call of it would send nothing: write @verb above it"
+        f"{name}: without the decorator @verb a call would send nothing; write @verb above it"
         for name in (*VERBS, "identify")
         if name not in family.registers
         and name not in family.texts

@@ -47,10 +47,10 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     - Whether a run command without a direction keeps the old one is not stated: both are always
       sent together. `start` without a direction goes forward from rest; while the motor turns it is
       refused, because the direction cannot be read. The toggle of the direction is never sent.
-    - Whether a start ends a jog, and a jog a run, is not stated: one that was jogged is to be stopped before
-      a start, and one that turns before a jog.
-    - There is no fault reset, and reserved bits are not tried.
-    - There is no state word: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
+    - Whether a start ends a jog, and a jog a run, is not stated: after a jog a stop is required before a
+      start, and a turning motor must be stopped before a jog.
+    - No fault reset is documented, and reserved bits are not tried.
+    - No state word is documented: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
     - "3800" bit/s is 4800; the fault "0C-xx" is OC-2, and 04 is OU.
     - How many registers may be read at once is not stated: one. Nor are exceptions: any is a refusal.
     - Timing is taken from part 3.

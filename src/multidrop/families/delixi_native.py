@@ -48,7 +48,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     A function code K has a table each: 02 run command, 03 run state, 04 run setpoint (not stored),
     05 and 06 parameters not stored and stored, 07 parameters read. A user's own parameters are
     declared in a subclass, `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`. The table says
-    where a value is kept: what 06 writes is in EEPROM, and what 02, 04 and 05 write is not.
+    which memory holds a value: 06 writes to EEPROM, and 02, 04 and 05 do not.
 
     Where the document errs or is silent, the safest reading is taken:
 
@@ -147,14 +147,14 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor. Sent once, then looked at."""
+        """Reset a fault; never starts the motor. It is sent once, then verified."""
         if (yield from read(self.status)) in CONDITIONS and not (yield from self._stands()):
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, DelixiNativeControl.RESET_FAULT)
         status = yield from read(self.status)
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             fault = self.fault.in_words((yield from read(self.fault)))
-            raise NotVerified(self.name, "the fault reset", f"the fault stands: {fault}")
+            raise NotVerified(self.name, "the fault reset", f"the fault remains: {fault}")
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

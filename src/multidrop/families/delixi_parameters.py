@@ -67,8 +67,8 @@ class DelixiParameters(Drive):
 
     P04.29, the format, has other codes in each protocol, and is the subclass's.
 
-    Values come without their decimal point, and the list that says where it belongs is lost: only the
-    scale of the output frequency is known, from an example. The units of P05.01 to P05.10 are inferred from
+    Values have no decimal point, and the list of scales is lost. Only the scale of the output
+    frequency is known, from an example. The units of P05.01 to P05.10 are inferred from
     the quantities' names.
     """
 
@@ -157,7 +157,7 @@ class DelixiParameters(Drive):
         )
 
     def _may_start(self) -> Script[None]:
-        """Raise WriteForbidden with a fault, without a setpoint, and where the line does not command it."""
+        """Raise WriteForbidden in a fault, without a setpoint, and if the drive does not obey the line."""
         fault = yield from read(self.fault)
         if fault:
             raise WriteForbidden(

@@ -24,7 +24,7 @@ from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
-UNKNOWN_RAMP = 30.0  # s that a stop may take where that time cannot be read; no document states a longest one
+UNKNOWN_RAMP = 30.0  # s for a stop if the deceleration time is unreadable; no document states a maximum
 
 
 class Coil(IntEnum):
@@ -102,32 +102,33 @@ class ErmanERG220(Drive):
     Where the document errs or is silent, the safest reading is taken:
 
     - The example of function 04 has the checksum of function 03's, and its reply a byte count of
-      10H for 5 registers: a reply must have the byte count that was asked for.
+      10H for 5 registers: a reply must have the byte count of the request.
     - The example of function 06 writes the setpoint to 0001H. That is a misprint, the setpoint is
       0002H; 0001H is never written.
     - The example of function 0F resets a fault and starts in one frame, and sets a reserved coil.
       Coils are written one at a time (05), and reset and start are two calls.
-    - The order of the bytes in a reply to function 01 is doubtful: coils are read where one byte holds
-      them, and not polled unless that is asked for. They show what was commanded. Whether the
+    - The byte order of a reply to function 01 is doubtful: coils are read only if one byte holds them, and
+      polled only on request. They show the last command. Whether the
       motor runs is read from 0400H, whose bits 0 and 1 are one number and not two flags.
     - Of the diagnostics, function 08, only the example is described, subfunction 0, and its error reply
       has the code 89H instead of 88H. `drive.send_raw(0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
       a copy of the request, as an adapter's echo is: it does not prove that a drive is there.
     - The order of the two words at 0400H and 0402H is not stated; one of them is always 0.
-    - 0402H is the last fault, and nothing says that a reset clears it, or that it is still in
+    - 0402H is the last fault. The document does not say whether a reset clears it, or whether it is still in
       force. `start` is refused until that fault has been reset by this object's `reset_fault`, or
       declared as dealt with by the option `acknowledged_fault`.
     - Whether START and STOP are levels or pulses is not stated. `stop` writes STOP on and START off,
-      and EMERGENCY STOP when the motor still runs after the deceleration time, or after 30 s where that
-      cannot be read. Both stay on until `start` writes them off: taking them off at another time could let
-      a kept START through. START is written off even where nobody confirms a stop: either may get through.
+      and EMERGENCY STOP if the motor still runs after the deceleration time, or after 30 s if that is
+      unreadable. Both stay on until `start` writes them off: writing them off earlier could let
+      a latched START through. START is written off even if STOP is not confirmed: either may arrive.
     - Exception 03 is used for any bad address and 04 says "on write": neither is a device failure.
     - The models -03 and -04 of the same make have another map: see `identify`.
-    - A setpoint is written between the minimum and the maximum frequency, for which the drive has no
-      refusal.
+    - A setpoint is limited to the minimum and the maximum frequency, because the drive does not refuse
+      others.
 
-    No ranges, defaults, timing, nor what is kept in EEPROM are stated. Address 0 is called the broadcast,
-    but not whether anybody answers it, so it is never sent. b.001 and b.002 must select RS-485.
+    No ranges, defaults or timing are stated, nor which registers are in EEPROM. Address 0 is called the
+    broadcast, but the document does not say whether drives answer it, so it is never sent. b.001 and b.002
+    must select RS-485.
     """
 
     model = "erman-er-g-220"
@@ -217,7 +218,7 @@ class ErmanERG220(Drive):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """Return all but the coils, which show what was commanded."""
+        """Return all readings except the coils, which show the last command."""
         return tuple(register for register in super().readings() if register.table is not COIL)
 
     @verb
@@ -276,7 +277,7 @@ class ErmanERG220(Drive):
         yield from self._stopped(self._stands, (yield from self._longest_ramp()))
 
     def _hold_back(self, stop: Register[Coil]) -> Script[None]:
-        """Write a stop on and START off; the second too where nobody confirms the first."""
+        """Write a stop on and START off; START even if the stop is not confirmed."""
         try:
             yield from insist(stop, Coil.ON)
         except Unconfirmed:

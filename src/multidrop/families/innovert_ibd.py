@@ -106,19 +106,19 @@ class InnovertIBD(Drive):
       cannot be read: `start` and `jog` are refused while it turns, and want a stop first.
     - A reset has "no action" in bits 1 and 0, which may leave a run of before the fault in force: a stop is
       sent before it, and without that no reset.
-    - There is no state word. The state is unknown unless the outputs are programmed as in the
+    - No state word is documented. The state is unknown unless the outputs are programmed as in the
       example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
       Otherwise `stop` goes by current and speed.
     - 2000H and 2001H are marked "write": they are not read.
     - A value above a parameter's maximum is silently stored as the maximum: settings are read back.
-      The setpoint's range, 0 to 400 Hz, knows nothing of the drive's maximum frequency: declare it
+      The setpoint's range, 0 to 400 Hz, ignores the drive's maximum frequency: declare it
       as the option `maximum_frequency`.
     - The table of letters is lost: of A and b the digit is known from examples, of C to H it is
       inferred, and these are read but never written.
-    - Nothing says that a drive is an IBD: see `identify`, and the option `confirmed`.
+    - No register identifies an IBD: see `identify`, and the option `confirmed`.
     - The "ordinal of the register" in a reply is the byte count. At most 4 registers are read.
 
-    Functions 03 and 06 only. Exceptions, fault codes, what is kept in EEPROM and what may be changed
+    Functions 03 and 06 only. Exceptions, fault codes, the registers in EEPROM and those that may be changed
     while the motor turns are not stated.
     """
 
@@ -213,8 +213,8 @@ class InnovertIBD(Drive):
     def identify(self) -> Script[None]:
         """Check that PrH.00 and PrH.02 are its own baud rate and address; these places are inferred.
 
-        A drive that has something else there may be an IBD all the same, which nothing can tell: its
-        owner declares confirmed = 1, once, in the plant file.
+        A drive with other values there may still be an IBD: its owner then declares confirmed = 1 in the
+        plant file.
         """
         if self.option.get("confirmed"):
             return
@@ -234,7 +234,7 @@ class InnovertIBD(Drive):
         return baudrate == IBDBaudrate[f"B{self.settings.baudrate}"] and address == self.address
 
     def resembles(self) -> Script[bool]:
-        """Return True where bits 11 to 15 of PrA.22 are as in the example, and what is named is there."""
+        """Return True if bits 11 to 15 of PrA.22 are as in the example, and the named registers exist."""
         try:
             yield from read(self.output_current)
             yield from read(self.motor_speed)
@@ -315,7 +315,7 @@ class InnovertIBD(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Report the state by the outputs where they are programmed for it; unknown otherwise."""
+        """Return the state shown by the outputs if they are programmed for it; else unknown."""
         terminals = yield from read(self.terminals)
         if not (yield from self._programmed()):
             return State(

@@ -108,11 +108,11 @@ class CommunicationFault(IntEnum):
 
 @declaration
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a function code by its ordinal number in one's own model's manual (section 11.6.4).
+    """Declare a function code by its ordinal number in your model's manual (section 11.6.4).
 
-    It is kept in EEPROM, and written to its alias in RAM: bit 15 of the address set. That is lost with the
-    power; what is to outlast it is a `stored_parameter`. Compare what is read with the keypad before
-    anything is written: a wrong ordinal may restore the factory settings.
+    It is kept in EEPROM, and written to its RAM alias: bit 15 of the address set. The RAM value is lost at
+    power-off; use `stored_parameter` for a permanent one. Compare the read value with the keypad before the
+    first write: a wrong ordinal may restore the factory settings.
 
         class MyCHE(InvtCHE):
             acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
@@ -144,7 +144,7 @@ class InvtCHE(Drive):
     """INVT CHE series; manual, chapter 11 "communication protocol".
 
     The chapter's register table is lost. All registers here, the meaning of exceptions and the PC
-    group are from outside it: the CHE100 manual v1.4; scales, where given, from the Goodrive300L
+    group are from outside it: the CHE100 manual v1.4; scales, if given, from the Goodrive300L
     manual; names of faults from the CHE100's relatives, for display only.
 
     The safest readings taken:
@@ -159,10 +159,10 @@ class InvtCHE(Drive):
     - Two scales are left open, because sources differ: GD200L and GD300L print the DC bus voltage (3002H)
       with and without a decimal; the output power (3006H) is 0.1 % in the Goodrive300L manual, and 0.01 kW
       on a CHF100A, as its owner compared it with the keypad.
-    - The example that writes 5000 to 0008H does not say what that is, and is not to be repeated.
-    - STOP may not end a jog: where the motor still turns after it, or nobody says that it stands, STOP_JOG
-      follows at once. Nor may a start: one that was jogged is to be stopped before a start. Whether a run
-      ends in a jog is not stated either: `jog` is refused while the motor turns.
+    - The example that writes 5000 to 0008H does not say what that is, and must not be repeated.
+    - STOP may not end a jog: if the motor still turns after it, or its state is unknown, STOP_JOG follows at
+      once. A start may not end a jog either: after a jog a stop is required before a start. Whether a jog
+      ends a run is not stated: `jog` is refused while the motor turns.
     - A state word other than 1 to 4 is not explained: `start` and `jog` are refused then.
     - Exception 03 is a malformed frame; a value out of range is 12H.
 
@@ -322,14 +322,14 @@ class InvtCHE(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp, and a jog too where the motor turns after it: that it jogs cannot be read."""
+        """Stop along the ramp; if the motor still turns, also stop a jog, which cannot be read."""
         refusals: list[DriveException] = []
         try:
             if (yield from self._stands_by(CHEControl.STOP, refusals)):
                 return
         except WriteForbidden:  # another drive is there
             raise
-        except BusError:  # one that is not heard may hear, and jog
+        except BusError:  # a silent drive may still hear, and jog
             with suppress(BusError):
                 yield from insist(self.control, CHEControl.STOP_JOG, attempts=1)
             raise
@@ -340,32 +340,32 @@ class InvtCHE(Drive):
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands_by(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
-        """Write a stop, and return True where the motor stands then; note its refusal."""
+        """Write a stop; return True if the motor is then at rest; collect its exception."""
         try:
             yield from insist(self.control, word)
-        except DriveException as refusal:  # as it may in a fault, or where there is no jog to stop
+        except DriveException as refusal:  # as in a fault, or without a jog
             refusals.append(refusal)
         return (yield from self._stands())
 
     @verb
     def coast(self) -> Script[None]:
-        """Take the voltage off and let the motor run out."""
+        """Remove the voltage and let the motor coast."""
         yield from insist(self.control, CHEControl.COAST)
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands(self) -> Script[bool]:
-        """Return True where the drive gives no voltage, as in a fault."""
+        """Return True if the drive applies no voltage, as in a fault."""
         return (yield from read(self.status)) in (CHEStatus.STANDBY, CHEStatus.FAULT)
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor. Sent once, then looked at."""
+        """Reset a fault; never starts the motor. It is sent once, then verified."""
         if (yield from read(self.status)) in (CHEStatus.FORWARD, CHEStatus.REVERSE):
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, CHEControl.RESET_FAULT)
         if (yield from read(self.status)) == CHEStatus.FAULT:
             fault = self.fault.in_words((yield from read(self.fault)))
-            raise NotVerified(self.name, "the fault reset", f"the fault stands: {fault}")
+            raise NotVerified(self.name, "the fault reset", f"the fault remains: {fault}")
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

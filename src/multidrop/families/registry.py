@@ -1,8 +1,11 @@
-"""Find a family by the name that a person writes: built-in, shipped as a file, or in a file of their own.
+"""Find a family by name: built-in, shipped as a file, or in a user's file.
 
-The shipped ones are TOML files of this package, which nobody has tried on hardware. A TOML file is data. A
-Python file is a program: looking its class up runs it, with all rights of the caller. It may import modules
-that lie beside it. Each of these is logged to `multidrop.families.registry` before it is run.
+The shipped families are TOML files of this package, untested on hardware. A TOML file is data. A Python
+file is a program: it runs once a process, with all rights of the caller, and is logged to
+`multidrop.families.registry` before. It may import modules of its own directory by name, as a script does.
+No other file sees such a module: `sys.path` and the names in `sys.modules` stay unchanged, so two
+directories may have modules of one name. A module of Python's own, or multidrop itself, is never taken from
+that directory.
 """
 
 from __future__ import annotations
@@ -24,11 +27,11 @@ from multidrop.families import MODELS
 
 GROUP = "multidrop.families"  # of entry points of other packages; a built-in name goes before theirs
 _SHIPPED = Path(__file__).parent / "shipped"
-SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read when it is asked for
+SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read on demand
 
 
 def shipped_family(name: str) -> type[Drive]:
-    """Return the family of SHIPPED that has this name; it is called so, and not by its file."""
+    """Return the shipped family of this name; its `model` is the name, not the file."""
     family = _family_of(_SHIPPED / f"{name}.toml")
     family.model = family.declared_in = name
     return family
@@ -37,8 +40,8 @@ def shipped_family(name: str) -> type[Drive]:
 def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     """Return the family called `text`: one of MODELS or SHIPPED, "path/to/file.toml", or "file.py:Class".
 
-    A relative path begins at `relative_to`, or at the working directory. A Python file is run, once a
-    process. Raises ValueError, also for whatever the file itself does wrong.
+    A relative path starts at `relative_to`, or at the working directory. A Python file is run, once a
+    process. Raises ValueError for an unknown name and for any error in the file.
     """
     if text in MODELS:
         return MODELS[text]
@@ -85,12 +88,12 @@ def installed_family(name: str) -> type[Drive] | None:
 
 
 def is_users_own(family: type[Drive]) -> bool:
-    """Return True for a family that is not of this package, and derives from none that is."""
+    """Return True for a user's family that does not derive from one of this package."""
     return family.model not in SHIPPED and not any(base in MODELS.values() for base in family.__mro__)
 
 
 def _family_of(path: Path) -> type[Drive]:
-    from multidrop.families.files.loader import load_family  # a tenth of what a command imports
+    from multidrop.families.files.loader import load_family  # a tenth of a command's imports
 
     return load_family(path)
 
@@ -122,16 +125,16 @@ def _load(path: Path) -> ModuleType:
     return load_model_file(path)
 
 
-_KEPT = {*sys.stdlib_module_names, "multidrop"}  # names that no file beside a model takes
-_running = RLock()  # a file that is being run is not run by another thread too
+_KEPT = {*sys.stdlib_module_names, "multidrop"}  # names that a file beside a model cannot have
+_running = RLock()  # one thread at a time runs files
 
 _log = logging.getLogger("multidrop.families.registry")
 
 
 def load_model_file(path: Path) -> ModuleType:
-    """Return the module that the file is; it is run once a process, so that its classes stay the same.
+    """Return the file's module; it is run once a process, so that its classes stay the same.
 
-    Raises ValueError, with file and line, for whatever it does wrong.
+    Raises ValueError, with file and line, for any error in it.
     """
     path = path.resolve()
     try:
@@ -143,18 +146,18 @@ def load_model_file(path: Path) -> ModuleType:
 
 
 class _NotPython(Exception):
-    """A file that is not called as Python files are."""
+    """A file whose name is not that of a Python file."""
 
 
 def _module(path: Path) -> ModuleType:
     name = f"multidrop_models.{path.stem}_{abs(hash(path)):x}"
     with _running:
-        if name in sys.modules:  # whole, or under way where two files import each other
+        if name in sys.modules:  # complete, or being loaded if two files import each other
             return sys.modules[name]
         spec = importlib.util.spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
             raise _NotPython(f"{path} cannot be loaded as Python")
-        _log.info("%s is run as Python: a model of one's own is a program", path)
+        _log.info("%s is run as Python: a user's model is a program", path)
         module = importlib.util.module_from_spec(spec)
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import_beside(path.parent)}
         sys.modules[name] = module  # dataclasses look their module up
@@ -185,16 +188,16 @@ def _import_beside(directory: Path) -> Callable[..., object]:
 
 
 def _imported(name: str, path: Path) -> ModuleType | None:
-    """Return the module of this name where the program has imported it, from this very file."""
+    """Return the module of this name if the program imported it from the same file."""
     module = sys.modules.get(name)
     file = getattr(module, "__file__", None)
     return module if file and Path(file).exists() and path.samefile(file) else None
 
 
 def _place(mistake: BaseException, path: Path) -> str:
-    """Return the file, and the line in which it happened where that is known: its own, or one beside it."""
+    """Return the file and, if known, the line of an error: in the file, or in one beside it."""
     if isinstance(mistake, SyntaxError):
-        return str(path)  # its text has file and line
+        return str(path)  # its message has file and line
     frames = [
         frame
         for frame in traceback.extract_tb(mistake.__traceback__)

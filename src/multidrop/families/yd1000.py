@@ -118,10 +118,9 @@ def preset(number: int, place: str, /) -> Register[float]:
 
 
 def extended(name: str, unit: str = "", /, **details: Unpack[Details]) -> Register[float]:
-    """Declare an extended parameter by its name in one's own manual: F800 is 0800H (section 6.2).
+    """Declare an extended parameter by its name in your manual: F800 is 0800H (section 6.2).
 
-    It is kept in EEPROM. Whoever has the manual at hand, for the numbers alone are known here, declares it
-    in a subclass:
+    It is kept in EEPROM. This library knows only the numbers, so declare the parameter in a subclass:
 
         class MyYD1000(YD1000):
             start_frequency = extended("F240", "Hz", step=0.01)
@@ -151,12 +150,12 @@ class YD1000(Drive):
       see `identify`, which holds 0802H against the drive's own address.
     - The table heads have the checksum's high byte first. It is the low one, as everywhere.
     - Other functions than 03 (one register) and 06 are spoken of, but not in the function table.
-    - 0000H in the control word is no stop: without bit 15 the panel or the terminals are in command,
+    - 0000H in the control word does not stop: without bit 15 the panel or the terminals are in command,
       and may say run. A stop keeps bit 15, and so does everything else.
-    - Bits 15 and 14 latch until they are written 0 or the power goes: until then panel and terminals command
-      nothing. `release_control` writes 0000H, at rest alone, while no terminal says run. What the panel says
-      cannot be read: if the motor turns after it, the stop is written again.
-    - Bit 14 should stay as it was, and what it is cannot be told for sure: every command has it set.
+    - Bits 15 and 14 latch until they are written 0 or the power fails: until then panel and terminals have
+      no effect. `release_control` writes 0000H, only at rest, and only if no terminal says run. The panel's
+      command cannot be read: if the motor then turns, the stop is written again.
+    - Bit 14 should stay as it was, but it cannot be read reliably: every command has it set.
       So the setpoint is 1001H from the first verb on, which is 0 Hz until set_frequency is called.
       With the option `setpoint_by_fnod` a start has it off, as the document's 8400H and 8600H.
     - Bits 3 to 0 are called preset speed 1 to 4, and there are seven, Sr1 to Sr7: the bits are taken for
@@ -167,7 +166,7 @@ class YD1000(Drive):
     - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: relatives restart again and
       again while they are set. A reset has bit 15 and not the run bit; its reply may be cut off, and 3 s
       later the stop is written again. A restart may take bit 15 back, as power-on does (section 8.1), so
-      that the terminals command the motor until then: a reset is refused while one of them says run. The
+      that the terminals command the motor until then: a reset is refused while a terminal says run. The
       table of functions is missing: 2 and 3 are taken for run, which the terminals F and R have.
     - Jog is written without the run bit, which would turn the motor at the setpoint if jog is not obeyed.
     - 1200H and 1201H are called present values, but are frozen in a trip: only 1100H is live. A motor
@@ -178,7 +177,7 @@ class YD1000(Drive):
       reset or at the next power-on, 0802H and 0803H at once (section 7).
     - CNOD, FNOD, FR, F103, F104 and F110 to F115 belong to the command over the motor, and what AU3
       sets by itself is not stated: they are read and never written.
-    - 0803H, the watchdog, is written only while the motor stands (the document does not ask for that): a
+    - 0803H, the watchdog, is written only while the motor is at rest (the document does not require that): a
       time shorter than the gap between two polls trips the drive.
     - The table of faults is missing: codes are shown as they are. Exceptions are a relative's, VF-S15's.
     - Addresses above 31 need a version above V104. The stop bits are not stated: 1.
@@ -362,7 +361,7 @@ class YD1000(Drive):
         note=f"0 is off. {AT_ONCE}",
     )
 
-    _record: float | None = None  # the latest entry of the fault record when it was last looked at
+    _record: float | None = None  # the newest entry of the fault record at the last check
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
         """Return 0802H, the drive's own address, and 0011H, a maximum frequency of 30 to 320 Hz."""

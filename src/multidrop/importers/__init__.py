@@ -23,14 +23,14 @@ from multidrop.toml_check import parse_document
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
 MOST_BYTES = 5_000_000
-MOST_REASONS = 3  # that a refusal gives
+MOST_REASONS = 3  # in an error
 
 
 def read_devices(path: Path) -> list[ImportedDevice]:
-    """Return the devices of a file, which its suffix and its contents tell apart.
+    """Return the devices in another program's file; its format follows from its suffix and contents.
 
-    Each has what a family can hold: its family file loads. Raises ValueError for what is no such file, or has
-    nothing that can be imported, ImportError for YAML without PyYAML.
+    The family file of each device loads. Raises ValueError if the file has another format or no importable
+    register, ImportError for YAML without PyYAML.
     """
     devices = all_devices(path)
     found = [device for device in devices if device.registers or device.texts]
@@ -39,12 +39,12 @@ def read_devices(path: Path) -> list[ImportedDevice]:
         reasons = "; ".join(printable(str(one))[:200] for one in lost[:MOST_REASONS])
         more = f"; and {len(lost) - MOST_REASONS} more" if len(lost) > MOST_REASONS else ""
         raise ValueError(f"{path} has no register that can be imported: {reasons or 'it is empty'}{more}")
-    _tell_apart(found, path.stem)
+    _make_titles_unique(found, path.stem)
     return found
 
 
-def _tell_apart(devices: list[ImportedDevice], stem: str) -> None:
-    """Give devices titles by which, with their addresses, each can be chosen."""
+def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
+    """Make the devices' titles unique, together with their addresses."""
     for device in devices:
         device.title = device.title or stem
     addresses = Counter(device.address for device in devices)
@@ -58,10 +58,10 @@ def _tell_apart(devices: list[ImportedDevice], stem: str) -> None:
 
 
 def all_devices(path: Path) -> list[ImportedDevice]:
-    """Return the same with devices of which nothing can be imported. Raises as `read_devices` does."""
+    """Return all devices, also those without an importable register. Raises as `read_devices` does."""
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise ValueError(f"{path}: its suffix is none of {', '.join(_READERS)}")
+        raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)

@@ -24,7 +24,7 @@ from multidrop.importers.numbers import (
     words_of,
 )
 
-CARRIED = {  # names of columns, in lower case and without _, the most telling first
+CARRIED = {  # names of columns, in lower case and without _, the most specific first
     "name": (
         *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
         *("tag", "signal", "variable", "point", "title"),
@@ -91,7 +91,7 @@ _ORDERS = {
 _STEP_COLUMNS = ("factor", "scale", "divisor", "gain", "decimal")
 _WHOLE = re.compile(r"(?:(u|unsigned)|signed)?int(?:eger)?(\d*)(?:t|bits?)?")
 _BIT_TYPES = frozenset({"bit", "bool", "boolean", "binary", "coil", "flag"})
-_NAMED_TABLES = (  # the first that a cell begins with
+_NAMED_TABLES = (  # the first prefix that matches a cell
     *(("holding", "holding"), ("hr", "holding"), ("4x", "holding")),
     *(("discrete", "discrete"), ("input status", "discrete"), ("input contact", "discrete")),
     *(("input coil", "discrete"), ("di", "discrete"), ("1x", "discrete"), ("contact", "discrete")),
@@ -190,14 +190,14 @@ class _Layout:
         return found
 
     def further(self, row: list[str]) -> set[str]:
-        """Return the names of the other columns in which a row says something."""
+        """Return the names of the other columns with a cell in this row."""
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return what the columns of a row leave open."""
+        """Return the gaps in a row: columns that may change the value and are not carried over."""
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
-            columns -= {"precision"}  # digits that are shown there
+            columns -= {"precision"}  # number of digits shown
         found = [f"the column {name} was not carried over" for name in sorted(columns)]
         is_text = cells.get("type", "").lower().startswith("str")
         if cells.get("length") and is_text and self._length in ("length", "size"):
@@ -294,13 +294,13 @@ def _is_number(cells: Cells) -> bool:
 
 
 def _steps(cells: Cells) -> list[tuple[str, str]]:
-    """Return the cells that state what one count is, by their columns, as far as they say something."""
+    """Return the non-trivial cells that state the value of one count, with their columns."""
     stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
     return [(key, cell) for key, cell in stated if cell and (cell != "1" or key == "decimal")]
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states. What has two meanings, or none that is known, is a gap."""
+    """Return the table that a row states. An ambiguous or unknown cell is a gap."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -494,7 +494,7 @@ def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None
 
 
 def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) -> float:
-    """Return the value of one count. Raises ValueError for what is no number."""
+    """Return the value of one count. Raises ValueError unless it is a number."""
     amount = number(given, 1)
     exact = Fraction(str(amount))
     if amount == 0 and key != "decimal":
@@ -536,7 +536,7 @@ class _Tag:
 
 
 def _parse_tag(cell: str) -> _Tag | None:
-    """Return the parts of such an address; None for a cell that is none."""
+    """Return the parts of a tag's address; None for any other cell."""
     match = _TAG.fullmatch(cell)
     if match is None:
         return None
@@ -544,7 +544,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return the order of a number's bytes; notes a gap where the tag leaves it to its node."""
+    """Return a number's byte order; mark a gap if the tag does not state it."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

@@ -18,13 +18,13 @@ UNKNOWN_HOST = "HOST"
 _HOST = re.compile(r"[A-Za-z0-9_.:-]{1,200}|\[[0-9A-Fa-f:.]{1,100}\]")
 _PORT = re.compile(r"[^!${}\s][^${}]*")  # no tag, and no variable that is substituted elsewhere
 _PARITIES = {"n": "N", "none": "N", "e": "E", "even": "E", "o": "O", "odd": "O"}
-# What a family takes that says nothing of its formats; an ASCII frame may have 7 bits.
+# Formats of a family that states none; an ASCII frame may have 7 bits.
 _FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", "8N1", "8E1", "8O1", "8N2")}
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """A line, as far as it is stated: an empty port, a baud rate of 0 and an empty format are not known."""
+    """The stated settings of a line: an empty port, a baud rate of 0 and an empty format are unknown."""
 
     port: str = ""
     baudrate: int = 0
@@ -32,7 +32,7 @@ class LineSettings:
     framing: str = "rtu"
 
     def drive_keys(self) -> dict[str, Any]:
-        """Return the keys of a drive in a plant file; a network's line has none but its framing."""
+        """Return the keys of a drive in a plant file; on a network line only its framing."""
         found: dict[str, Any] = {"framing": self.framing} if self.framing != "rtu" else {}
         if self.is_network:
             return found
@@ -55,7 +55,7 @@ UNKNOWN_LINE = LineSettings()
 
 
 def serial_settings(given: Mapping[str, Any], *, port: Any = "", framing: Any = "rtu") -> LineSettings:
-    """Return a serial line's settings of `baudrate`, `bits`, `parity` and `stop`, each where it is stated."""
+    """Return a serial line's settings from the optional keys `baudrate`, `bits`, `parity` and `stop`."""
     parity = _PARITIES.get(str(given.get("parity", "")).lower(), "")
     bits, stop = _whole(given.get("bits")) or 8, _whole(given.get("stop")) or 1
     return LineSettings(
@@ -69,9 +69,9 @@ def serial_settings(given: Mapping[str, Any], *, port: Any = "", framing: Any = 
 def network_settings(
     host: Any, port: Any, *, is_serial_frames: bool = False, framing: str = "rtu"
 ) -> LineSettings:
-    """Return the line of a host: Modbus TCP, or frames of a serial line over a socket.
+    """Return the line of a host: Modbus TCP, or serial frames over a socket.
 
-    A host that is not known is HOST, and a port that is none 502: never a serial port.
+    An unknown host becomes HOST, and an invalid port number 502.
     """
     number = _whole(port)
     known = host if isinstance(host, str) and _HOST.fullmatch(host) else UNKNOWN_HOST
@@ -81,7 +81,7 @@ def network_settings(
 
 
 def _whole(given: Any) -> int:
-    """Return a whole number that may be text; 0 for what is none."""
+    """Return a whole number, also from text; 0 for any other value."""
     if isinstance(given, str) and re.fullmatch(r"[0-9]{1,9}", given.strip()):
         given = int(given)
     return given if isinstance(given, int) and not isinstance(given, bool) and 0 < given < 10**9 else 0
@@ -96,7 +96,7 @@ _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 
 
 class Treatment(Enum):
-    """The treatment of a key of the source's schema."""
+    """How the importer treats a key of the source's schema."""
 
     CARRIED = "the importer reads it"
     IRRELEVANT = "it changes no value"
@@ -107,7 +107,7 @@ KeyTable = Mapping[str, Treatment]
 
 
 def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
-    """Return the treatment of each of these keys, which are separated by spaces."""
+    """Return the treatment of each key; the arguments are keys separated by spaces."""
     return {
         **dict.fromkeys(carried.split(), Treatment.CARRIED),
         **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
@@ -118,7 +118,7 @@ def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyT
 def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
     """Return a sentence for each key of an entry that may change its value and is not carried over.
 
-    A key that the table does not have may change the value too. Empty and false values say nothing.
+    A key that is not in the table may change the value too. Keys with empty or false values are ignored.
     """
     known = {
         Treatment.GAP: "{} was not carried over",
@@ -135,10 +135,10 @@ def is_empty(value: Any) -> bool:
 
 @dataclass
 class ImportedRegister:
-    """One register; its address is the one that is sent. `gaps` are sentences about what is not known.
+    """One register, with its address on the wire. `gaps` are sentences about unknown facts.
 
-    `lacks` is what its value needs and a register cannot say: only the raw count is carried over. A family
-    file gets readings alone; what is written elsewhere is noted for whoever asks how much a register holds.
+    `lacks` is a fact that its value needs and a register cannot declare; then only the raw count is carried
+    over. A family file gets only readings; `is_written` and `of_writes` serve coverage reports.
     """
 
     name: str
@@ -149,18 +149,18 @@ class ImportedRegister:
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # details that a written register has besides
+    of_writes: dict[str, Any] = field(default_factory=dict)  # further details of a written register
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Note that the other program writes it too: a gap, because nothing is known of what that does."""
+        """Mark a gap if the other program writes the register, because the effect is unknown."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of its values or bits; mark a gap for those that it cannot have.
+        """Add names of its values or bits; mark a gap for names that it cannot have.
 
-        Of several names of one number the first stands.
+        If a number has several names, the first is used.
         """
         names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
         for spelt, given in pairs.items():
@@ -177,7 +177,7 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry that could not be carried over, or with `is_entry` false another fact; and why."""
+    """An entry, or with `is_entry` false another fact, that could not be carried over, with the reason."""
 
     name: str
     reason: str
@@ -189,7 +189,7 @@ class Lost:
 
 @dataclass
 class ImportedDevice:
-    """A device: what is read of it, what is only written, and what could not be carried over."""
+    """A device: its readable registers, its commands, and the entries that could not be carried over."""
 
     title: str = ""
     address: int | None = None
@@ -197,18 +197,18 @@ class ImportedDevice:
     texts: list[ImportedRegister] = field(default_factory=list)
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
-    readable: range = range(0)  # holding registers, of which any may be read across
-    together: int = 0  # registers that one request may read; 0 is not stated
+    readable: range = range(0)  # holding registers that one read may include
+    together: int = 0  # registers that one request may read; 0: not stated
     line: LineSettings = UNKNOWN_LINE
     names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
-        """Add a register under a name that no other has; what cannot be one is lost."""
+        """Add a register under a unique name; an invalid one is recorded as lost."""
         if isinstance(found.address, bool) or not isinstance(found.address, int):
-            self.lose(found.name, f"its address {str(found.address)[:40]!r} is no whole number")
+            self.lose(found.name, f"its address {str(found.address)[:40]!r} is not a whole number")
             return
         if not 0 <= found.address <= 0xFFFF:
-            self.lose(found.name, "its address is none from 0 to 65535")
+            self.lose(found.name, "its address is not from 0 to 65535")
             return
         spelt, found.name = found.name, self.names.free(found.name)
         if not found.is_read:
@@ -220,12 +220,12 @@ class ImportedDevice:
         (self.texts if is_text else self.registers).append(found)
 
     def lose(self, name: str, reason: str, *, is_entry: bool = True) -> None:
-        """Note what could not be carried over, and why."""
+        """Record an entry or fact that could not be carried over, with the reason."""
         self.lost.append(Lost(name, reason, is_entry))
 
     @contextmanager
     def entry(self, name: str) -> Iterator[None]:
-        """Lose the entry where reading it fails, not its file. Raises ValueError for too many entries."""
+        """Record the entry as lost if reading it fails. Raises ValueError for too many entries."""
         if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
             raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
         try:
@@ -238,13 +238,13 @@ class ImportedDevice:
             self.lose(name, f"it is not laid out as an entry: {type(failure).__name__} {str(failure)[:100]}")
 
     def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
-        """Note the keys of a device or line that are not carried over."""
+        """Record the keys of a device or line that are not carried over."""
         for sentence in uncarried(given, table):
             self.lose(place, sentence, is_entry=False)
 
 
 class UniqueNames:
-    """Names for Python that are as near as can be to what was spelt, each given once."""
+    """Unique Python names, as close as possible to the given spelling."""
 
     def __init__(self, taken: Collection[str] = TAKEN_NAMES) -> None:
         self._taken = taken
@@ -263,10 +263,10 @@ class UniqueNames:
 
 
 def unit_address(given: Any, key: str) -> int | None:
-    """Return a device's unit id, 0 to 255; None if it is not stated. Raises ValueError for no unit id."""
+    """Return a device's unit id, 0 to 255; None if it is not stated. Raises ValueError for other values."""
     if given is None:
         return None
     number = int(given.strip(), 0) if isinstance(given, str) and _ANY_BASE.fullmatch(given.strip()) else given
     if isinstance(number, bool) or not isinstance(number, int) or number not in UNIT_IDS:
-        raise ValueError(f"{key} = {str(given)[:40]!r} is no unit id from {UNIT_IDS[0]} to {UNIT_IDS[-1]}")
+        raise ValueError(f"{key} = {str(given)[:40]!r} is not a unit id from {UNIT_IDS[0]} to {UNIT_IDS[-1]}")
     return number

@@ -106,7 +106,7 @@ def read_esphome(document: Any) -> list[ImportedDevice]:
 
 
 def _parts(document: Any) -> Iterator[dict[str, Any]]:
-    """Yield the document and the packages that stand in it; a list is one of entities."""
+    """Yield the document and its packages; a list is a list of entities."""
     if isinstance(document, list):
         entities = [each for each in document if isinstance(each, dict) and each.get("platform") == PLATFORM]
         yield from ({_kind_of(entity): entity} for entity in entities)
@@ -119,7 +119,7 @@ def _parts(document: Any) -> Iterator[dict[str, Any]]:
 
 
 def _kind_of(entity: Mapping[str, Any]) -> str:
-    """Return the kind of an entity in a bare list: the first whose keys are all of it."""
+    """Return the kind of an entity in a bare list: the first kind that has all its keys."""
     return next((kind for kind, table in KEYS.items() if entity.keys() <= table.keys()), "sensor")
 
 
@@ -257,7 +257,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Make factors and offsets, in their order, a step and an offset; what others do is not carried over."""
+    """Combine factors and offsets, in order, into a step and an offset; other filters are gaps."""
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []
     for each in _listed(filters):
@@ -310,7 +310,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
     every = (1 << 16 * words_of(found)) - 1
     mask = whole(entry, "bitmask", every) & every
     if words_of(found) < 4 and mask != every:  # the mask of 64 bits is ignored there
-        found = found.replace("I", "U")  # what is masked has no sign there
+        found = found.replace("I", "U")  # a masked number has no sign there
         _part(register, found, mask)
     elif is_flag:
         register.gaps.append("it is true where its count is not 0")
@@ -319,7 +319,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
         register.gaps.append("it is true where one of its bits is")
     if entry.get("multiply") is not None:
         factor = Fraction(str(number(entry["multiply"], 1, "multiply"))) or Fraction(1)
-        scaled(register.details, float(1 / factor))  # what is read is divided there
+        scaled(register.details, float(1 / factor))  # a read count is divided there
     if (options := entry.get("optionsmap")) is not None:
         if isinstance(options, dict):
             register.put_names("values", options)

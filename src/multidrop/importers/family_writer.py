@@ -19,10 +19,10 @@ from multidrop.importers.device import UNKNOWN_HOST, ImportedDevice, ImportedReg
 from multidrop.printable import printable
 from multidrop.toml_check import TomlPlace, parse_document
 
-MOST_LOST = 500  # that the file tells
+MOST_LOST = 500  # listed in the file
 UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"
 _LONGEST = 200  # characters of a text
-_MOST_POINTS = 20  # of a text; TOML's reader takes a line of very many for a key
+_MOST_POINTS = 20  # in a text; TOML's parser is slow on a line with very many
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
@@ -31,9 +31,9 @@ _ORDER = (
 
 
 def family_text(device: ImportedDevice, source: str) -> str:
-    """Return the text of a family file. It declares readings and texts alone: nothing in it writes.
+    """Return the text of a family file, which declares only readings and texts.
 
-    Raises ValueError where it would be longer than a family file may be.
+    Raises ValueError if it would be longer than a family file may be.
     """
     lines = [
         f"# Imported from {_comment(source)}: compare each line with the manual, and mend each `gap:`.",
@@ -77,7 +77,7 @@ def family_text(device: ImportedDevice, source: str) -> str:
 def plant_text(device: ImportedDevice, family_file: str) -> str:
     """Return the text of a plant file with this device.
 
-    Raises ValueError where its address is not known, or where it has nothing that is polled.
+    Raises ValueError if its address is unknown, or if it has no register to poll.
     """
     if not device.registers:
         raise ValueError(
@@ -152,7 +152,7 @@ _PLACE = Path("entry")
 
 
 def settle(device: ImportedDevice) -> None:
-    """Move what a family cannot hold to the device's `lost`, with the sentence of the library."""
+    """Move registers and texts that a family cannot hold to the device's `lost`, with the library's error."""
     held = _keep(device, device.registers, declare, MOST_REGISTERS, "registers")
     _keep(device, device.texts, declare_text, MOST_TEXTS, "texts")
     _settle_together(device, held)
@@ -165,7 +165,7 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Leave in a list what one family can hold; return what it declares, by name."""
+    """Keep the entries that one family can hold; return their declarations by name."""
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:
@@ -183,7 +183,7 @@ def _keep(
 
 
 def declare(found: ImportedRegister, access: Access = Access.READING) -> Register[Any]:
-    """Return the register that a family's file makes of this one. Raises ValueError with its reasons."""
+    """Return the register that a family file would declare. Raises ValueError with all errors in it."""
     place = TomlPlace(_PLACE)
     declared = Declared(Counting(0), {}, "single")
     ((name, given),) = parse_document(entry_line(found).encode()).items()
@@ -200,7 +200,7 @@ def declare(found: ImportedRegister, access: Access = Access.READING) -> Registe
 
 
 def declare_text(found: ImportedRegister) -> Text:
-    """Return the text that a family's file makes of this one. Raises ValueError with its reasons."""
+    """Return the text that a family file would declare. Raises ValueError with all errors in it."""
     place = TomlPlace(_PLACE)
     texts = texts_of(parse_document(entry_line(found).encode()), Counting(0), {}, place)
     if place.config_errors:
@@ -210,7 +210,7 @@ def declare_text(found: ImportedRegister) -> Text:
 
 
 def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
-    """Take away what registers are to each other until one class holds them all."""
+    """Remove scale registers, or whole registers, until one class can hold all registers together."""
     by_name = {found.name: found for found in device.registers}
     gaps = {HOLDING: device.readable} if device.readable else {}
     while wrong := _refused_together({**held, "readable_gaps": gaps}):
@@ -229,7 +229,7 @@ def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> 
 
 
 def _refused_together(members: dict[str, Any]) -> dict[str, str]:
-    """Return why one class cannot have these members, by register; nothing where it can."""
+    """Return the errors of a class with these members, by register; empty if there are none."""
     try:
         type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:

@@ -115,11 +115,11 @@ def _lack(document: Any, hubs: list[Mapping[str, Any]]) -> str:
     )
 
 
-# ---- where hubs are ----
+# ---- hubs ----
 
 
 def _hubs(found: Any, place: str, depth: int) -> Iterator[Mapping[str, Any]]:
-    """Yield the hubs of a document: below `modbus:`, also in packages, or what it is itself."""
+    """Yield the hubs of a document: below `modbus:`, in packages, or the document itself."""
     if isinstance(found, dict):
         if (place == "modbus" and "type" in found) or any(kind in found for kind in (*KEYS, *_NOT_READ)):
             yield found
@@ -228,12 +228,12 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
         _sensor(device, register, entry)
         return
     if register.table in ("holding", "input") and kind == "binary_sensors":
-        register.details["part"] = "0"  # the others of its bits are never looked at
+        register.details["part"] = "0"  # its other bits are never used
     _repeat(device, register, entry, 1)
 
 
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Read a switch where its state is, and note which counts mean on and off."""
+    """Read the switch's state register, and name the counts for on and off."""
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
     if isinstance(verify, dict):

@@ -47,7 +47,7 @@ def words_of(number: str) -> int:
 
 
 def bits_text(low: int, high: int) -> str:
-    """Return the bits of a part as a family file has them: 3, or 0-7."""
+    """Return the bits of a part as a family file writes them: 3, or 0-7."""
     return str(low) if low == high else f"{low}-{high}"
 
 
@@ -64,7 +64,7 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 def scaled(
     details: dict[str, Any], step: Any, offset: Any = 0, keys: tuple[str, str] = ("scale", "offset")
 ) -> None:
-    """Add step and offset if they say something; a step of 0 says nothing. Raises as `number` does."""
+    """Add step and offset unless they change nothing; a step of 0 is ignored. Raises as `number` does."""
     found = number(step, 1, keys[0]), number(offset, 0, keys[1])
     if found[0] not in (0, 1):
         details["step"] = found[0]
@@ -73,7 +73,7 @@ def scaled(
 
 
 def number(given: Any, default: float, key: str = "number") -> float:
-    """Return a number that may be text; `default` if it is empty. Raises ValueError for what is none."""
+    """Return a number, also from text; `default` if it is empty. Raises ValueError for anything else."""
     if given in (None, ""):
         return default
     text = str(given).strip()
@@ -88,7 +88,7 @@ def number(given: Any, default: float, key: str = "number") -> float:
 def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int:
     """Return the whole number of a key, which may be text and hex.
 
-    Raises KeyError if the entry has none and there is no default, ValueError for what is no whole number.
+    Raises KeyError if the key is missing and there is no default, ValueError for anything else.
     """
     given = entry.get(key)
     if given is None:
@@ -102,12 +102,12 @@ def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int
 
 
 def count(given: Any, key: str = "count") -> int | str:
-    """Return a raw count: a number, also as text and in hex, or NaN. Raises ValueError for what is none."""
+    """Return a raw count: a number, also as text and in hex, or NaN. Raises ValueError for anything else."""
     return "NaN" if str(given).strip().lower() in ("nan", ".nan") else whole({key: given}, key)
 
 
 def float_of_bits(bits: int, number: str) -> float | str:
-    """Return the float that these bits of a float format mean, or NaN. Raises ValueError for more bits."""
+    """Return the float with these bits, or "NaN". Raises ValueError for more bits than the format has."""
     code, size = {"F16": (">e", 2), "F32": (">f", 4), "F64": (">d", 8)}[number]
     try:
         (found,) = struct.unpack(code, bits.to_bytes(size))

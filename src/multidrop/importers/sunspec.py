@@ -38,7 +38,7 @@ def is_sunspec(document: Any) -> bool:
 
 
 def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return the model as a device whose block begins at the address 40000, which is to be corrected."""
+    """Return the model as a device whose block starts at the assumed address 40000."""
     group = document["group"]
     title = f"SunSpec model {document.get('id', '')} {group.get('label', group.get('name', ''))}".strip()
     device = ImportedDevice(title)

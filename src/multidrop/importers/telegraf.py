@@ -67,7 +67,7 @@ PLUGIN_KEYS = key_table(
 
 
 class _Field(NamedTuple):
-    """A field of a plugin, and what its place says of it."""
+    """A field of a plugin, with the facts from its place in the file."""
 
     given: Mapping[str, Any]
     style: str
@@ -78,7 +78,7 @@ class _Field(NamedTuple):
 
 
 def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return a device for each slave id of each line. Raises ValueError if there is no field."""
+    """Return a device for each slave id of each line. Raises ValueError for a file without fields."""
     inputs = document.get("inputs")
     plugins = inputs.get("modbus") if isinstance(inputs, dict) else None
     if plugins is None:
@@ -123,7 +123,7 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
         except ValueError as mistake:
             if "$" in controller:  # a variable of its environment
                 return network_settings(None, 502)
-            raise ValueError(f"controller = {controller[:200]!r} is no address: {mistake}") from mistake
+            raise ValueError(f"controller = {controller[:200]!r} is not an address: {mistake}") from mistake
         framing = mode.lower().removesuffix("overtcp")
         is_serial = framing in ("rtu", "ascii")
         return network_settings(

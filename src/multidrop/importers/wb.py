@@ -24,12 +24,12 @@ from multidrop.importers.device import (
 )
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
-# Comments, and a comma before the end of a list: what JSON does not have. Strings are left as they are; what
-# has no end goes to the text's end, so that each character is looked at once.
+# Comments, and a comma before the end of a list, which JSON does not allow. Strings are kept. An unclosed
+# string or comment extends to the end, so that each character is scanned once.
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
 _DEEPEST = 8  # subdevices in subdevices
-PART = "its place in a larger channel"  # the key of a channel's part, beside those of its own
+PART = "its place in a larger channel"  # an extra key of a channel's part
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -201,7 +201,7 @@ def _listed(found: Any) -> list[tuple[str, Any]]:
 
 
 def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield entries, and those of which one consists."""
+    """Yield entries, and the parts of composite ones."""
     for key, entry in listed:
         if isinstance(entry, dict):
             name = str(entry.get("name") or key or entry.get("id") or entry.get("title") or "channel")
@@ -274,7 +274,7 @@ def _number(
 
 
 def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, int] | None) -> tuple[str, str]:
-    """Return the number format, and the part of it that a format or an address with bits is."""
+    """Return the number format, and the part that the format or the address selects."""
     number = _FORMATS[format]
     own = _WIDTHS.get(format, 16 * words_of(number))
     if bits is None and (own == 16 * words_of(number) or number == "I8"):
@@ -310,7 +310,7 @@ def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
 
 
 def _is_plain(register: ImportedRegister) -> bool:
-    """Return True for a number that names can stand for."""
+    """Return True for a number whose counts may have names."""
     is_float = str(register.details.get("number_format", "")).startswith("F")
     return not is_float and not {"step", "offset"} & register.details.keys()
 

@@ -6,17 +6,17 @@ from importlib import import_module
 from typing import Any
 
 MOST_CHARACTERS = 1_000_000
-MOST_NODES = 50_000  # where each alias counts as all that it stands for
+MOST_NODES = 50_000  # an alias counts as its expansion
 
 
 class YamlTag(str):
-    """A value that stands elsewhere or is a program, such as `!secret host`, as it is spelt."""
+    """The spelling of a value with a tag, such as `!secret host`, whose real value is elsewhere."""
 
 
 def parse_yaml(text: str) -> Any:
     """Return the document; a value with a tag such as !secret is a `YamlTag`.
 
-    Raises ImportError without PyYAML, ValueError for what is no YAML, too long, or blown up by aliases.
+    Raises ImportError without PyYAML, ValueError if it is not YAML, too long, or too large with its aliases.
     """
     try:
         yaml: Any = import_module("yaml")
@@ -26,7 +26,7 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(f"has more than {MOST_CHARACTERS} characters of YAML")
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
-        """Counts nodes, and reads no tag."""
+        """Counts nodes, and ignores tags."""
 
         left = MOST_NODES
 
@@ -43,7 +43,7 @@ def parse_yaml(text: str) -> Any:
             return node
 
         def count_again(self, node: Any) -> None:
-            """Count what an alias stands for, as far as there is anything left."""
+            """Count the nodes of an alias's expansion, up to the limit."""
             pending = [node]
             while pending and self.left >= 0:
                 self.left -= 1

@@ -59,9 +59,9 @@ def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[
 @table(
     ("given", "sentence"),
     [
-        (True, "True is no address; write 0x2000"),
-        (1.5, "1.5 is no address; write 0x2000"),
-        ("", '"" is no address; write 0x2000'),
+        (True, "True is not an address; write 0x2000"),
+        (1.5, "1.5 is not an address; write 0x2000"),
+        ("", '"" is not an address; write 0x2000'),
         ("8192", '"8192" may be decimal or hex; write 8192, or "8192H"'),
         (-1, "-1 is outside 0 to FFFFH"),
         (65536, "65536 is outside 0 to FFFFH"),
@@ -101,8 +101,8 @@ def test_a_digit_that_contradicts_its_table() -> None:
         ("1E10", "1E10 is a power of ten, which a spreadsheet makes of hex; write 1E10H"),
         ("1.00E+10", "is a power of ten"),
         ("40001", "40001 may be the number 40001, or register 1 of table holding"),
-        ("4x0001", '"4x0001" is no address'),
-        ("\uff19", "is no address"),
+        ("4x0001", '"4x0001" is not an address'),
+        ("\uff19", "is not an address"),
         ("1" * 400, "is outside 0 to FFFFH"),
     ],
 )

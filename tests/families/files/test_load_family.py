@@ -281,7 +281,7 @@ def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mi
         (HEAD + "[reading]\na = {}\n", ["t.toml: [reading] a: its address is missing; add at = 0x2000"]),
         (
             HEAD + "[reading]\nname = { at = 1 }\n",
-            ["t.toml: [reading] name: this is a name that every drive"],
+            ["t.toml: [reading] name: reserved name; every drive"],
         ),
         (
             HEAD + "[reading]\nclass = { at = 1 }\n",
@@ -314,7 +314,7 @@ def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mi
         ),
         (
             HEAD + "[option]\nconfirmed = { span = [1, 2], meaning = 'm' }\n[reading]\na = { at = 1 }\n",
-            ["[option] confirmed: 'confirmed' cannot be an option's name: every drive has it"],
+            ["[option] confirmed: 'confirmed' cannot be an option's name: reserved name; every drive has it"],
         ),
         (
             HEAD + "gaps = { input = [9, 1] }\n[reading]\na = { at = 1 }\n",
@@ -322,7 +322,7 @@ def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mi
         ),
         (HEAD + "silence = '2 s'\n[reading]\na = { at = 1 }\n", ["silence = '2 s' is more than 1 s"]),
         (HEAD + "response_timeout = '11 s'\n[reading]\na = { at = 1 }\n", ["'11 s' is more than 10 s"]),
-        (HEAD + "[reading]\nstart = { at = 1 }\n", ["[reading] start: this is a name that every drive has"]),
+        (HEAD + "[reading]\nstart = { at = 1 }\n", ["[reading] start: reserved name; every drive has it"]),
         (HEAD + "framings = ['tcp']\n[reading]\na = { at = 1 }\n", ["'tcp' is none of rtu, ascii"]),
         (HEAD + "framings = ['delixi']\n[reading]\na = { at = 1 }\n", ["'delixi' is none of rtu, ascii"]),
         (
@@ -362,9 +362,9 @@ def test_a_mistake_is_told_with_its_place(tmp_path: Path, text: str, told: list[
         (b'name,at,step\na,1,"1.000,5"\n', "column step: '1.000,5' has a decimal comma; write 1000.5"),
         (
             b"name,at,invalid\na,1,7FFF\n",
-            "column invalid: '7FFF' is no number; write it as 0.1, 10 or 0x7FFF",
+            "column invalid: '7FFF' is not a number; write it as 0.1, 10 or 0x7FFF",
         ),
-        (b"name,at,harmless\na,1,1E10\n", "column harmless: '1E10' is no whole number; write 0x1E10"),
+        (b"name,at,harmless\na,1,1E10\n", "column harmless: '1E10' is not a whole number; write 0x1E10"),
         (b"name,at,values\na,1,off\n", "column values: 'off' is no name with its number; write off=0 | on=1"),
         (b"name,at,moves\na,1,maybe\n", "column moves: 'maybe' is neither true nor false"),
         (b'name,at\na,"1\n', "c.csv: line 2: is not CSV: "),
@@ -421,7 +421,7 @@ def test_what_is_no_file(tmp_path: Path) -> None:
 def test_mistakes_are_bounded(tmp_path: Path) -> None:
     text = HEAD + "[reading]\n" + "".join(f"a{number} = 5\n" for number in range(300))
     found = mistakes(tmp_path, text)
-    assert (len(found), found[-1]) == (201, "t.toml: 100 more mistakes are not told; mend these first")
+    assert (len(found), found[-1]) == (201, "t.toml: 100 more mistakes are not shown; correct these first")
 
 
 def test_every_key_is_in_the_reference() -> None:
@@ -450,7 +450,10 @@ def test_texts(tmp_path: Path) -> None:
             "in holding or input registers, and 'coil' is neither",
         ),
         ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
-        ("name = { at = 1, length = 2 }", "[text] name: every drive has this name for something else"),
+        (
+            "name = { at = 1, length = 2 }",
+            "[text] name: reserved name; every drive has it for something else",
+        ),
     ],
 )
 def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:

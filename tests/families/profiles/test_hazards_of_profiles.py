@@ -192,7 +192,7 @@ def test_a_reset_without_a_fault_sends_nothing(line: Line) -> None:
 def test_a_fault_that_stands_is_told(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.sim.trip(FAULT)
     monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
-    with pytest.raises(NotVerified, match="the fault stands"):
+    with pytest.raises(NotVerified, match="the fault remains"):
         line.drive.reset_fault()
     assert not line.starts
 

@@ -93,7 +93,7 @@ def test_all_mistakes_of_a_family_are_told_at_once() -> None:
         "status: it is one word of bits, without a unit and a step",
         "reference: its unit is 'rpm'; this profile takes 'Hz' or '%'",
         "reference: a reference below 0 may turn the motor the other way; its span begins at 0",
-        "stop_word: this is a name that every profile has for something else; call it otherwise",
+        "stop_word: reserved name; every profile has it for something else; rename the register",
         "reset: this profile needs a register of this name, which is not declared",
         "output_frequency: this profile needs a register of this name, which is not declared",
         "fault: this profile needs a register of this name, which is not declared",

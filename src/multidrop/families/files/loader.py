@@ -1,4 +1,4 @@
-"""Load a family from its file: every mistake is found before anything is made of it. No code is executed."""
+"""Load a family from its file, after checking the whole file. No code is executed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _loaded: dict[Path, _Loaded] = {}
 def load_family(path: Path | str) -> type[Drive]:
     """Return the family that a TOML file declares: a subclass of `Drive`.
 
-    The same file is the same class as long as what it says stays the same. Its `model` is the file's name.
+    The same file gives the same class until its contents change. Its `model` is the file's name.
     Raises FamilyError with all that is wrong with the file, and with the CSV files that it names.
     """
     path = Path(path)
@@ -82,7 +82,7 @@ def _same(file: Path, data: bytes) -> bool:
 
 
 def _bytes(path: Path, what: str) -> bytes:
-    """Return a file's bytes; ValueError, without the path, for what is no file or too long."""
+    """Return a file's bytes. Raises ValueError, without the path, if it is missing or too long."""
     try:
         if not path.is_file():
             other = "is no file, but a directory or a device; name a file" if path.exists() else ""
@@ -100,7 +100,7 @@ def _at_most(place: TomlPlace) -> tuple[str, ...]:
     left = len(place.config_errors) - MOST_MISTAKES
     if left > 0:
         del place.config_errors[MOST_MISTAKES:]
-        place.wrong(f"{left} more mistakes are not told; mend these first")
+        place.wrong(f"{left} more mistakes are not shown; correct these first")
     return tuple(place.config_errors)
 
 
@@ -110,7 +110,7 @@ def _at_most(place: TomlPlace) -> tuple[str, ...]:
 def _family(
     document: Mapping[str, Any], path: Path, place: TomlPlace, files: dict[Path, bytes]
 ) -> type[Drive] | None:
-    """Return the class; None where anything is wrong."""
+    """Return the class; None if the file has an error."""
     if "line" in document:
         place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE")
         return None
@@ -135,7 +135,7 @@ def _family(
     if not declared.places and not document.get("text") and not given.get("registers"):
         place.wrong("declares no register; add [reading] and NAME = { at = 0x0010 }")
     if len(declared.places) > MOST_REGISTERS:
-        place.wrong(f"declares more than {MOST_REGISTERS} registers; leave out those that nobody reads")
+        place.wrong(f"declares more than {MOST_REGISTERS} registers; remove unused ones")
         return None
     namespace: dict[str, Any] = {
         "__module__": __name__,
@@ -212,23 +212,23 @@ def _named_bytes(table: Path) -> bytes:
 def _made(
     base: type[Drive], namespace: dict[str, Any], declared: Declared, place: TomlPlace
 ) -> type[Drive] | None:
-    """Return the class of this namespace; None where anything in the file is wrong."""
+    """Return the class of this namespace; None if the file has an error."""
     broken = declared.places.keys() - declared.registers.keys()
     if place.config_errors:
         bounds = {*namespace["options"], *broken}
-        _tell(declaration_errors(declared.registers, TAKEN_NAMES, bounds), declared, place)
+        _report(declaration_errors(declared.registers, TAKEN_NAMES, bounds), declared, place)
         roles = getattr(base, "role_mistakes", None)
         mistakes = roles(declared.registers) if roles else []
-        _tell([one for one in mistakes if one.partition(":")[0] not in broken], declared, place)
+        _report([one for one in mistakes if one.partition(":")[0] not in broken], declared, place)
         return None
     try:
         return type(_class_name(place.path), (base,), namespace)
     except DeclarationError as wrong:
-        _tell(wrong.mistakes, declared, place)
+        _report(wrong.mistakes, declared, place)
         return None
 
 
-def _tell(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
+def _report(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
     """Report mistakes of declarations at the places of their registers."""
     for mistake in mistakes:
         name, _, sentence = mistake.partition(": ")

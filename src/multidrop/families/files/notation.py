@@ -23,22 +23,22 @@ _EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+", re.ASCII)
 
 @dataclass(frozen=True)
 class Counting:
-    """The number that the manual gives to the address 0 of the wire; None where the file does not say.
+    """The manual's number for address 0 on the wire; None if the file does not state it.
 
-    `assumed` has the numbers for which 0 was assumed, so that their other mistakes are found.
+    `assumed` lists the numbers for which 0 was assumed, so that their other errors are found.
     """
 
     counts_from: int | None
     assumed: list[int | str] = field(default_factory=list)
 
     def address(self, given: Any, table: str | None, default: str) -> tuple[int, str]:
-        """Return the address on the wire, and the table's name, of a value of TOML.
+        """Return the address on the wire, and the table's name, for a TOML value.
 
-        `table` is what the register says of itself, `default` what holds where it says nothing. Raises
-        ValueError with what would be right.
+        `table` is the register's own table, `default` the table without one. Raises ValueError with a valid
+        example.
         """
         if isinstance(given, bool) or not isinstance(given, (int, str)):
-            raise ValueError(f'{given!r} is no address; write 0x2000, 8192, "2000H" or "40001"')
+            raise ValueError(f'{given!r} is not an address; write 0x2000, 8192, "2000H" or "40001"')
         if isinstance(given, int):
             return self._number(given, table or default), table or default
         text = given.strip()
@@ -48,12 +48,12 @@ class Counting:
             return _numbered(text, table)
         if text.isascii() and text.isdecimal():
             raise ValueError(f'"{text}" may be decimal or hex; write {int(text[:12])}, or "{text}H"')
-        raise ValueError(f'"{text}" is no address; write 0x2000, 8192, "2000H" or "40001"')
+        raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Return the same of a cell of a CSV file, in which a number of 40001's kind has no quotes.
+        """Return the same for a cell of a CSV file, in which a number such as 40001 has no quotes.
 
-        Where the file says `counts_from`, it is a number unless its digit names the table it is in.
+        If the file states `counts_from`, it is a plain number, unless its first digit is its table's.
         """
         text = text.strip()
         if text.isascii() and text.isdecimal():
@@ -85,7 +85,7 @@ class Counting:
 
 
 def sent_as(address: int, table: str) -> str:
-    """Return the TOML of an address that is sent as it is, where `counts_from` is 0."""
+    """Return the TOML for an address on the wire, with `counts_from = 0`."""
     is_plain = not _NUMBERED.fullmatch(str(address)) or _TABLE_OF_DIGIT[str(address)[0]] != table
     return f"0x{address:04X}" if is_plain else f'"{address:X}H"'
 
@@ -123,7 +123,7 @@ def text(cell: str) -> str:
 
 
 def number(cell: str) -> int | float:
-    """Return a number with a point, or in hex. Raises ValueError with what would be right."""
+    """Return a number with a point, or in hex. Raises ValueError with a valid example."""
     if match := _HEX_COUNT.fullmatch(cell):
         return int(match[1] or match[2], 16)
     if _WHOLE.fullmatch(cell) and len(cell) <= 20:
@@ -132,7 +132,7 @@ def number(cell: str) -> int | float:
         return float(cell)
     if "," in cell and (_NUMBER.fullmatch(point := cell.replace(".", "").replace(",", "."))):
         raise ValueError(f"{cell!r} has a decimal comma; write {point}")
-    raise ValueError(f"{cell!r} is no number; write it as 0.1, 10 or 0x7FFF")
+    raise ValueError(f"{cell!r} is not a number; write it as 0.1, 10 or 0x7FFF")
 
 
 def number_or_word(cell: str) -> int | float | str:
@@ -146,10 +146,10 @@ def numbers(cell: str) -> list[int | float | str]:
 
 
 def whole(cell: str) -> int:
-    """Return a whole number; 1E10 may have been hex before a spreadsheet had it."""
+    """Return a whole number; refuse 1E10, which may have been hex before a spreadsheet changed it."""
     if _NUMBER.fullmatch(cell) and not _WHOLE.fullmatch(cell):
         right = f"0x{cell}" if cell.isalnum() else "it as 10 or 0x7FFF"
-        raise ValueError(f"{cell!r} is no whole number; write {right}")
+        raise ValueError(f"{cell!r} is not a whole number; write {right}")
     found = number(cell)
     if not isinstance(found, int):
         raise ValueError(f"{cell!r} has too many digits")
@@ -162,7 +162,7 @@ def counts(cell: str) -> list[int]:
 
 
 def named(cell: str) -> dict[str, Any]:
-    """Return the numbers by name in "off=0 | on=1". Raises ValueError with what would be right."""
+    """Return the numbers by name in "off=0 | on=1". Raises ValueError with a valid example."""
     found: dict[str, Any] = {}
     for part in cell.split("|"):
         name, equals, given = (piece.strip() for piece in part.partition("="))

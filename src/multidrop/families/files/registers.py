@@ -38,7 +38,7 @@ OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "na
 
 
 def unusable(name: str) -> str:
-    """Return why a name cannot be an attribute in Python, with one that can; "" where it can."""
+    """Return why a name cannot be a Python attribute, with a valid one; "" if it can."""
     if len(name) > LONGEST_NAME:
         return f"it has more than {LONGEST_NAME} characters; give it a shorter one"
     if keyword.iskeyword(name):
@@ -104,7 +104,7 @@ _KEPT = {"ram": Kept.RAM, "eeprom": Kept.EEPROM, NOT_STATED: Kept.UNKNOWN}
 
 @dataclass(frozen=True)
 class RegisterKey:
-    """One key: it raises ValueError for what it does not take, and `example` is what it does."""
+    """One key: `convert` raises ValueError for an invalid value; `example` is a valid one."""
 
     convert: Callable[[Any], Any]
     example: str
@@ -235,7 +235,7 @@ DEFAULT_KEYS = ("table", "unit", "step", "number_format", "order", "invalid", "w
 
 
 def converted(key: str, value: Any) -> Any:
-    """Return what the key's value becomes. Raises ValueError with what was wrong and what would be right."""
+    """Return the converted value of a key. Raises ValueError with the error and a valid example."""
     try:
         return REGISTER_KEYS[key].convert(value)
     except ValueError as mistake:
@@ -243,7 +243,7 @@ def converted(key: str, value: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """Return a value as a sentence shows it."""
+    """Return a value for an error sentence."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -302,12 +302,12 @@ class Declared:
             self.registers[name] = register
 
     def _reserve(self, name: str, place: TomlPlace) -> bool:
-        """Note the name's place; False where it cannot be used."""
+        """Record the name's place; return False if it cannot be used."""
         if why := unusable(name):
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
             return False
         if name in TAKEN_NAMES:  # a verb of the file would take its place without a word
-            place.wrong("this is a name that every drive has for something else; call it otherwise")
+            place.wrong("reserved name; every drive has it for something else; rename the register")
             return False
         if name in self.places:
             first = self.places[name]
@@ -393,7 +393,7 @@ def _made(access: Access, address: int, what: Any, details: dict[str, Any]) -> R
 
 
 def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
-    """Return what holds for the registers that say nothing else."""
+    """Return the defaults of registers."""
     if not isinstance(table, dict):
         place.wrong('is no table; write [default] and table = "input"')
         return {}
@@ -432,7 +432,7 @@ def declare_rows(data: bytes, declared: Declared, place: TomlPlace) -> None:
     for number, cells in rows:
         _declare(columns, cells, declared, place.within(f"line {number}"))
         if len(declared.places) > MOST_REGISTERS:
-            place.wrong(f"has more than {MOST_REGISTERS} registers; leave out those that nobody reads")
+            place.wrong(f"has more than {MOST_REGISTERS} registers; remove unused ones")
             return
 
 
@@ -466,7 +466,7 @@ def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
-    """Return the columns' names; None where they are wrong."""
+    """Return the columns' names; None if any is wrong."""
     columns = [name.lower().replace(" ", "_") for name in header]
     while columns and not columns[-1]:  # of a spreadsheet with an empty column
         columns.pop()

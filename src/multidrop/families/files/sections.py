@@ -208,7 +208,7 @@ _OPTION_KEYS = {
     "span": Key(list, "span = [1, 600]", needed=True),
     "meaning": Key(str, 'meaning = "parameter 1105, of which 20000 is 100 %"', needed=True),
 }
-# What a drive in a plant file, and its class, have for something else.
+# Reserved names: keys of a drive in a plant file, and options of its class.
 _NOT_OPTIONS = frozenset(
     {"name", "model", "address", "framing", "baudrate", "format", "silence", "ram", "every", "poll"}
     | {"confirmed"}
@@ -225,9 +225,8 @@ def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict
         at = place.within(f"[option] {name[:60]}")
         why = unusable(name)
         if why or name in _NOT_OPTIONS:
-            at.wrong(
-                f"{shown(name)} cannot be an option's name: {why or 'every drive has it for something else'}"
-            )
+            reason = why or "reserved name; every drive has it for something else"
+            at.wrong(f"{shown(name)} cannot be an option's name: {reason}")
         if name in registers:
             at.wrong("a register has this name too; call one of the two otherwise")
         good = at.check(given, _OPTION_KEYS)
@@ -270,7 +269,7 @@ def texts_of(
         if why:
             at.wrong(f"{shown(name)} cannot be a text's name: {why}")
         elif name in TAKEN_NAMES:
-            at.wrong("every drive has this name for something else; call it otherwise")
+            at.wrong("reserved name; every drive has it for something else; rename the text")
         elif name in registers:
             at.wrong("a register has this name too; call one of the two otherwise")
         declared = _text(at.check(given, TEXT_KEYS), counting, at)

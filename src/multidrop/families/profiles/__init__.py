@@ -1,7 +1,7 @@
 """Profiles: state machines that many makes share; a family adds the addresses of its registers.
 
-A family is a class that derives from one of these and declares the registers that the profile names, or a
-file with `profile = "…"`.
+A family is a class that derives from a profile and declares its registers, or a file with
+`profile = "…"`.
 """
 
 from collections.abc import Mapping

@@ -47,7 +47,7 @@ class CiA402Status(IntFlag):
 
 
 DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE, RESET = 0x0000, 0x0006, 0x0007, 0x000F, 0x0087
-MASK, SHORT_MASK = 0x6F, 0x4F  # the bits that tell the states; without the quick stop's
+MASK, SHORT_MASK = 0x6F, 0x4F  # the bits of the state; without the quick stop's
 NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08  # under the short mask
 READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07  # under the mask
 _UP = ((SHUTDOWN, READY, "ready to be switched on"), (SWITCH_ON, SWITCHED_ON, "switched on"))
@@ -59,7 +59,7 @@ class CiA402(Profile):
     - The stop is "disable operation", 0007H, whose factory setting is the ramp, and which never starts: a
       drive that is ready to be switched on is switched on by it and stands. "Shutdown", 0006H, coasts or
       ramps by each drive's setting.
-    - The reset is 0080H with 0007H; without bit 3 it enables nothing.
+    - The reset is 0080H with 0007H; without bit 3 it does not enable operation.
     - The standard has no direction for frequency drives. A family may declare a bit of its own,
       `bits = { reverse = 11 }`; without it a direction is refused.
     - The remote bit 9 must be set, which says that the drive takes the word from the line.

@@ -64,9 +64,9 @@ class Delta(Profile):
       warning.
     - The direction is sent with every run, and the toggle of both bits never.
     - 2002H holds its bits. It is written 2 once and 0 again, or a later fault would reset itself. Bit 2, the
-      base block, lets the motor go on where it was when it is taken back: a stop comes before.
+      base block, lets the motor continue when it is cleared: a stop comes before.
     - Bit 10 of the status says that the drive takes its commands from the line; a start needs it.
-    - There is no word that coasts.
+    - No word coasts.
     """
 
     stop_word: ClassVar[int] = DeltaControl.STOP

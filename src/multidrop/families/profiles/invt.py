@@ -49,9 +49,8 @@ class Invt(Profile):
 
     - Other makes have copied the words with 5 and 6 the other way round (both stop), and some with 5 for
       reverse: compare the manual's list with `InvtControl`, word by word, before a family is declared.
-    - A stop may not end a jog, nor may a start: where the motor still turns after it, or the stop is refused,
-      or nobody says that it stands, STOP_JOG follows at once; one that was jogged is to be stopped before a
-      start.
+    - A stop may not end a jog: if the motor still turns after it, the stop is refused, or the state is
+      unknown, STOP_JOG follows at once. A start may not end a jog either: after a jog a stop is required.
     """
 
     stop_word: ClassVar[int] = InvtControl.STOP
@@ -116,15 +115,15 @@ class Invt(Profile):
             may_jog = self._turns((yield from self._status()))
         except WriteForbidden:  # another drive is there
             raise
-        except BusError:  # one that is not heard may hear, and jog
+        except BusError:  # a silent drive may still hear, and jog
             with suppress(BusError):
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
             raise
         if may_jog:
-            with suppress(DriveException):  # there may be no jog to stop
+            with suppress(DriveException):  # as without a jog
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG))
         yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
-        """Do nothing: a word is carried out when it comes, and is not held."""
+        """Send no word: the drive acts on a word when it arrives, and does not hold it."""
         yield from ()

@@ -63,7 +63,7 @@ class Profidrive(Profile):
     refused.
 
     - The stop is 047EH, OFF1 alone: bit 3, which the manual's first word lacks too, would let the motor
-      coast where it carries the run enable (ACS550, 1601 = COMM).
+      coast if it carries the run enable (ACS550, 1601 = COMM).
     - The direction is the sign of the reference, or a bit that each make has elsewhere (SINAMICS has bit 11;
       on an ABB this bit selects EXT2). References are written from 0 up, and a start names no direction.
     - A jog is each make's own, and is not sent.

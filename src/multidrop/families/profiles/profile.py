@@ -41,19 +41,19 @@ class Role:
     harmless: tuple[int, ...] | None = None
     never_together: tuple[int, ...] = ()
     moves: bool | None = None
-    units: tuple[str, ...] = ()  # any where there are none
+    units: tuple[str, ...] = ()  # empty: any
     extra: tuple[str, ...] = ()
     needed: bool = True
 
     @property
     def is_word(self) -> bool:
-        """True where the state machine looks at bits or words rather than at a quantity."""
+        """True if the state machine uses its bits or words, not a quantity."""
         return self.values is not None
 
 
 READING = Role((Access.READING,))
 OPTIONAL = Role((Access.READING,), needed=False)
-PROOFS = ("station", "signature")  # roles that only tell the family
+PROOFS = ("station", "signature")  # roles that only identify the family
 COMMON: Mapping[str, Role] = {  # of all profiles, besides `control` and `status`
     "reference": Role((Access.SETTING, Access.COMMAND), moves=False, units=("Hz", "%")),
     "output_frequency": READING,
@@ -66,11 +66,11 @@ COMMON: Mapping[str, Role] = {  # of all profiles, besides `control` and `status
 def own_errors(
     name: str, register: Register[Any], roles: Mapping[str, Role], taken: Collection[str]
 ) -> Iterator[str]:
-    """Find what is wrong with a family's register; `taken` are names that a profile has already."""
+    """Find errors in a family's register; `taken` are the reserved names of profiles."""
     if name in roles:
         yield from role_errors(name, roles[name], register)
     elif name in taken:
-        yield f"{name}: this is a name that every profile has for something else; call it otherwise"
+        yield f"{name}: reserved name; every profile has it for something else; rename the register"
     elif register.harmless:
         yield f"{name}: harmless counts are those of its control, which the profile says; leave it out"
     if name == "reference" and register.span is not None and register.span[0] < 0:
@@ -95,7 +95,7 @@ def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iter
 
 
 def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
-    """Find what a family says of a role that it may not say, or must say differently."""
+    """Find facts of a role that the family must leave out or declare differently."""
     if register.access not in role.access:
         wanted = " or a ".join(access.value for access in role.access)
         yield f"{name}: in this profile it is a {wanted}, and not a {register.access.value}"
@@ -142,7 +142,7 @@ def _extra_errors(name: str, role: Role, extra: type[Any]) -> Iterator[str]:
 
 
 def completed(role: Role, register: Register[Any]) -> Register[Any]:
-    """Return the family's declaration with what the profile says of this role."""
+    """Return the family's declaration, completed by the profile's facts of the role."""
     facts: dict[str, Any] = {"moves": role.moves}
     if role.values is not None:
         facts["values"] = _with_extra(role.values, register.values)
@@ -170,19 +170,19 @@ class Profile(Drive):
     A role is a register with a fixed name. The family says its address, table, unit, step, memory and place
     in the manual; the profile says its bits, and which of its counts are harmless. Every profile has these:
 
-    - `control` (a command), `status` (a reading), `reference` (a setting, or a command where it cannot be
+    - `control` (a command), `status` (a reading), `reference` (a setting, or a command if it cannot be
       read), in Hz, or in % of the option `maximum_frequency`; `output_frequency` (a reading);
-    - `fault` (a reading, not needed): shown by its names where it has some;
+    - `fault` (a reading, not needed): shown by its names if it has any;
     - `reference_in_force` (a reading, not needed): the setpoint as the drive shows it;
     - `station` (a reading, not needed): a drive of the family has its own address there;
-    - `signature` (a reading of named values, not needed): a drive of the family has one of these there.
+    - `signature` (a reading of named values, not needed): each drive of the family has one of the values.
 
-    The verbs guarantee what the built-in families' verbs do. A stop is sent always, repeated until it is
-    confirmed, and watched until the drive stands. A start or a reset is written once. A start is refused in a
-    fault, in local control, and without a setpoint in force; a reset is refused while the motor turns, never
-    has a bit that runs it, and comes after a stop. `identify` only reads. A stop is withheld because of it
-    only if the status is another profile's, and `station` or `signature` another drive's: these two are
-    settings, and may not be in force yet.
+    The verbs guarantee the same as those of the built-in families. A stop is always sent, repeated until it
+    is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is
+    refused in a fault, in local control, and without a setpoint in force. A reset is refused while the
+    motor turns, never has a bit that runs it, and comes after a stop. `identify` only reads. It withholds a
+    stop only if the status is another profile's, and `station` or `signature` another drive's: these two
+    are settings, and may not be in force yet.
     """
 
     roles: ClassVar[Mapping[str, Role]] = {}
@@ -225,62 +225,62 @@ class Profile(Drive):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """Return the registers that are polled by default: not those that only tell the family."""
+        """Return the registers that are polled by default: not those that only identify the family."""
         return tuple(one for one in super().readings() if one.name not in PROOFS)
 
     # ---- for each profile ----
 
     def _impossible(self, status: int) -> str:
-        """Return the reason why no drive of this profile shows this status; empty where one may."""
+        """Return why no drive of this profile can show this status; "" if one can."""
         return ""
 
     def _is_tripped(self, status: int) -> bool:
         raise NotImplementedError
 
     def _turns(self, status: int) -> bool:
-        """Return True where the status says that the motor gets voltage."""
+        """Return True if the status says that the motor gets voltage."""
         raise NotImplementedError
 
     def _not_ready(self, status: int) -> str:
-        """Return the reason why it cannot be started from the line; empty where it can."""
+        """Return why the drive cannot be started from the line; "" if it can."""
         return ""
 
     def _cannot_reset(self, status: int) -> str:
-        """Return the reason why a reset would do nothing, or harm; empty where it may be sent."""
+        """Return why a reset would be useless or harmful; "" if it may be sent."""
         return ""
 
     def _direction(self, status: int) -> Direction | None:
-        """Return the direction that the status shows, None where it shows none."""
+        """Return the direction that the status shows; None if it shows none."""
         return None
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         raise NotImplementedError
 
     def _prepare(self, status: int) -> Script[None]:
-        """Bring the drive to where the start word starts it, without moving the motor."""
+        """Prepare the drive for the start word, without moving the motor."""
         yield from ()
 
     def _condition(self, status: int) -> Condition:
         """Return the condition of a drive that has no fault, by its status alone."""
         return Condition.RUNNING if self._turns(status) else Condition.STOPPED
 
-    # ---- looks ----
+    # ---- readings ----
 
     def _status(self) -> Script[int]:
         return int((yield from read(self.status)))
 
     def _fault(self) -> Script[str]:
-        """Return the fault in words, empty where the family has no register for it."""
+        """Return the fault in words; "" if the family has no register for it."""
         register = self.registers.get("fault")
         return "" if register is None else register.format((yield from read(register)))
 
     def _tripped(self, status: int) -> Script[bool]:
-        """Return True where the drive has a fault; most show it in their status."""
+        """Return True if the drive has a fault; most show it in their status."""
         return self._is_tripped(status)
         yield
 
     def _stands(self) -> Script[bool]:
-        """Return True where neither the status nor the output frequency shows that the motor turns."""
+        """Return True if neither the status nor the output frequency shows that the motor turns."""
         status = yield from self._status()
         if self._turns(status) and not (yield from self._tripped(status)):
             return False
@@ -296,7 +296,7 @@ class Profile(Drive):
         if held == 0:
             why = f"the setpoint of {self.name} is 0:"
         elif held != self.commanded and not self.reference.readable:
-            why = f"{self.name} follows {shown.format(held)}, which is not what it was told;"
+            why = f"{self.name} follows {shown.format(held)}, not the setpoint that was written;"
         else:
             return
         raise WriteForbidden(f"{why} call set_frequency before start", advice=Advice.call("set_frequency"))
@@ -338,7 +338,7 @@ class Profile(Drive):
         yield from self._started(direction)
 
     def _may_start(self, status: int) -> Script[None]:
-        """Raise WriteForbidden in a fault, in local control, and where the status shows another hindrance."""
+        """Raise WriteForbidden in a fault, in local control, and if the status prevents a start."""
         if (yield from self._tripped(status)):
             raise self._reset_first((yield from self._fault()))
         if why := self._not_ready(status):
@@ -356,12 +356,12 @@ class Profile(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; it has happened when the status says so and the output frequency is 0."""
+        """Stop along the ramp, until the status says so and the output frequency is 0."""
         yield from self._stop_by(self.stop_word)
 
     @verb
     def coast(self) -> Script[None]:
-        """Take the voltage off and let the motor run out."""
+        """Remove the voltage and let the motor coast."""
         if self.coast_word is None:
             raise self._unsupported("coast command")
         yield from self._stop_by(self.coast_word)
@@ -373,7 +373,7 @@ class Profile(Drive):
     def _send_stop(self, word: int) -> Script[None]:
         try:
             yield from insist(self.control, self._word(word))
-        except DriveException:  # as some do in a fault, in which they stand already
+        except DriveException:  # as some do in a fault, when already at rest
             if not (yield from self._stands()):
                 raise
 
@@ -385,7 +385,7 @@ class Profile(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault after a stop was commanded; never starts the motor. Sent once, then looked at."""
+        """Reset a fault after a stop; never starts the motor. It is sent once, then verified."""
         status = yield from self._status()
         if not (yield from self._tripped(status)):
             if not (yield from self._stands()):
@@ -393,14 +393,14 @@ class Profile(Drive):
             return
         if why := self._cannot_reset(status):
             raise WriteForbidden(f"{self.name} {why}")
-        yield from insist(self.control, self._word(self.stop_word))  # no run command outlasts the fault
+        yield from insist(self.control, self._word(self.stop_word))  # no run command may outlast the fault
         yield from self._pulse()
         if not (yield from until(self._is_reset, limit=RESET_TIME)):
             fault = (yield from self._fault()) or "it shows a fault"
-            raise NotVerified(self.name, "the fault reset", f"the fault stands: {fault}")
+            raise NotVerified(self.name, "the fault reset", f"the fault remains: {fault}")
 
     def _pulse(self) -> Script[None]:
-        """Write the reset once, and take its bit back, so that it resets no later fault by itself."""
+        """Write the reset once, then clear its bit, so that it cannot reset a later fault."""
         register: Register[Any] = self.register(self.reset_role)
         assert register.values is not None
         try:
@@ -433,7 +433,7 @@ class Profile(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Report the condition by the status, the direction where it is shown, and the fault by name."""
+        """Return the condition, the direction if it is shown, and the fault by name."""
         status = yield from self._status()
         direction = self._direction(status)
         if (yield from self._tripped(status)):
