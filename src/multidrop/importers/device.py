@@ -96,7 +96,7 @@ _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 
 
 class Treatment(Enum):
-    """How the importer treats a key of the source's schema."""
+    """The treatment of a key of the source's schema."""
 
     CARRIED = "the importer reads it"
     IRRELEVANT = "it changes no value"
