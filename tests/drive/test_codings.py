@@ -286,7 +286,7 @@ def test_a_field_may_have_names() -> None:
 @settings(max_examples=examples(300))
 @given(numbers().filter(lambda case: case[0] not in DIGITS), st.data())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 2), None)
-def test_an_invalid_count_is_no_value_and_its_neighbour_is_one(
+def test_invalid_count_has_no_value(
     case: tuple[NumberFormat, str, float, float, float], data: st.DataObject | None
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -331,7 +331,7 @@ def test_an_invalid_count_is_no_value_and_its_neighbour_is_one(
         (NumberFormat.I16, (0, 3), -8, "00 08"),
     ],
 )
-def test_what_means_no_value(number_format: NumberFormat, part: Any, invalid: Any, wire: str) -> None:
+def test_counts_that_mean_no_value(number_format: NumberFormat, part: Any, invalid: Any, wire: str) -> None:
     data = bytes.fromhex(wire)
     register = reading(7, table=INPUT, number_format=number_format, part=part, invalid=invalid)
     family = declared(level=register)
@@ -342,7 +342,7 @@ def test_what_means_no_value(number_format: NumberFormat, part: Any, invalid: An
     assert register.value_in(other, 0) is not None
 
 
-def test_a_register_without_a_value_is_told_by_the_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_raises_no_value_for_an_invalid_count(monkeypatch: pytest.MonkeyPatch) -> None:
     family = declared(
         level=reading(0, "m", invalid=0x7FFF),
         speed=reading(1, "rpm"),

@@ -49,7 +49,7 @@ class Noting(Drive):
         return STANDS if self.zeros > 1 else RUNS
 
 
-def test_equal_values_are_one_look() -> None:
+def test_equal_values_are_computed_once() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     for temperature in range(5):
@@ -62,7 +62,7 @@ def test_equal_values_are_one_look() -> None:
     assert Counting.looks[-1] == 25.0
 
 
-def test_a_value_that_is_no_number_is_no_equal() -> None:
+def test_nan_is_never_equal() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     assert [reader.state({"speed": math.nan}) for _ in range(2)] == [RUNS, RUNS]

@@ -84,7 +84,7 @@ def written(line: SimulatedBus) -> list[str]:
     return [frame[:17] for frame in line.written]
 
 
-def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plain_setting_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(Fan(1)))
     fan = line.attach(Fan(1))
     assert fan.write(fan.frequency, 25.0) == 25.0
@@ -93,7 +93,7 @@ def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
 @pytest.mark.parametrize("word", Word)
-def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
+def test_command_is_left_to_verbs_by_default(
     monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
@@ -107,7 +107,7 @@ def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
     assert line.frames == []
 
 
-def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     class Bare(Drive):
         """Has a command and nothing else."""
 
@@ -123,7 +123,7 @@ def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pyte
     assert line.frames == []
 
 
-def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_harmless_counts_need_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stoppable(Pump):
         """Its author says what is harmless."""
 
@@ -138,9 +138,7 @@ def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
-def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_moving_an_unidentified_drive_needs_confirmation(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     def command_it(line: SimulatedBus, pump: Pump) -> None:
         acts = {
             "start": pump.start,
@@ -164,7 +162,7 @@ def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
 
 
 @pytest.mark.parametrize("name", ["start_staggered", "ramp", "run_at"])
-def test_nor_is_it_commanded_by_what_is_made_of_verbs(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_ramps_and_sequences_need_confirmation_too(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     class Combined(Pump):
         """Its author has made one verb of two."""
 
@@ -211,7 +209,7 @@ def test_stop_all_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None
     assert written(line) == [STOP]
 
 
-def test_a_class_that_says_what_it_is_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_class_with_identify_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "confirmed" in Pump.options
     line = SimulatedBus(monkeypatch, simulated(Known(1)))
     line.attach(Known(1)).start()
@@ -223,7 +221,7 @@ def acknowledged(request: Message) -> bytes | None:
     return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # the CRC by pymodbus
 
 
-def test_what_is_still_under_way_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_in_flight_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exception 05: the server has accepted the request and is processing it (V1.1b3, section 7)."""
     line = SimulatedBus(monkeypatch, simulated(Known(1)))
     drive = line.attach(Known(1))
@@ -246,7 +244,7 @@ def test_a_drive_s_own_meaning_of_05_is_a_refusal(monkeypatch: pytest.MonkeyPatc
         drive.start()
 
 
-def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_setting_may_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     class Readable(Drive):
         """Its control word can be read."""
 

@@ -73,7 +73,7 @@ def test_an_enumeration_decodes_to_its_member_and_a_stranger_to_its_number() -> 
         (Example.choice, 1.5, ValueError),
     ],
 )
-def test_what_a_register_does_not_take(
+def test_values_that_a_register_refuses(
     register: Register[Any], value: object, error: type[Exception]
 ) -> None:
     with pytest.raises(error, match=register.name):
@@ -136,6 +136,6 @@ def test_an_address_outside_the_protocol_is_refused() -> None:
 
 @table("number", [10**400, -(10**400), 1 << 64])
 @table("name", ["current", "energy", "frequency", "choice", "unknown"])
-def test_a_number_that_no_float_can_hold_is_refused(name: str, number: int) -> None:
+def test_number_too_large_for_a_float_is_refused(name: str, number: int) -> None:
     with pytest.raises(ValueError, match=rf"^{name} "):
         Example.register(name).encode(number)

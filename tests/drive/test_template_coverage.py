@@ -68,7 +68,7 @@ def shares(coverage: Any) -> dict[str, tuple[int, int]]:
     }
 
 
-def test_what_a_template_needs_is_held(bench: Any, tmp_path: Path) -> None:
+def test_every_key_of_a_template_is_carried(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "all.json").write_text(wb(HELD))
     coverage = covered(bench, tmp_path)
     whole = (len(HELD), len(HELD))
@@ -92,7 +92,7 @@ def test_what_a_template_needs_is_held(bench: Any, tmp_path: Path) -> None:
     }
 
 
-def test_what_lacks_is_counted_with_its_reason(bench: Any, tmp_path: Path) -> None:
+def test_missing_facts_are_counted_with_their_reasons(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "some.json").write_text(wb([*HELD, *READ_ONLY, *LACKING, *LACKING]))
     (tmp_path / "more.json").write_text(wb(LACKING[:1]))
     whole = len(HELD) + 1 + 2 * len(LACKING) + 1
@@ -129,14 +129,14 @@ def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: P
     }
 
 
-def test_entries_that_are_held_apart_and_not_together_are_told(bench: Any, tmp_path: Path) -> None:
+def test_entries_that_no_single_class_holds_are_reported(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
     coverage = covered(bench, tmp_path)
     assert (coverage.whole, coverage.refused.total()) == (0, 1)
     assert "is written at the same address" in next(iter(coverage.refused))
 
 
-def test_other_protocols_and_files_that_are_none_are_left_out(bench: Any, tmp_path: Path) -> None:
+def test_other_protocols_and_invalid_files_are_left_out(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "modbus.json").write_text(wb(HELD[:1]))
     (tmp_path / "other.json").write_text(wb(HELD[:1], protocol="uniel"))
@@ -219,7 +219,7 @@ def test_the_script_prints_its_tables(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "sentence"), [("none", "is no folder"), (".", "has no template")])
-def test_a_folder_without_templates_is_told(tmp_path: Path, folder: str, sentence: str) -> None:
+def test_folder_without_templates_is_reported(tmp_path: Path, folder: str, sentence: str) -> None:
     command = [*SCRIPT, str(tmp_path / folder)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stdout) == (2, "")

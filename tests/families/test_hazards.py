@@ -475,7 +475,7 @@ class Mine(InvtCHE):
 
 
 @pytest.mark.parametrize("hazard", HAZARDS, ids=lambda each: each.place)
-def test_the_safe_thing_is_sent_or_nothing(monkeypatch: pytest.MonkeyPatch, hazard: Hazard) -> None:
+def test_only_the_safe_frames_are_sent(monkeypatch: pytest.MonkeyPatch, hazard: Hazard) -> None:
     line, drive, sim = one(monkeypatch, hazard.drive())
     for name, value in hazard.shows.items():
         sim[name] = value
@@ -516,7 +516,7 @@ def test_e1_the_checksum_is_computed_and_not_copied(monkeypatch: pytest.MonkeyPa
     assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
 
 
-def test_e2_a_reply_with_another_byte_count_is_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_e2_reply_with_another_byte_count_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03"
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     line.answers = lambda request: bytes.fromhex(printed)
@@ -525,7 +525,7 @@ def test_e2_a_reply_with_another_byte_count_is_no_reply(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("code", [2, 3, 4])
-def test_e12_no_bad_address_is_a_device_failure(code: int) -> None:
+def test_e12_bad_address_is_not_a_device_failure(code: int) -> None:
     assert "address" in ErmanERG220(1).exception(code)
     assert "fail" not in ErmanERG220(1).exception(code)
 
@@ -535,7 +535,7 @@ def test_e9_e10_the_state_is_one_number_in_either_word() -> None:
     assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
 
-def test_e13_e16_no_diagnostics_and_nothing_beyond_the_tables() -> None:
+def test_e13_e16_diagnostics_and_unknown_addresses_are_not_used() -> None:
     assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
     assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
     assert all(
@@ -582,7 +582,7 @@ def test_i3_parity_and_stop_bits_are_the_user_s_to_say() -> None:
     assert InvtCHE(1, format="8E2").settings.format == "8E2"
 
 
-def test_i6_the_example_without_a_meaning_cannot_be_said() -> None:
+def test_i6_unexplained_example_cannot_be_sent() -> None:
     assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
@@ -593,13 +593,13 @@ def test_n3_n6_at_most_four_registers_of_an_ibd(monkeypatch: pytest.MonkeyPatch)
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
 
-def test_n9_without_its_outputs_an_ibd_is_never_said_to_have_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_n9_ibd_without_programmed_outputs_is_never_reported_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, InnovertIBD(1))
     sim["output_m01"] = 0
     assert drive.state().condition is Condition.UNKNOWN
 
 
-def test_d2_d15_running_is_running_and_a_changed_echo_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_d2_d15_running_is_running_and_a_changed_echo_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, DelixiNative(1))
     sim["status"] = DelixiNativeStatus.FORWARD
     assert drive.state().condition is Condition.RUNNING
@@ -609,7 +609,7 @@ def test_d2_d15_running_is_running_and_a_changed_echo_is_none(monkeypatch: pytes
     assert parse_reply(Framing.DELIXI, swapped, request)[0] < 0
 
 
-def test_d1_d3_d6_d9_what_is_misprinted_about_the_line() -> None:
+def test_d1_d3_d6_d9_misprints_about_the_line() -> None:
     assert 4800 in DelixiModbus.baudrates
     assert 3800 not in DelixiModbus.baudrates
     assert DelixiModbus.formats[Framing.ASCII][0] == "7N2"
@@ -677,7 +677,7 @@ def test_y12_what_the_watchdog_does_is_read_for_no_factory_setting_is_stated(
     assert drive.communication_timeout.default is None
 
 
-def test_0_8_what_wears_an_eeprom_is_declared() -> None:
+def test_0_8_eeprom_registers_are_declared() -> None:
     for register in YD1000.registers.values():
         in_ram = 0x1000 <= register.address <= 0x12FF
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
@@ -686,7 +686,7 @@ def test_0_8_what_wears_an_eeprom_is_declared() -> None:
 # ---- an echo, and another family ----
 
 
-def test_0_3_an_adapter_s_echo_is_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_0_3_adapter_echo_is_not_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing but the request's copy ever comes: no write leaves, because no read is answered."""
     line = SimulatedBus(monkeypatch)
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]

@@ -56,7 +56,7 @@ def found(device: ImportedDevice) -> list[str]:
         ("Address [HEX],type", "10,uint16", 0x10, None, ""),
     ],
 )
-def test_where_a_register_is(
+def test_address_and_table_of_a_register(
     tmp_path: Path, header: str, cells: str, at: int, table: str | None, gap: str
 ) -> None:
     device = row(tmp_path, header, cells)
@@ -78,7 +78,7 @@ def test_numbers_beside_bare_hex_may_be_hex(tmp_path: Path) -> None:
     assert "b: it cannot be read:" in told(device)[0]
 
 
-def test_a_bit_keeps_no_unit_and_says_so(tmp_path: Path) -> None:
+def test_unit_of_a_bit_is_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,table,unit", "5,uint16,coil,V")
     assert entries(device)["a"] == {"at": 5, "table": "coil"}
     assert found(device) == ["its type, unit and scale were left out: a coil is a bit"]
@@ -208,12 +208,12 @@ WRITTEN = ["it is written there; what a write does is not known here"]
         ("sometimes", ["its access 'sometimes' is not known; it is read here"]),
     ],
 )
-def test_who_reads_and_writes_a_register(tmp_path: Path, word: str, said: list[str]) -> None:
+def test_access_of_a_register(tmp_path: Path, word: str, said: list[str]) -> None:
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
 
 
 @pytest.mark.parametrize("word", ["W", "WO", "Write", "write only", "Write-only"])
-def test_what_is_only_written_is_lost(tmp_path: Path, word: str) -> None:
+def test_write_only_register_is_lost(tmp_path: Path, word: str) -> None:
     with pytest.raises(ValueError, match="a: is only written: a command is never imported"):
         row(tmp_path, "address,type,access", f"0x10,uint16,{word}")
 

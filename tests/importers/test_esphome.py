@@ -58,7 +58,7 @@ def test_an_entity_is_carried_over(tmp_path: Path, keys: str, expected: dict[str
         ("unit_of_measurement: '${unit}'", "its unit is ${unit}"),
     ],
 )
-def test_what_changes_the_value_otherwise_is_a_gap(tmp_path: Path, keys: str, gap: str) -> None:
+def test_other_value_changes_are_gaps(tmp_path: Path, keys: str, gap: str) -> None:
     assert gaps(entity(tmp_path, keys), "a") == [gap]
 
 
@@ -92,7 +92,7 @@ def test_a_text_without_its_size_is_a_gap(tmp_path: Path) -> None:
     ]
 
 
-def test_a_custom_command_is_no_read_of_registers(tmp_path: Path) -> None:
+def test_custom_command_is_lost(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: it is read by a custom_command, which is no read of registers"):
         entity(tmp_path, "custom_command: [1, 3]")
 

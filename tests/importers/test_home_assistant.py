@@ -37,9 +37,7 @@ def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
         ('data_type: custom, count: 1, structure: ">H"', None),
     ],
 )
-def test_a_width_may_stand_in_count_or_in_structure(
-    tmp_path: Path, keys: str, number_format: str | None
-) -> None:
+def test_width_may_be_in_count_or_in_structure(tmp_path: Path, keys: str, number_format: str | None) -> None:
     device = sensor(tmp_path, keys)
     assert entries(device)["a"].get("number_format") == number_format
     assert gaps(device, "a") == []
@@ -78,7 +76,7 @@ def test_a_clamp_at_0_is_a_gap(tmp_path: Path) -> None:
     assert gaps(sensor(tmp_path, "precision: 0"), "a") == ["precision was not carried over"]
 
 
-def test_a_unit_that_stands_elsewhere_is_a_gap(tmp_path: Path) -> None:
+def test_unit_defined_elsewhere_is_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "unit_of_measurement: !secret unit")
     assert "unit" not in entries(device)["a"]
     assert gaps(device, "a") == ["its unit is !secret unit"]
@@ -94,7 +92,7 @@ def test_a_switch_written_by_a_multiple_function_is_in_the_same_table(tmp_path: 
     assert gaps(device, "a") == [WRITTEN]
 
 
-def test_a_switch_is_read_where_its_state_is_verified(tmp_path: Path) -> None:
+def test_switch_is_read_at_its_verify_address(tmp_path: Path) -> None:
     verify = "verify: {address: 9, input_type: input, state_on: 37, state_off: 36, delay: 1}"
     device = sensor(tmp_path, f"command_on: 24, command_off: 25, {verify}", "switches")
     assert entries(device)["a"] == {"at": 9, "table": "input"}
@@ -209,7 +207,7 @@ def test_a_refusal_says_why(tmp_path: Path, text: str, reason: str) -> None:
         ("type: serial, port: !secret port", "/dev/ttyUSB0"),
     ],
 )
-def test_a_host_that_is_not_known_makes_no_serial_port(tmp_path: Path, hub: str, port: str) -> None:
+def test_unknown_host_never_becomes_a_serial_port(tmp_path: Path, hub: str, port: str) -> None:
     device = only(tmp_path, "a.yaml", f"modbus:\n  - {{{hub}, sensors: [{{slave: 1, address: 1}}]}}\n")
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
     assert ("the hub: its type udp is not spoken here" in told(device)) == ("udp" in hub)

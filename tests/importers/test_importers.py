@@ -93,7 +93,7 @@ def test_neuron(tmp_path: Path) -> None:
     assert loaded(tmp_path, device, "volt", "power")["power"].words == 2
 
 
-def test_a_table_of_one_s_own(tmp_path: Path) -> None:
+def test_table_with_own_columns(tmp_path: Path) -> None:
     device = only(tmp_path, "own.csv", OWN)
     text = family_text(device, "own.csv")
     assert "# gap: speed: whether its address counts from 0 or 1; 0 was assumed" in text
@@ -171,7 +171,7 @@ def test_sunspec(tmp_path: Path) -> None:
     assert registers["wh"].number_in(b"\x80" + bytes(7), 0) == 2.0**63
 
 
-def test_a_scale_register_out_of_reach_is_told_and_left_out(tmp_path: Path) -> None:
+def test_scale_register_out_of_reach_is_reported_and_left_out(tmp_path: Path) -> None:
     """One request reads both, and reads 125 registers at most."""
     points = [
         {"name": "A", "type": "int16", "size": 1, "sf": "S"},
@@ -260,7 +260,9 @@ def test_yaml_that_would_be_costly_is_refused(tmp_path: Path, text: str, told: s
         read_devices(tmp_path / "a.yaml")
 
 
-def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_at_most_the_registers_of_one_family_are_declared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """To look at what is beyond that would be in vain: a large file has ten times as many."""
     declared: list[str] = []
 
@@ -296,7 +298,7 @@ def test_no_more_is_declared_than_a_family_holds(tmp_path: Path, monkeypatch: py
         ("a.xls", "a", "its suffix is not one of .csv"),
     ],
 )
-def test_what_is_no_table_is_refused(tmp_path: Path, name: str, text: str, told: str) -> None:
+def test_file_that_is_not_a_table_is_refused(tmp_path: Path, name: str, text: str, told: str) -> None:
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(ValueError, match=re.escape(told)):
@@ -364,7 +366,7 @@ def test_the_line_of_telegraf_and_esphome(tmp_path: Path) -> None:
     assert str(only(tmp_path, "node.yaml", node + sensor).line) == "9600, 8E1"
 
 
-def test_a_controller_that_is_no_address_is_named(tmp_path: Path) -> None:
+def test_invalid_controller_address_is_reported(tmp_path: Path) -> None:
     plugin = '[[inputs.modbus]]\ncontroller = "{}"\n'
     for controller in ("tcp://gate:99999", "tcp://gate:modbus", "tcp://[fe80::1"):
         named = rf"t\.conf: controller = '{re.escape(controller)}' is not an address: "
@@ -372,7 +374,7 @@ def test_a_controller_that_is_no_address_is_named(tmp_path: Path) -> None:
             devices(tmp_path, "t.conf", plugin.format("tcp://hall") + plugin.format(controller))
 
 
-def test_addresses_that_are_not_side_by_side_are_no_number(tmp_path: Path) -> None:
+def test_scattered_addresses_are_lost(tmp_path: Path) -> None:
     field = '{{ name = "{}", byte_order = "ABCD", data_type = "UINT32", address = {} }}'
     listed = ", ".join(
         field.format(*each) for each in (("good", [4, 5]), ("split", [4, 9]), ("one", [4, 5, 6]))
@@ -385,7 +387,7 @@ def test_addresses_that_are_not_side_by_side_are_no_number(tmp_path: Path) -> No
     ]
 
 
-def test_what_one_request_reads_is_carried_over(tmp_path: Path) -> None:
+def test_read_limits_are_carried_over(tmp_path: Path) -> None:
     template = '{{"device": {{"max_read_registers": {}, "channels": [{}]}}}}'
     channels = ", ".join(
         f'{{"name": "{name}", "address": {at}, "format": "{kind}"}}'
@@ -424,7 +426,7 @@ def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:
     assert run("import", source, "--out", family)[0] == 2
 
 
-def test_a_device_of_texts_alone_gets_no_plant(run: Run, tmp_path: Path) -> None:
+def test_device_with_only_texts_gets_no_plant_file(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "label.toml", "plant.toml"))
     source.write_text("name,address,type\nlabel,1!400001.8,STRING\n")
     status, _, err = run("import", source, "--out", family, "--plant", plant)

@@ -93,7 +93,7 @@ def damaged(seed: int) -> bytes:
     max_examples=examples(400), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.integers(0, 1 << 32))
-def test_a_damaged_file_is_a_family_or_one_sentence(tmp_path: Path, seed: int) -> None:
+def test_damaged_file_gives_a_family_or_one_error(tmp_path: Path, seed: int) -> None:
     read("import", damaged(seed), tmp_path)
 
 
@@ -182,7 +182,7 @@ ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), 
     max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(CHANNELS, POINTS, SENSORS, ENTITIES, ROWS)
-def test_what_an_importer_takes_is_a_family_that_loads(
+def test_imported_device_gives_a_family_that_loads(
     tmp_path: Path, channels: Any, points: Any, sensors: Any, entities: Any, rows: Any
 ) -> None:
     """YAML takes JSON, which has no tags and no aliases."""

@@ -180,7 +180,7 @@ def test_every_column_of_a_known_layout_has_a_treatment(columns: str) -> None:
     assert [column for column in columns.split() if column not in known] == []
 
 
-def test_a_key_without_a_treatment_is_a_gap_and_an_empty_one_says_nothing() -> None:
+def test_unknown_key_is_a_gap_unless_it_is_empty() -> None:
     table = home_assistant.KEYS["sensors"]
     given = {"name": "a", "icon": "x", "min_value": 0, "max_value": None, "zero_suppress": False, "new": 1}
     assert uncarried(given, table) == [

@@ -55,7 +55,7 @@ def test_float32_is_a_float_in_the_other_styles(tmp_path: Path) -> None:
     assert entries(only(tmp_path, "t.conf", HEAD + metric))["b"]["number_format"] == "F32"
 
 
-def test_float64_without_ieee_is_none_of_the_register_style(tmp_path: Path) -> None:
+def test_float64_without_ieee_is_lost_in_the_register_style(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type FLOAT64 has no number format"):
         of_registers(tmp_path, 'byte_order = "ABCD", data_type = "FLOAT64", address = [5, 6, 7, 8]')
 

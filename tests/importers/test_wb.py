@@ -138,7 +138,7 @@ def test_an_error_value_is_the_bits_of_its_format(tmp_path: Path, keys: dict[str
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_what_is_not_carried_over_is_a_gap(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
+def test_keys_not_carried_over_are_gaps(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
@@ -168,9 +168,7 @@ def test_names_of_values_given_as_text_are_carried_over(tmp_path: Path) -> None:
         ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
     ],
 )
-def test_a_text_in_an_order_that_no_family_has_is_lost(
-    tmp_path: Path, keys: dict[str, Any], reason: str
-) -> None:
+def test_text_in_an_unsupported_order_is_lost(tmp_path: Path, keys: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=f"a: {reason}"):
         channel(tmp_path, string_data_size=8, **keys)
 

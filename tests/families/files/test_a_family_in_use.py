@@ -72,7 +72,7 @@ def pump(plant: Path) -> type[Drive]:
     return load_family(plant.parent / "families" / "pump.toml")
 
 
-def test_a_model_s_path_begins_at_the_plant_file(plant: Path, pump: type[Drive]) -> None:
+def test_model_path_is_relative_to_the_plant_file(plant: Path, pump: type[Drive]) -> None:
     drives = [polled.drive for polled in Plant.load(plant).lines[0].drives]
     assert type(drives[1]) is pump
     assert find_model("families/pump.toml", plant.parent) is pump
@@ -151,7 +151,7 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
-def test_a_file_that_could_move_a_motor_writes_nothing_unconfirmed(
+def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
     pump: type[Drive], name: str, value: str
 ) -> None:
     """Nor what it calls harmless: without a stop verb nobody has held that against anything."""
@@ -164,7 +164,7 @@ def test_a_file_that_could_move_a_motor_writes_nothing_unconfirmed(
         assert simulated_writes(line) == []
 
 
-def test_an_unconfirmed_file_broadcasts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unconfirmed_file_sends_no_broadcast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor does stop_all send what it calls a broadcast, for nobody has held that against a stop."""
     path = tmp_path / "fan.toml"
     head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
@@ -248,6 +248,6 @@ def simulated_writes(line: Simulator) -> list[str]:
     return [written.name for drive in line.wires[0].drives for written in drive.counters.writes]
 
 
-def test_an_unknown_table_is_no_surprise(plant: Path) -> None:
+def test_unknown_section_is_reported(plant: Path) -> None:
     family = load_family(plant.parent / "families" / "meter.toml")
     assert {each.table for each in family.registers.values() if each.name == "voltage"} == {INPUT}

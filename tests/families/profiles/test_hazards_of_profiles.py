@@ -92,7 +92,7 @@ def test_a_start_that_never_arrives_is_sent_once(line: Line) -> None:
 
 @pytest.mark.parametrize("lost", usually(7, 1, 2, 3))
 @pytest.mark.parametrize("how", ["loses", "deafens"])
-def test_a_stop_whose_replies_are_lost(line: Line, lost: int, how: str) -> None:
+def test_stop_is_repeated_if_its_replies_are_lost(line: Line, lost: int, how: str) -> None:
     """It is sent until it is confirmed and the motor stands."""
     line.runs()
     begun = len(line.writes)
@@ -156,7 +156,7 @@ def test_a_reset_never_starts_the_motor(line: Line) -> None:
 
 
 @pytest.mark.parametrize("lost", range(4))
-def test_a_reset_whose_replies_are_lost_starts_nothing(line: Line, lost: int) -> None:
+def test_reset_with_lost_replies_never_starts(line: Line, lost: int) -> None:
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -184,12 +184,12 @@ def test_a_reset_is_refused_while_the_motor_turns(line: Line) -> None:
     assert line.sim.motor.energised
 
 
-def test_a_reset_without_a_fault_sends_nothing(line: Line) -> None:
+def test_reset_without_a_fault_sends_no_write(line: Line) -> None:
     line.drive.reset_fault()
     assert line.writes == []
 
 
-def test_a_fault_that_stands_is_told(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fault_that_remains_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.sim.trip(FAULT)
     monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
     with pytest.raises(NotVerified, match="the fault remains"):
@@ -316,7 +316,7 @@ def test_a_start_word_is_never_plainly_written(line: Line) -> None:
     assert line.writes == []
 
 
-def test_what_is_harmless_starts_nothing_at_any_time(line: Line) -> None:
+def test_harmless_counts_never_start_the_motor(line: Line) -> None:
     line.drive.set_frequency(20)
     control = line.drive.control
     for before in control.harmless:
@@ -357,9 +357,7 @@ def test_a_jog_that_goes_on_through_a_stop_is_stopped_on_its_own(monkeypatch: py
 
 
 @pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
-def test_a_jog_is_stopped_on_its_own_where_the_stop_is_not_confirmed(
-    monkeypatch: pytest.MonkeyPatch, is_refused: bool
-) -> None:
+def test_stop_jog_follows_an_unconfirmed_stop(monkeypatch: pytest.MonkeyPatch, is_refused: bool) -> None:
     """Replies are lost, as where one wire is broken; or it has no word for a stop in a jog."""
     line = Line(monkeypatch, "invt-goodrive")
     line.sim.jog_needs_own_stop = True
@@ -382,7 +380,7 @@ def test_a_jog_is_stopped_on_its_own_where_the_stop_is_not_confirmed(
     assert not line.sim.motor.energised
 
 
-def test_no_stop_of_a_jog_is_sent_where_another_drive_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_jog_is_not_sent_to_another_make(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     checked: list[Drive] = []
 
@@ -419,7 +417,7 @@ def test_a_profidrive_is_not_started_through_an_off(name: str, monkeypatch: pyte
     assert line.sim.motor.energised
 
 
-def test_an_off2_in_a_run_is_told_and_not_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_off2_during_a_run_is_reported_and_not_overridden(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "siemens-v20")
     line.runs()
     line.drive.write(line.drive.control, line.drive.control.decode(0x047C))

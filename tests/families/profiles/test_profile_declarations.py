@@ -21,7 +21,7 @@ every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFIL
 
 
 @every_profile
-def test_a_profile_says_what_it_does(profile: type[Drive]) -> None:
+def test_each_profile_is_documented(profile: type[Drive]) -> None:
     assert profile.__doc__
     assert len(profile.__doc__) > 400
     assert profile.registers == {}
@@ -36,7 +36,7 @@ def test_no_harmless_word_is_a_start_or_a_reset(profile: Any) -> None:
     assert profile.reset_role != "control" or profile.reset_word not in harmless
 
 
-def test_the_profile_says_what_the_family_does_not() -> None:
+def test_profile_completes_the_family_roles() -> None:
     control = Acs355.control
     assert control.name == "control"
     assert control is Acs355.registers["control"]
@@ -46,7 +46,7 @@ def test_the_profile_says_what_the_family_does_not() -> None:
     assert not Acs355.reference.commands
 
 
-def test_a_family_may_add_the_bit_for_reverse_where_makes_differ() -> None:
+def test_family_may_add_the_reverse_bit() -> None:
     assert Atv320.control.values(0x0800).name == "REVERSE"
     with pytest.raises(DeclarationError) as wrong:
 
@@ -60,20 +60,20 @@ def test_a_family_may_add_the_bit_for_reverse_where_makes_differ() -> None:
             control = command(1, IntFlag("Bits", {"jog": 1 << 8}))
 
 
-def test_the_output_frequency_is_0_for_a_motor_that_stands_alone() -> None:
+def test_output_frequency_must_be_0_only_at_rest() -> None:
     for frequency in (reading(0x60, "Hz", part=(0, 3)), reading(0x60, "Hz", offset=-50)):
         with pytest.raises(DeclarationError, match="output_frequency: it is 0 where the motor stands alone"):
             type("Half", (Atv320,), {"output_frequency": frequency})
 
 
-def test_nothing_beside_the_roles_is_harmless() -> None:
+def test_only_roles_may_have_harmless_counts() -> None:
     with pytest.raises(DeclarationError, match="sleeve: harmless counts are those of its control"):
 
         class Sleeved(Atv320):
             sleeve = command(0x50, harmless=(1,))
 
 
-def test_all_mistakes_of_a_family_are_told_at_once() -> None:
+def test_all_mistakes_of_a_family_are_reported_at_once() -> None:
     class Words(IntEnum):
         RUN = 1
 
@@ -101,7 +101,7 @@ def test_all_mistakes_of_a_family_are_told_at_once() -> None:
     }
 
 
-def test_a_status_of_two_words_is_no_status() -> None:
+def test_status_of_two_words_is_refused() -> None:
     with pytest.raises(DeclarationError, match="status: it is one word"):
 
         class Wide(Profidrive):
@@ -128,14 +128,14 @@ def test_a_reference_that_counts_backwards_is_refused() -> None:
             reference = setting(1, "%", step=-0.005, span=(0, 100), number_format=NumberFormat.I16)
 
 
-def test_a_signed_status_is_no_word_of_bits() -> None:
+def test_signed_status_is_refused() -> None:
     with pytest.raises(DeclarationError, match="status: it is one word of bits"):
 
         class Signed(Acs355):
             status = reading(3, number_format=NumberFormat.I16)
 
 
-def test_a_percentage_needs_to_know_of_what() -> None:
+def test_percentage_needs_maximum_frequency() -> None:
     drive = Fc51(1)
     wire = Wire(drive)
     with pytest.raises(WriteForbidden, match="maximum_frequency = HZ") as refusal:
@@ -202,7 +202,7 @@ def test_a_drive_that_shows_something_else_is_refused(
         identify(model, **says)
 
 
-def test_a_drive_that_refuses_a_role_is_no_drive_of_the_family() -> None:
+def test_drive_that_refuses_a_role_is_not_identified() -> None:
     with pytest.raises(DriveException):
         identify("abb-acs355", signature=DriveException("abb", 2, "illegal address"))
 

@@ -234,7 +234,7 @@ HINDRANCES = [
 
 
 @table(("model", "status", "sentence"), HINDRANCES)
-def test_a_hindrance_is_named_and_nothing_starts(model: str, status: int, sentence: str) -> None:
+def test_start_is_refused_with_the_hindrance(model: str, status: int, sentence: str) -> None:
     found = wire(model, status)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
@@ -284,7 +284,7 @@ def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condi
         ("optidrive-e3", E3_RUNS),
     ],
 )
-def test_a_drive_that_runs_at_0_hz_does_not_stand(model: str, running: int) -> None:
+def test_running_at_0_hz_is_not_stopped(model: str, running: int) -> None:
     found = wire(model, running, output_frequency=0.0)
     found.drive.option["stop_time"] = 5.0
     with pytest.raises(Unconfirmed, match="5 s it is not seen to have stopped"):

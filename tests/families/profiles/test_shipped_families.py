@@ -138,7 +138,7 @@ def test_the_registers_are_those_of_the_manual(name: str) -> None:
 
 
 @every_family
-def test_a_family_says_where_it_comes_from_and_what_was_not_tried(name: str) -> None:
+def test_shipped_family_names_its_sources_and_is_marked_untested(name: str) -> None:
     family = shipped_family(name)
     assert issubclass(family, Profile) is (name != READ_ONLY)
     assert "not tried on hardware" in family.title
@@ -158,7 +158,7 @@ def test_every_register_names_a_page_of_an_edition(name: str) -> None:
         assert any(edition in register.place for edition in EDITIONS[name]), (register.name, register.place)
 
 
-def test_the_pump_controller_whose_map_leaves_too_much_open_is_only_read(
+def test_pump_controller_is_only_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     family = shipped_family(READ_ONLY)
@@ -179,9 +179,7 @@ def test_the_pump_controller_whose_map_leaves_too_much_open_is_only_read(
 
 
 @every_profile_family
-def test_nothing_is_commanded_before_the_owner_has_confirmed_it(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_command_is_sent_before_confirmation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     family = shipped_family(name)
     bus, drive, _ = one(monkeypatch, family(1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
@@ -193,7 +191,7 @@ def test_nothing_is_commanded_before_the_owner_has_confirmed_it(
 
 
 @every_profile_family
-def test_what_only_tells_the_family_is_not_polled(name: str) -> None:
+def test_identification_registers_are_not_polled(name: str) -> None:
     polled = {register.name for register in shipped_family(name).readings()}
     assert "status" in polled
     assert not polled & {"station", "signature"}
@@ -244,7 +242,7 @@ def test_the_command_line_lists_and_checks_them(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.long
-def test_nothing_of_them_is_read_before_one_is_asked_for() -> None:
+def test_shipped_files_are_loaded_on_demand() -> None:
     code = (
         "import sys, multidrop.families.registry as registry; "
         "from multidrop.families.files import loader; "
@@ -276,7 +274,7 @@ def test_a_file_may_name_any_profile(tmp_path: Path) -> None:
         assert issubclass(load(tmp_path, f'{HEAD}profile = "{name}"\n{roles}'), profile)
 
 
-def test_all_mistakes_of_a_file_with_a_profile_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_file_with_a_profile_are_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"own\.toml") as wrong:
         load(
             tmp_path,
@@ -302,6 +300,6 @@ def test_a_profile_that_is_not_known(tmp_path: Path) -> None:
         load(tmp_path, f'{HEAD}profile = "profdrive"\n[reading]\nspeed = {{ at = 1 }}\n')
 
 
-def test_registers_are_read_in_blocks_where_the_manual_lets_them() -> None:
+def test_registers_are_read_in_blocks_if_the_manual_allows_it() -> None:
     assert shipped_family("delta-vfd-el").most_registers
     assert {register.access for register in shipped_family("abb-acs355").readings()} == {Access.READING}

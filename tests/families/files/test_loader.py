@@ -121,7 +121,7 @@ control = { at = 3, bits = { on = 0, reset = 1 }, harmless = [0], broadcast = [0
     assert loaded.broadcasts
 
 
-def test_what_must_be_written_by_10h(tmp_path: Path) -> None:
+def test_registers_written_by_function_10h(tmp_path: Path) -> None:
     loaded = family(
         tmp_path, HEAD + 'write = "multiple"\n[setting]\na = { at = 1 }\nb = { at = 2, write = "single" }\n'
     )
@@ -211,7 +211,7 @@ TOLD = [
 ]
 
 
-def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
+def test_more_than_twenty_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     (tmp_path / "twenty.csv").write_text(TWENTY_CSV)
     path = tmp_path / "twenty.toml"
     path.write_text(TWENTY)
@@ -341,7 +341,7 @@ def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mi
         (HEAD + "option = 3\n".join(["", ""]), ["declares no register"]),
     ],
 )
-def test_a_mistake_is_told_with_its_place(tmp_path: Path, text: str, told: list[str]) -> None:
+def test_mistake_is_reported_with_its_place(tmp_path: Path, text: str, told: list[str]) -> None:
     found = mistakes(tmp_path, text)
     for sentence in told:
         assert any(sentence in mistake for mistake in found), found
@@ -410,7 +410,7 @@ def test_all_cells_of_a_csv_file(tmp_path: Path) -> None:
     assert [(each.name, each.value) for each in b.values] == [("off", 0), ("on", 16)]
 
 
-def test_what_is_no_file(tmp_path: Path) -> None:
+def test_missing_and_invalid_files(tmp_path: Path) -> None:
     with pytest.raises(FamilyError, match="there is no such file"):
         load_family(tmp_path / "none.toml")
     for path in (tmp_path, Path("/dev/zero")):

@@ -83,7 +83,7 @@ class Known(Meter):
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
-def test_a_text_says_what_a_device_is(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+def test_text_identifies_a_device(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
     line = SimulatedBus(monkeypatch, sim)
@@ -135,7 +135,7 @@ def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -
         ((-1, 2), "its registers are not within 0 to FFFFH"),
     ],
 )
-def test_a_text_that_no_request_reads_is_refused(details: tuple[int, int], sentence: str) -> None:
+def test_text_longer_than_a_request_is_refused(details: tuple[int, int], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         text(*details)
 
@@ -151,7 +151,7 @@ def test_a_text_s_other_mistakes() -> None:
         type("Wrong", (Drive,), {"second": Meter.serial})
 
 
-def test_the_command_line_prints_texts_and_what_has_no_value(run: Run, tmp_path: Path) -> None:
+def test_command_line_prints_texts_and_missing_values(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "meter.py"
     path.write_text(METER)
     model = f"{path}:Meter"

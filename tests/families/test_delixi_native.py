@@ -121,7 +121,7 @@ def test_start_without_a_known_setpoint_is_refused() -> None:
         (9, "says 0009H to K = 03, which is not explained"),
     ],
 )
-def test_no_motor_is_started_that_could_run_later(status: int, sentence: str) -> None:
+def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
     """P05.31 is 0 all the same: a run command without mains may wait for them."""
     wire = Wire(DelixiNative(1), {**STANDING, "status": status})
     wire.drive.set_frequency(50)
@@ -146,7 +146,7 @@ def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sen
     assert wire.sent == [FIFTY]
 
 
-def test_a_start_that_is_not_seen_is_told_of() -> None:
+def test_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
     wire = Wire(DelixiNative(1), STANDING)
     wire.drive.set_frequency(50)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
@@ -267,9 +267,7 @@ def test_the_function_code_says_whether_a_parameter_is_stored() -> None:
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 
-def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_only_stored_writes_are_counted_and_limited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
     line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
@@ -283,13 +281,13 @@ def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
 
 
 @pytest.mark.parametrize("name", ["coast", "emergency_stop", "jog"])
-def test_what_the_document_does_not_have(name: str) -> None:
+def test_undocumented_verbs_are_unsupported(name: str) -> None:
     with pytest.raises(Unsupported, match="Delixi"):
         getattr(Wire(DelixiNative(1)).drive, name)()
 
 
 @pytest.mark.parametrize("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
-def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus) -> None:
+def test_fault_that_remains_after_reset_is_reported(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
     with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):
         wire.drive.reset_fault()
@@ -304,7 +302,7 @@ def test_a_fault_that_stands_after_its_reset_is_told(status: DelixiNativeStatus)
         (DelixiNativeStatus.STOPPED, 0.01),
     ],
 )
-def test_a_motor_that_turns_has_no_fault_to_reset(status: DelixiNativeStatus, hz: float) -> None:
+def test_reset_is_refused_while_the_motor_turns(status: DelixiNativeStatus, hz: float) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "output_frequency": hz})
     with pytest.raises(WriteForbidden, match="runs: it has no fault to reset"):
         wire.drive.reset_fault()

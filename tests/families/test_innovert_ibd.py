@@ -92,7 +92,7 @@ def test_the_line_and_its_limits() -> None:
     assert InnovertIBD(1).exception(2) == "a code that the document does not explain"
 
 
-def test_the_words_have_no_toggle_and_no_reserved_bit() -> None:
+def test_words_never_have_the_toggle_or_reserved_bits() -> None:
     assert {each.value for each in IBDControl} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
 
 
@@ -118,7 +118,7 @@ def test_reset_and_zero() -> None:
     assert wire.sent == [STOP[Framing.RTU], RESET, ZERO]
 
 
-def test_no_run_command_outlasts_the_fault() -> None:
+def test_stop_is_sent_before_the_fault_reset() -> None:
     """In table 3 the word of the reset has no action in bits 1 and 0: a run of before may still be there."""
     stop = STOP[Framing.RTU]
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
@@ -222,7 +222,7 @@ def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
         Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
 
-def test_a_start_without_current_and_speed_is_told_of() -> None:
+def test_start_without_current_and_speed_is_unconfirmed() -> None:
     wire = Wire(InnovertIBD(1), STANDING | {"terminals": Terminals(0)})
     wire.drive.set_frequency(50)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
@@ -240,7 +240,7 @@ SEEN = {
 
 
 @pytest.mark.parametrize("name", SEEN)
-def test_a_drive_that_has_not_all_that_is_named_resembles_none(name: str) -> None:
+def test_drive_without_all_named_registers_does_not_resemble(name: str) -> None:
     def resembles(says: dict[str, object]) -> bool:
         wire = Wire(InnovertIBD(1), says)
         found = wire.run(wire.drive.resembles())
@@ -263,7 +263,7 @@ def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
         wire.drive.stop()
 
 
-def test_stop_goes_by_the_outputs_where_they_are_programmed() -> None:
+def test_stop_is_confirmed_by_programmed_outputs() -> None:
     says = {**STANDING, **PROGRAMMED, "terminals": [Terminals.M01 | Terminals.YABC, Terminals(0)]}
     wire = Wire(InnovertIBD(1), says)
     wire.drive.stop()
@@ -308,7 +308,7 @@ def test_state_from_the_outputs(raw: int, condition: Condition) -> None:
     assert Wire(InnovertIBD(1), says).drive.state().condition is condition
 
 
-def test_what_is_never_written() -> None:
+def test_registers_that_are_never_written() -> None:
     never = {name for name, each in InnovertIBD.registers.items() if each.never}
     inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
     assert inferred <= never
@@ -316,6 +316,6 @@ def test_what_is_never_written() -> None:
 
 
 @pytest.mark.parametrize("name", ["coast", "emergency_stop"])
-def test_what_the_document_does_not_have(name: str) -> None:
+def test_undocumented_verbs_are_unsupported(name: str) -> None:
     with pytest.raises(Unsupported, match="IBD"):
         getattr(Wire(InnovertIBD(1)).drive, name)()

@@ -149,7 +149,7 @@ def test_ram_and_eeprom() -> None:
     assert ram == {"control", "frequency", "panel_frequency"}
 
 
-def test_what_is_never_written() -> None:
+def test_registers_that_are_never_written() -> None:
     never: dict[str, set[int]] = {}
     for register in YD1000.registers.values():
         never.setdefault(register.never, set()).add(register.address)
@@ -171,7 +171,7 @@ def test_what_is_never_written() -> None:
     }
 
 
-def test_what_a_change_of_the_line_needs() -> None:
+def test_line_parameters_are_read_only() -> None:
     """Section 7: 0800H and 0801H after a reset or power-on, 0802H and 0803H at once."""
     later = {register.address for register in YD1000.registers.values() if "after a reset" in register.note}
     at_once = {register.address for register in YD1000.registers.values() if "at once" in register.note}
@@ -306,7 +306,7 @@ def test_a_motor_without_a_setpoint_is_not_started() -> None:
     assert wire.sent == []
 
 
-def test_where_fnod_has_the_setpoint_1001h_is_not_looked_at() -> None:
+def test_1001h_is_ignored_if_fnod_has_the_setpoint() -> None:
     wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
     wire.drive.start()
     assert wire.sent == [yd_word(0x8400)]
@@ -344,7 +344,7 @@ def test_a_preset_speed_is_seen_at_rest_before_the_motor_is_started(number: int,
         ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
     ],
 )
-def test_a_preset_speed_that_is_not_seen_starts_nothing(
+def test_start_is_refused_if_the_preset_speed_is_not_seen(
     says: dict[str, object], sent: list[str], sentence: str
 ) -> None:
     wire = Wire(YD1000(1, preset_speed=3), {**AT_PRESET, **says})
@@ -362,7 +362,7 @@ def test_jog_leaves_the_run_bit_off() -> None:
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
 
 
-def test_stop_keeps_bit_15_until_the_motor_stands_twice() -> None:
+def test_stop_keeps_bit_15_until_two_readings_of_0_hz() -> None:
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": [20.0, 0.0, 3.0, 0.0, 0.0]})
     wire.drive.stop()
     assert wire.sent == [STOP]
@@ -376,7 +376,7 @@ def test_stop_keeps_bit_15_until_the_motor_stands_twice() -> None:
     assert wire.sent == [STOP]
 
 
-def test_nothing_releases_the_command() -> None:
+def test_no_other_verb_releases_control() -> None:
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     for verb in (
         wire.drive.start,
@@ -485,13 +485,13 @@ def test_a_reset_that_a_terminal_could_make_a_start_is_not_sent(
 
 
 @pytest.mark.parametrize("closed", [Inputs.RST | Inputs.S1, Inputs(0)])
-def test_other_terminals_keep_no_reset_back(closed: Inputs) -> None:
+def test_other_terminals_do_not_block_a_reset(closed: Inputs) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "inputs": closed})
     wire.drive.reset_fault()
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_a_limit_that_the_manual_does_not_print_is_not_said_to_be_its_own() -> None:
+def test_limit_from_outside_the_manual_names_its_source() -> None:
     """It has 0.5 to FH for UL, and of FH only 30.0 to 320.0."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
@@ -621,7 +621,7 @@ def test_a_motor_with_a_fault_is_not_started() -> None:
     assert wire.sent == []
 
 
-def test_a_trip_shows_in_what_it_froze() -> None:
+def test_trip_shows_in_the_frozen_registers() -> None:
     """Section 8.2: 1200H is held while the drive has tripped, and 1100H is not."""
     wire = Wire(YD1000(1), {**STANDING, "held_frequency": 30.0, "fault_record_1": 0x0A})
     assert wire.drive.state() == State(Condition.FAULT, fault="code 0AH")
@@ -629,7 +629,7 @@ def test_a_trip_shows_in_what_it_froze() -> None:
     assert Wire(YD1000(1), starting).drive.state().condition is Condition.STOPPED
 
 
-def test_a_start_after_an_emergency_stop_is_told_of_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """From a new object too, as the command line has it each time."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(30)
@@ -659,7 +659,7 @@ def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
         drive.start()
 
 
-def test_the_watchdog_is_set_over_the_line_while_the_motor_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_is_written_only_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert drive.write(drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5

@@ -64,7 +64,7 @@ def test_the_line_and_its_limits() -> None:
         DelixiModbus(1, framing="ascii", format="8N2")
 
 
-def test_the_words_have_a_direction_and_no_toggle() -> None:
+def test_run_words_have_a_direction_and_never_the_toggle() -> None:
     assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
 
 
@@ -119,7 +119,7 @@ def test_jog_has_its_direction_too() -> None:
 
 
 @pytest.mark.parametrize("name", ["start", "jog"])
-def test_a_motor_that_is_not_seen_to_run_is_told_of(name: str) -> None:
+def test_start_is_unconfirmed_if_the_motor_does_not_run(name: str) -> None:
     wire = Wire(DelixiModbus(1), STANDING)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
         getattr(wire.drive, name)()
@@ -197,7 +197,7 @@ def test_start_is_refused(name: str, held: float, sentence: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["coast", "emergency_stop", "reset_fault"])
-def test_what_the_document_does_not_have(name: str) -> None:
+def test_undocumented_verbs_are_unsupported(name: str) -> None:
     wire = Wire(DelixiModbus(1))
     with pytest.raises(Unsupported, match="Delixi"):
         getattr(wire.drive, name)()

@@ -181,14 +181,14 @@ def test_a_jog_that_goes_on_through_the_stop_is_stopped_at_once() -> None:
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_a_motor_that_coasts_on_is_told_of() -> None:
+def test_stop_is_unconfirmed_while_the_motor_coasts() -> None:
     wire = Wire(InvtCHE(1, stop_time=20), {"status": CHEStatus.FORWARD})
     with pytest.raises(Unconfirmed, match="20 s"):
         wire.drive.coast()
     assert wire.sent == [frame(InvtCHE(1), InvtCHE.control, CHEControl.COAST)]
 
 
-def test_a_jog_is_stopped_also_where_the_stop_is_refused() -> None:
+def test_stop_jog_follows_a_refused_stop() -> None:
     refusal = DriveException("drive", 0x12, "")
     turns = {STOP_JOG: {"status": CHEStatus.STANDBY}}
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3}, turns)
@@ -196,7 +196,7 @@ def test_a_jog_is_stopped_also_where_the_stop_is_refused() -> None:
     assert wire.sent == [STOP] * 3 + [STOP_JOG]
 
 
-def test_a_jog_is_stopped_also_where_nobody_confirms_the_stop() -> None:
+def test_stop_jog_follows_an_unconfirmed_stop() -> None:
     """The drive may hear, though it is not heard: the stop that it did hear may not end a jog."""
     lost = Unconfirmed("drive", "control = STOP", "no reply")
     for of_a_jog in ([], [lost] * 3):  # once: the whole is repeated, the stop first
@@ -211,14 +211,14 @@ def test_a_jog_is_stopped_also_where_nobody_confirms_the_stop() -> None:
     [NoReply("drive"), BadReply("drive", "checksum", b""), DriveException("drive", 6, "busy")],
     ids=lambda unseen: type(unseen).__name__,
 )
-def test_a_jog_is_stopped_also_where_nobody_says_whether_the_motor_turns(unseen: BusError) -> None:
+def test_stop_jog_follows_if_the_state_is_unknown(unseen: BusError) -> None:
     wire = Wire(InvtCHE(1), {"status": unseen})
     with pytest.raises(type(unseen)):
         wire.drive.stop()
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_no_jog_is_stopped_where_another_drive_is_there() -> None:
+def test_stop_jog_is_not_sent_to_another_make() -> None:
     wire = Wire(
         InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [WriteForbidden("another family is there")]}
     )
@@ -227,7 +227,7 @@ def test_no_jog_is_stopped_where_another_drive_is_there() -> None:
     assert wire.sent == [STOP]
 
 
-def test_a_run_whose_drive_has_no_jog_to_stop_is_watched() -> None:
+def test_refused_stop_jog_does_not_end_the_watch() -> None:
     refusal = DriveException("drive", 0x12, "")
     says = {"status": [CHEStatus.FORWARD] * 4 + [CHEStatus.STANDBY]}
     wire = Wire(InvtCHE(1), says, {STOP_JOG: [refusal] * 3})
@@ -235,7 +235,7 @@ def test_a_run_whose_drive_has_no_jog_to_stop_is_watched() -> None:
     assert wire.sent == [STOP] + [STOP_JOG] * 3
 
 
-def test_a_stop_may_be_refused_by_a_drive_that_stands() -> None:
+def test_stop_refused_at_rest_counts_as_stopped() -> None:
     refusal = DriveException("drive", 1, "")
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FAULT}, {STOP: [refusal] * 3})
     wire.drive.stop()
@@ -279,7 +279,7 @@ def test_a_fault_is_reset_before_a_start_and_not_by_it() -> None:
 
 
 @table(("name", "word"), [("start", CHEControl.FORWARD), ("jog", CHEControl.JOG_FORWARD)])
-def test_a_trip_while_starting_is_told(name: str, word: CHEControl) -> None:
+def test_trip_during_start_is_reported(name: str, word: CHEControl) -> None:
     tripped = {"status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
     sent = frame(InvtCHE(1), InvtCHE.control, word)
     wire = Wire(InvtCHE(1), STANDBY, turns={sent: tripped})
@@ -338,7 +338,7 @@ def test_state(says: dict[str, object], state: State) -> None:
     assert Wire(InvtCHE(1), says).drive.state() == state
 
 
-def test_identify_refuses_what_is_no_che() -> None:
+def test_identify_refuses_other_makes() -> None:
     for device in (0x0101, 0x0102):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(device)}).drive.identify()
     with pytest.raises(WriteForbidden, match="010AH"):
@@ -401,6 +401,6 @@ def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
     assert wire.sent == [jog, STOP, FORWARD, FORWARD]
 
 
-def test_there_is_no_emergency_stop() -> None:
+def test_emergency_stop_is_unsupported() -> None:
     with pytest.raises(Unsupported, match="emergency stop"):
         Wire(InvtCHE(1)).drive.emergency_stop()

@@ -35,7 +35,9 @@ from multidrop.families.files.notation import Counting, sent_as
         (40001, 0, "input", (40001, "input")),
     ],
 )
-def test_what_is_sent(given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]) -> None:
+def test_addresses_on_the_wire(
+    given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]
+) -> None:
     assert Counting(counts_from).address(given, table, "holding") == sent
 
 
@@ -52,7 +54,7 @@ def test_what_is_sent(given: Any, counts_from: int | None, table: str | None, se
         ("0016", 0, (16, "holding")),
     ],
 )
-def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[int, str]) -> None:
+def test_addresses_in_csv_cells(cell: str, counts_from: int | None, sent: tuple[int, str]) -> None:
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
 
 
@@ -75,7 +77,7 @@ def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[
         (400017, "400017 may be the number 400017, or register 17 of table holding; write a smaller number"),
     ],
 )
-def test_what_is_refused(given: Any, sentence: str) -> None:
+def test_invalid_addresses_are_refused(given: Any, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (the sentence is compared below)
         Counting(0).address(given, None, "holding")
     assert sentence in str(refused.value)
@@ -112,7 +114,7 @@ def test_cells_that_are_refused(cell: str, sentence: str) -> None:
     assert sentence in str(refused.value)
 
 
-def test_numbers_that_nobody_said_how_to_count() -> None:
+def test_missing_counts_from_is_reported() -> None:
     counting = Counting(None)
     assert counting.address(16, None, "holding") == (16, "holding")
     assert counting.address("40001", None, "holding") == (0, "holding")

@@ -35,12 +35,12 @@ def test_t3_5(baudrate: int, format: str, seconds: float) -> None:
 
 
 @table("format", ["8X1", "9N1", "8N3", "8n1", "", "8N1 "])
-def test_a_format_that_is_none_is_refused(format: str) -> None:
+def test_invalid_format_is_refused(format: str) -> None:
     with pytest.raises(ValueError, match="format"):
         Settings(9600, format)
 
 
 @pytest.mark.parametrize("baudrate", [0, -9600, 10**9])
-def test_a_baud_rate_that_is_none_is_refused(baudrate: int) -> None:
+def test_invalid_baud_rate_is_refused(baudrate: int) -> None:
     with pytest.raises(ValueError, match="baud rate"):
         Settings(baudrate, "8N1")

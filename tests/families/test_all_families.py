@@ -64,7 +64,7 @@ def test_the_models_by_name() -> None:
 
 
 @family
-def test_a_family_says_what_it_is(family: type[Drive]) -> None:
+def test_each_family_has_a_title_and_a_manual(family: type[Drive]) -> None:
     assert family.__doc__
     assert len(family.__doc__) > 500
     assert family.manual
@@ -95,7 +95,7 @@ def test_a_family_names_its_terminals(family: type[Drive]) -> None:
     assert family.line_terminals == TERMINALS[family.model]
 
 
-def test_a_framing_that_a_family_lacks_is_told_with_the_one_to_write() -> None:
+def test_unknown_framing_is_refused_with_the_right_one() -> None:
     with pytest.raises(
         ValueError, match=r"^framing 'ascii' is not one of .*: delixi; write delixi, or leave"
     ):
@@ -103,7 +103,7 @@ def test_a_framing_that_a_family_lacks_is_told_with_the_one_to_write() -> None:
 
 
 @pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
-def test_units_that_a_delixi_s_manual_does_not_print_are_said_to_be_inferred(family: type[Drive]) -> None:
+def test_delixi_units_not_in_the_manual_are_marked_as_inferred(family: type[Drive]) -> None:
     of_p05 = [each for each in family.registers.values() if 501 <= each.address <= 510 and each.unit]
     assert len(of_p05) == 7
     assert all("unit is inferred" in each.note for each in of_p05)
@@ -115,7 +115,7 @@ def test_a_framing_by_its_number_is_the_framing(family: type[Drive]) -> None:
     assert family(1, framing=int(first)).framing is first  # type: ignore[arg-type]
 
 
-def test_the_class_of_all_families_is_none() -> None:
+def test_drive_base_class_cannot_be_used_as_a_family() -> None:
     with pytest.raises(TypeError, match=r"^Drive is the base class: use a family, such as YD1000, or "):
         Drive(1)
 
@@ -183,14 +183,14 @@ def test_limits_hold_for_tables_that_the_family_has(family: type[Drive]) -> None
 
 
 @family
-def test_each_register_says_where_it_comes_from(family: type[Drive]) -> None:
+def test_each_register_has_a_source(family: type[Drive]) -> None:
     for name, register in family.registers.items():
         assert register.place or register.outside, name
         assert getattr(family, name) is register
 
 
 @table("family, register", registers(lambda each: each.span))
-def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
+def test_span_ends_can_be_encoded_and_values_beyond_cannot(
     family: type[Drive], register: Register[Any]
 ) -> None:
     assert register.span
@@ -227,7 +227,7 @@ def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[A
 
 
 @family
-def test_what_is_never_written_is_not_writable(family: type[Drive]) -> None:
+def test_register_with_never_is_not_writable(family: type[Drive]) -> None:
     assert not [register for register in family.registers.values() if register.never and register.writable]
 
 
@@ -320,7 +320,7 @@ NUMBERS = registers(lambda each: each.values is None and each.writable)
 @pytest.mark.parametrize(("family", "register"), NUMBERS, ids=told)
 @settings(max_examples=examples(10))
 @given(data=st.data())
-def test_what_is_shown_can_be_typed(
+def test_formatted_values_can_be_parsed(
     family: type[Drive], register: Register[Any], data: st.DataObject
 ) -> None:
     value = data.draw(_values(register))
@@ -329,7 +329,7 @@ def test_what_is_shown_can_be_typed(
 
 
 @pytest.mark.slow
-def test_drives_import_what_they_may() -> None:
+def test_families_import_only_allowed_modules() -> None:
     for path in Path(multidrop.families.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             assert not isinstance(node, ast.Import) or all(
@@ -364,7 +364,7 @@ def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
     return found
 
 
-def test_no_part_of_a_verb_is_called_and_not_carried_out() -> None:
+def test_each_script_is_run_with_yield_from() -> None:
     """Without `yield from` a script does nothing, and nobody says so."""
     rooms = (Path(multidrop.families.__file__).parent, Path(multidrop.drive.__file__).parent)
     trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.glob("*.py")}
@@ -399,14 +399,14 @@ def test_a_family_without_a_verb_says_so() -> None:
             next(getattr(Mute(1), name).script(*given))
 
 
-def test_a_state_is_told_with_all_that_is_known() -> None:
+def test_state_as_text_has_all_its_facts() -> None:
     said = State(Condition.FAULT, Direction.REVERSE, "OVERCURRENT", "watchdog is off")
     assert str(said) == "fault reverse (OVERCURRENT) - watchdog is off"
     assert str(State(Condition.UNKNOWN)) == "unknown"
 
 
 @family
-def test_a_register_is_no_attribute_to_assign_to(family: type[Drive]) -> None:
+def test_assigning_to_a_register_is_refused(family: type[Drive]) -> None:
     drive = family(1)
     name = next(iter(drive.registers))
     with pytest.raises(AttributeError, match=rf"^{name} is a register, which drive.write\('{name}', VALUE\)"):

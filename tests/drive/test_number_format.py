@@ -127,7 +127,7 @@ def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> N
 
 @table("name", ["f32", "f32_swapped", "scaled", "unscaled", "u16"])
 @table("value", [math.nan, math.inf, -math.inf, 3.5e38, -1e300, 10**400, -(10**5000)], ids=range(7))
-def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value: float) -> None:
+def test_value_outside_the_number_format_is_refused(attached: Any, name: str, value: float) -> None:
     line, meter, _ = attached
     before = len(line.written)
     with pytest.raises(WriteForbidden, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
@@ -165,7 +165,7 @@ def test_a_half_float_is_shown_as_short_as_it_reads_back(capsys: pytest.CaptureF
         Meter.f16.encode(65520)
 
 
-def test_an_end_of_a_span_that_no_float32_is_can_be_written(attached: Any) -> None:
+def test_span_end_between_two_float32_values_can_be_written(attached: Any) -> None:
     _, meter, _ = attached
     assert meter.write(Meter.narrow, 0.1) == pytest.approx(0.1)
     with pytest.raises(WriteForbidden, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
@@ -188,7 +188,7 @@ def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
     assert sim["f32"] == math.inf
 
 
-def test_what_the_command_line_takes_and_tells(capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     (single,) = struct.unpack(">f", struct.pack(">f", 12.1))
     assert nearest_value(Meter.f32, Meter.f32.parse("12.1")) == single
     assert capsys.readouterr().err == ""  # shown as it was typed
@@ -210,7 +210,7 @@ def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, t
 # ---- what is common in devices ----
 
 
-def test_a_long_register_is_read_where_no_limit_is_stated(attached: Any) -> None:
+def test_long_register_is_read_without_a_stated_limit(attached: Any) -> None:
     _, meter, sim = attached
     sim["total"] = 0x12345
     assert meter.read(Meter.total) == 0x12345

@@ -109,7 +109,7 @@ def test_start_clears_both_stops_and_leaves_the_setpoint_alone() -> None:
     assert wire.sent == [STOP_OFF, frame(wire.drive, ErmanERG220.emergency_stop_coil, Coil.OFF), START_ON]
 
 
-def test_there_is_no_reverse() -> None:
+def test_reverse_is_unsupported() -> None:
     wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
     with pytest.raises(Unsupported, match="reverse"):
         wire.drive.start(Direction.REVERSE)
@@ -118,7 +118,7 @@ def test_there_is_no_reverse() -> None:
     assert wire.sent[-1] == START_ON
 
 
-def test_start_is_refused_while_a_fault_may_stand() -> None:
+def test_start_is_refused_until_the_last_fault_is_reset() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=r"overheat.*reset_fault.*acknowledged_fault = 64"):
         wire.drive.start()
@@ -133,7 +133,7 @@ def test_start_is_refused_while_a_fault_may_stand() -> None:
 
 
 @pytest.mark.parametrize("fault", ErmanFault)
-def test_no_fault_counts_as_dealt_with_by_itself(fault: ErmanFault) -> None:
+def test_fault_must_be_acknowledged_explicitly(fault: ErmanFault) -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": fault}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=f"acknowledged_fault = {int(fault)}"):
         wire.drive.start()
@@ -173,7 +173,7 @@ def test_stop_ends_in_an_emergency_stop_and_then_in_an_error() -> None:
 @pytest.mark.parametrize(
     "failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveException("drive", 2, "")]
 )
-def test_stop_ends_in_an_emergency_stop_where_the_ramp_cannot_be_read(failure: Exception) -> None:
+def test_stop_escalates_to_emergency_stop_without_a_readable_ramp(failure: Exception) -> None:
     says = {**STOPPED, "deceleration_time": failure, "status": ErmanStatus.RUNNING}
     stops = {EMERGENCY_ON: {"status": ErmanStatus.STOPPED}}
     wire = Wire(ErmanERG220(1), says, turns=stops)
@@ -185,7 +185,7 @@ def test_stop_ends_in_an_emergency_stop_where_the_ramp_cannot_be_read(failure: E
     assert wire.sent == [EMERGENCY_ON, START_OFF]
 
 
-def test_start_is_written_off_though_nobody_confirms_the_stop() -> None:
+def test_start_coil_is_written_off_after_an_unconfirmed_stop() -> None:
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
     for stop in (STOP_ON, EMERGENCY_ON):
         wire = Wire(ErmanERG220(1), STOPPED, {stop: lost})
@@ -239,7 +239,7 @@ def test_start_needs_a_setpoint_that_is_still_there() -> None:
     assert wire.sent == sent
 
 
-def test_a_start_that_has_no_effect_is_unconfirmed_and_says_what_to_set() -> None:
+def test_start_without_effect_is_unconfirmed_and_names_the_setting() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     with pytest.raises(Unconfirmed, match=r"to run; stop it, or it may start later; b\.001 must be 2"):
         wire.drive.start()
@@ -327,7 +327,7 @@ def test_identify_refuses_the_models_03_and_04() -> None:
 
 
 @pytest.mark.parametrize("name", ["coast", "jog"])
-def test_what_the_document_does_not_have(name: str) -> None:
+def test_undocumented_verbs_are_unsupported(name: str) -> None:
     wire = Wire(ErmanERG220(1))
     with pytest.raises(Unsupported, match="ERMAN"):
         getattr(wire.drive, name)()
