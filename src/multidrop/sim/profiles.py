@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from multidrop.families.profiles.cia402 import CiA402Control, CiA402Status
 from multidrop.families.profiles.danfoss_fc import DanfossControl, DanfossStatus
 from multidrop.families.profiles.delta import (
@@ -270,12 +272,22 @@ class SimulatedInvt(ProfileDrive):
         self._jogs = False
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
-        if cell.name == "control" and raw in _STARTS and self.motor.fault:
+        if cell.name == "control" and self._canonical(raw) in _STARTS and self.motor.fault:
             raise Refusal(Reason.CANNOT)
         return super().accept(cell, raw)
 
-    def _control(self, word: int) -> None:
-        if self.is_local or (word == InvtControl.STOP and self._jogs and self.jog_needs_own_stop):
+    def _canonical(self, raw: int) -> InvtControl | None:
+        """Return the profile's word for a raw count, which the family may number itself."""
+        values: Any = self.drive.register("control").values
+        return next((InvtControl[member.name] for member in values if member == raw), None)
+
+    def _control(self, raw: int) -> None:
+        word = self._canonical(raw)
+        if (
+            self.is_local
+            or word is None
+            or (word == InvtControl.STOP and self._jogs and self.jog_needs_own_stop)
+        ):
             return
         actions = {
             InvtControl.FORWARD: lambda: self.motor.run(1),
@@ -287,7 +299,7 @@ class SimulatedInvt(ProfileDrive):
             InvtControl.RESET_FAULT: self.motor.reset,
             InvtControl.STOP_JOG: self.motor.stop,
         }
-        actions[InvtControl(word)]()
+        actions[word]()
         self._jogs = word in (InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
 
     def _state(self) -> int:

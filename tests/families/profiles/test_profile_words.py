@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import IntEnum, IntFlag
+from pathlib import Path
 from typing import Any
 
 import checksums
 import pytest
-from profile_families import MAKE
+from profile_families import MAKE, Goodrive
 from scripts import Wire
 from tables import table
 
+from multidrop import Bus, load_family
 from multidrop.drive import (
     Condition,
     Direction,
@@ -21,6 +24,10 @@ from multidrop.drive import (
     Unsupported,
     WriteForbidden,
 )
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.register import Register, command
+from multidrop.sim import SimulatedDrive, Simulator, simulated
+from multidrop.sim import Wire as SimulatedWire
 
 # Each without its checksum: address 1, function 06, where the manual has the word.
 ABB = "01 06 00 00 "  # 40001 (ACS355 manual p. 313)
@@ -346,3 +353,102 @@ def test_a_profidrive_that_does_not_get_ready_to_operate_is_switched_off() -> No
     with pytest.raises(NotVerified, match="not ready to operate"):
         found.drive.start()
     assert sent(found) == [ABB + "04 76", ABB + "04 77", ABB + "04 7E"]
+
+
+# ---- a family with numbers of its own for INVT's words ----
+
+EXCHANGED = {"forward": 1, "reverse": 2, "stop": 6, "coast": 5, "reset_fault": 7}
+
+
+def numbered(words: Mapping[str, int], **facts: Any) -> Register[Any]:
+    make: Any = IntEnum
+    return command(0x2000, make("Words", words), **facts)
+
+
+class Clone(Goodrive):
+    """A copy of INVT's words with 5 and 6 exchanged, and without jogs."""
+
+    control = numbered(EXCHANGED)
+
+
+def test_renumbered_words_are_sent() -> None:
+    drive: Any = Clone(1)
+    drive.commanded = 40.0
+    found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
+    drive.stop()
+    drive.coast()
+    assert sent(found) == [DELTA + "00 06", DELTA + "00 05"]
+    assert Clone.control.harmless == (6, 5)
+    assert Goodrive.control.harmless == (5, 6, 8)
+
+
+def test_renumbered_stop_is_the_only_stop_of_a_turning_motor_without_jogs() -> None:
+    drive: Any = Clone(1)
+    found = Wire(drive, {**FREE, "status": [drive.status.values(GD_RUNS), drive.status.values(GD_STANDBY)]})
+    drive.stop()
+    assert sent(found) == [DELTA + "00 06"]
+
+
+def test_words_that_a_family_leaves_out_are_unsupported() -> None:
+    control = numbered({"forward": 1, "stop": 0, "reset_fault": 9})
+    drive: Any = type("Short", (Goodrive,), {"control": control})(1)
+    drive.commanded = 40.0
+    found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
+    for call in (drive.coast, drive.jog, lambda: drive.start(Direction.REVERSE)):
+        with pytest.raises(Unsupported):
+            call()
+    assert found.sent == []
+
+
+@table(
+    ("words", "mistake"),
+    [
+        ({"forward": 1, "stop": 6}, "control: the number of reset_fault is missing"),
+        ({**EXCHANGED, "crawl": 9}, "control: crawl is not a word of this profile; it has forward, reverse"),
+        ({**EXCHANGED, "stop": 5}, "control: two of its words have one number"),
+        ({**EXCHANGED, "jog_forward": 3}, "control: a jog needs the number of stop_jog"),
+        ({**EXCHANGED, "stop": 0x10000}, "control: STOP = 65536 is not within 0 to 65535"),
+    ],
+)
+def test_wrong_numbers_of_words_are_reported(words: Mapping[str, int], mistake: str) -> None:
+    with pytest.raises(DeclarationError) as wrong:
+        type("Wrong", (Goodrive,), {"control": numbered(words)})
+    assert any(each.startswith(mistake) for each in wrong.value.mistakes)
+
+
+def test_renumbered_words_are_not_bits() -> None:
+    with pytest.raises(DeclarationError, match="its words are whole numbers"):
+        type("Bits", (Goodrive,), {"control": command(0x2000, IntFlag("Bits", {"forward": 1, "stop": 2}))})
+
+
+CLONE_FILE = """
+[family]
+title = "Clone"
+manual = "Clone manual, section 8"
+profile = "invt"
+counts_from = 0
+
+[command]
+control = { at = 0x2000, values = { forward = 1, reverse = 2, stop = 6, coast = 5, reset_fault = 7 } }
+
+[setting]
+reference = { at = 0x2001, unit = "Hz", step = 0.01, span = [0, 400], kept = "ram" }
+
+[reading]
+status = { at = 0x2100 }
+output_frequency = { at = 0x3000, unit = "Hz", step = 0.01 }
+"""
+
+
+def test_family_file_with_renumbered_words_runs_and_stops_its_simulation(tmp_path: Path) -> None:
+    (tmp_path / "clone.toml").write_text(CLONE_FILE)
+    family = load_family(tmp_path / "clone.toml")
+    sim: SimulatedDrive = simulated(family(1))
+    with Simulator([SimulatedWire([sim])]) as line, Bus(line.wires[0].path) as bus:
+        drive: Any = bus.attach(family, address=1, confirmed=1)
+        drive.set_frequency(20)
+        drive.start()
+        assert sim.motor.goal == 20
+        drive.stop()
+        assert sim.motor.frequency == 0
+        assert drive.state().condition is Condition.STOPPED

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum
-from typing import ClassVar
+from typing import Any, ClassVar, cast
 
 from multidrop.drive import BusError, DriveException, WriteForbidden
 from multidrop.drive.register import Access
@@ -47,8 +47,9 @@ _DIRECTIONS: Mapping[int, Direction] = {
 class Invt(Profile):
     """INVT's words: one number each for forward, reverse, jog, stop, coast and reset.
 
-    - Other makes have copied the words with 5 and 6 the other way round (both stop), and some with 5 for
-      reverse: compare the manual's list with `InvtControl`, word by word, before a family is declared.
+    - Other makes have copied the words with 5 and 6 exchanged (both stop), and some with 5 for reverse. Such
+      a family names its own numbers in `control`: `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A
+      word that it leaves out is never sent. Compare them with the manual's list, word by word.
     - A stop may not end a jog: if the motor still turns after it, the stop is refused, or the state is
       unknown, STOP_JOG follows at once. A start may not end a jog either: after a jog a stop is required.
     """
@@ -62,6 +63,7 @@ class Invt(Profile):
             (Access.COMMAND,),
             values=InvtControl,
             harmless=(InvtControl.STOP, InvtControl.COAST, InvtControl.STOP_JOG),
+            renumbered=("forward", "stop", "reset_fault"),
         ),
         "status": Role((Access.READING,), values=InvtStatus),
     }
@@ -86,6 +88,15 @@ class Invt(Profile):
     def _condition(self, status: int) -> Condition:
         return Condition.UNKNOWN if self._impossible(status) else super()._condition(status)
 
+    def _has(self, word: InvtControl) -> bool:
+        return word.name in cast(Any, self.control.values).__members__
+
+    def _word(self, count: int, role: str = "control") -> Any:
+        word = InvtControl(count)
+        if not self._has(word):
+            raise self._unsupported(f"{word.name.lower().replace('_', ' ')} command")
+        return cast(Any, self.control.values)[word.name]
+
     def _reverse(self, direction: Direction | None, status: int) -> bool:
         return (direction or self._direction(status)) is Direction.REVERSE
 
@@ -104,9 +115,9 @@ class Invt(Profile):
         status = yield from self._status()
         yield from self._may_jog(status)
         reverse = self._reverse(direction, status)
+        word = self._word(InvtControl.JOG_REVERSE if reverse else InvtControl.JOG_FORWARD)
         self._jogged = True
-        word = InvtControl.JOG_REVERSE if reverse else InvtControl.JOG_FORWARD
-        yield from write(self.control, self._word(word))
+        yield from write(self.control, word)
         yield from self._started(direction)
 
     def _stop_by(self, word: int) -> Script[None]:
@@ -116,10 +127,11 @@ class Invt(Profile):
         except WriteForbidden:  # another drive is there
             raise
         except BusError:  # a silent drive may still hear, and jog
-            with suppress(BusError):
-                yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
+            if self._has(InvtControl.STOP_JOG):
+                with suppress(BusError):
+                    yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
             raise
-        if may_jog:
+        if may_jog and self._has(InvtControl.STOP_JOG):
             with suppress(DriveException):  # as without a jog
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG))
         yield from self._watch_stop()

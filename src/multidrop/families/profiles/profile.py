@@ -42,7 +42,8 @@ class Role:
     never_together: tuple[int, ...] = ()
     moves: bool | None = None
     units: tuple[str, ...] = ()  # empty: any
-    extra: tuple[str, ...] = ()
+    extra: tuple[str, ...] = ()  # names of bits that a family may add
+    renumbered: tuple[str, ...] = ()  # the words that a family with numbers of its own needs
     needed: bool = True
 
     @property
@@ -123,7 +124,9 @@ def _word_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str
     if register.values is None:
         return
     known = ", ".join(role.extra)
-    if not role.extra:
+    if role.renumbered:
+        yield from _renumbering_errors(name, role, register.values)
+    elif not role.extra:
         yield f"{name}: its values are {_CODED}"
     elif unknown := [member.name for member in register.values if member.name.lower() not in role.extra]:
         yield f"{name}: bits may only add {known}, and not {', '.join(unknown)}"
@@ -141,13 +144,36 @@ def _extra_errors(name: str, role: Role, extra: type[Any]) -> Iterator[str]:
             yield f"{name}: bit {int(member).bit_length() - 1} is {taken[int(member)]} in this profile"
 
 
+def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[str]:
+    """Find errors in a family's own numbers for the profile's words."""
+    assert role.values is not None
+    known = [str(member.name).lower() for member in role.values]
+    names = [name.lower() for name in values.__members__]
+    if not issubclass(values, IntEnum):
+        yield f"{name}: its words are whole numbers, so write values and not bits"
+    elif unknown := [one for one in names if one not in known]:
+        yield f"{name}: {', '.join(unknown)} is not a word of this profile; it has {', '.join(known)}"
+    elif missing := [one for one in role.renumbered if one not in names]:
+        yield f"{name}: the number of {', '.join(missing)} is missing"
+    elif len(values) < len(names):
+        yield f"{name}: two of its words have one number"
+    elif {"jog_forward", "jog_reverse"} & {*names} and "stop_jog" not in names:
+        yield f"{name}: a jog needs the number of stop_jog; add it, or leave the jogs out"
+
+
 def completed(role: Role, register: Register[Any]) -> Register[Any]:
     """Return the family's declaration, completed by the profile's facts of the role."""
     facts: dict[str, Any] = {"moves": role.moves}
-    if role.values is not None:
+    harmless = role.harmless
+    if role.renumbered and register.values is not None:
+        numbers = {name.upper(): int(member) for name, member in register.values.__members__.items()}
+        facts["values"] = _enumeration(IntEnum, register.name, numbers)
+        safe = [member.name for member in cast(Any, role.values) if member in (harmless or ())]
+        harmless = tuple(numbers[name] for name in safe if name in numbers)
+    elif role.values is not None:
         facts["values"] = _with_extra(role.values, register.values)
-    if role.harmless is not None:
-        facts["harmless"] = role.harmless
+    if harmless is not None:
+        facts["harmless"] = harmless
         facts["never_together"] = role.never_together
     return replace(register, **facts)
 
@@ -156,8 +182,11 @@ def _with_extra(values: type[IntEnum | IntFlag], extra: type[Any] | None) -> typ
     if extra is None:
         return values
     members = {str(member.name): int(member) for one in (values, extra) for member in one}
-    make: Any = IntFlag  # its call makes a class, which type checkers know of literals alone
-    return cast(type[Any], make(values.__name__, {name.upper(): bits for name, bits in members.items()}))
+    return _enumeration(IntFlag, values.__name__, {name.upper(): bits for name, bits in members.items()})
+
+
+def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
+    return cast(type[Any], kind(name, members))
 
 
 STOP_TIME = 60.0  # s; the deceleration ramp is a role of no profile
@@ -350,9 +379,11 @@ class Profile(Drive):
         if self._turns(status):
             raise self._stop_first("turns, and may go on through a jog:")
 
-    def _word(self, count: int) -> Any:
-        assert self.control.values is not None
-        return self.control.values(count)
+    def _word(self, count: int, role: str = "control") -> Any:
+        """Return the value of a role for one of the profile's words."""
+        values = self.register(role).values
+        assert values is not None
+        return values(count)
 
     @verb
     def stop(self) -> Script[None]:
@@ -402,9 +433,8 @@ class Profile(Drive):
     def _pulse(self) -> Script[None]:
         """Write the reset once, then clear its bit, so that it cannot reset a later fault."""
         register: Register[Any] = self.register(self.reset_role)
-        assert register.values is not None
         try:
-            yield from write(register, register.values(self.reset_word))
+            yield from write(register, self._word(self.reset_word, self.reset_role))
         except (Unconfirmed, DriveException):
             yield from self._take_reset_back()
             raise
