@@ -316,7 +316,7 @@ def test_a_register_has_one_name_and_one_class() -> None:
         torque = reading(2, "%")
 
     class Less(Base):
-        """Has one of them no more."""
+        """Replaces one register."""
 
         speed = None  # type: ignore[assignment]
 
@@ -397,7 +397,7 @@ def test_facts_and_registers_are_reported_together() -> None:
 
 @pytest.mark.parametrize("name", [*VERBS, "identify"])
 def test_method_without_verb_decorator_is_reported(name: str) -> None:
-    """A call of it would make a generator, and send nothing."""
+    """Such a call would only make a generator, and send no request."""
 
     def script(self: Any) -> Script[None]:
         yield from insist(self.control, 0)

@@ -1,4 +1,4 @@
-"""A drive's state out of values that somebody has: the family is asked again where it may say another one."""
+"""A drive's state from known values, computed again only if it may have changed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
 
 
 class Counting(Drive):
-    """It counts how often it is asked, where no copy of it does."""
+    """Counts its calls, across all copies."""
 
     looks: list[float] = []
     speed = reading(0x10)
@@ -33,7 +33,7 @@ class Counting(Drive):
 
 
 class Noting(Drive):
-    """It stands only when it has shown 0 twice, and so must be asked each time."""
+    """It is at rest only after two readings of 0, so its state is computed each time."""
 
     speed = reading(0x10)
 
@@ -43,7 +43,7 @@ class Noting(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Standing when it has stood for two looks."""
+        """At rest after two readings of 0."""
         speed = yield from read(self.speed)
         self.zeros = 0 if speed else self.zeros + 1
         return STANDS if self.zeros > 1 else RUNS
@@ -75,7 +75,7 @@ def test_a_family_that_notes_something_is_asked_each_time() -> None:
     assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
 
 
-# Words of the manuals. A Delixi by Modbus has no status: of a fault its code alone tells.
+# Words of the manuals. A Delixi with Modbus has no status; only the fault code shows a fault.
 @pytest.mark.parametrize(
     ("model", "values", "condition"),
     [

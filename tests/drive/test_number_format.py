@@ -24,7 +24,7 @@ from multidrop.sim import SimulatedDrive
 
 SEVERAL = Table("holding register, several at once", 0x03, 0x10)
 RELAYS = Table("coil, several at once", 0x01, 0x0F, Carrier.BIT)
-PACKED = {  # what a document calls them
+PACKED = {  # names in documents
     NumberFormat.U16: ">H",
     NumberFormat.I16: ">h",
     NumberFormat.U32: ">I",
@@ -35,7 +35,7 @@ PACKED = {  # what a document calls them
 
 
 class Meter(Drive):
-    """A setting of each format, and what a drive's manual says besides; no limit on a read is stated."""
+    """A setting of each format; no read limit is stated."""
 
     u16 = setting(0, "V", kept=Kept.RAM)
     i16 = setting(1, "V", number_format=NumberFormat.I16, kept=Kept.RAM)
@@ -184,7 +184,7 @@ def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
     for value in (0.2, -1e-9, math.nan, math.inf):
         assert answer(value).exception == 3
     assert sim["narrow"] == pytest.approx(0.05)
-    sim["f32"] = 1e300  # cut off where it does not fit
+    sim["f32"] = 1e300  # cut off if it does not fit
     assert sim["f32"] == math.inf
 
 
@@ -207,7 +207,7 @@ def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, t
     assert value_text(Meter.unscaled, value) == text
 
 
-# ---- what is common in devices ----
+# ---- common in devices ----
 
 
 def test_long_register_is_read_without_a_stated_limit(attached: Any) -> None:

@@ -1,4 +1,4 @@
-"""A drive of a user's own: what can move its motor is not written by mistake, and its stop always is."""
+"""A user's own drive: motor commands are never written by mistake, and its stop is always sent."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Fan(Drive):
 
 
 class Pump(Fan):
-    """With a control word, of which its author says nothing, and verbs."""
+    """Has verbs, and a control word without further facts."""
 
     control = command(0x30, Word)
     target = command(0x31, "Hz", step=0.1, span=(0, 60), moves=False)
@@ -44,7 +44,7 @@ class Pump(Fan):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop it, as somebody writes it who has not read of `insist`."""
+        """Stop it without `insist`."""
         yield from write(self.control, Word.STOP)
 
     @verb
@@ -65,7 +65,7 @@ class Pump(Fan):
 
 
 class Known(Pump):
-    """One that says what it is."""
+    """Has `identify`."""
 
     kind = reading(0x40)
     control = command(0x30, Word, harmless=(Word.STOP,))
@@ -109,7 +109,7 @@ def test_command_is_left_to_verbs_by_default(
 
 def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     class Bare(Drive):
-        """Has a command and nothing else."""
+        """Has only a command."""
 
         level = reading(1)
         run = command(2)
@@ -125,7 +125,7 @@ def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.M
 
 def test_harmless_counts_need_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stoppable(Pump):
-        """Its author says what is harmless."""
+        """Declares its harmless counts."""
 
         control = command(0x30, Word, harmless=(Word.STOP,))
 

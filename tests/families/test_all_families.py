@@ -124,7 +124,7 @@ def test_drive_base_class_cannot_be_used_as_a_family() -> None:
 @table("name", ["start", "jog"])
 @table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
 def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
-    """A word that is no Direction must not turn the motor the other way; nothing is sent."""
+    """A value other than a Direction must not turn the motor; no frame is sent."""
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
     sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
@@ -271,7 +271,7 @@ def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
-    """Written in any framing, taken by the drive as it stands in the frame, and read back."""
+    """Written in any framing, held by the drive as sent, and read back."""
     drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
     value = data.draw(_values(register))
     asked = write_request(drive, register, register.encode(value))
@@ -342,7 +342,7 @@ def test_families_import_only_allowed_modules() -> None:
 
 
 def scripts_of(tree: ast.AST) -> set[str]:
-    """Return the names of functions that do nothing but where what they return is gone through."""
+    """Return the names of generator functions, which run only when iterated."""
     return {
         node.name
         for node in ast.walk(tree)
@@ -353,7 +353,7 @@ def scripts_of(tree: ast.AST) -> set[str]:
 
 
 def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
-    """Return the lines at which such a function is called, and what it returns is thrown away."""
+    """Return the lines that call such a function and drop the generator."""
     calls = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
     found = []
     for call in calls:
@@ -365,7 +365,7 @@ def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
 
 
 def test_each_script_is_run_with_yield_from() -> None:
-    """Without `yield from` a script does nothing, and nobody says so."""
+    """Without `yield from` a script silently does not run."""
     rooms = (Path(multidrop.families.__file__).parent, Path(multidrop.drive.__file__).parent)
     trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.glob("*.py")}
     scripts = {"script"}.union(*map(scripts_of, trees.values()))

@@ -294,7 +294,7 @@ def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
         (2, 64, Condition.ACCELERATING, ""),
         (3, 0, Condition.DECELERATING, ""),
         (0x21, 0, Condition.RUNNING, "motor overloaded"),
-        (0x8001, 0, Condition.RUNNING, ""),  # reserved bits are not looked at
+        (0x8001, 0, Condition.RUNNING, ""),  # reserved bits are ignored
         (
             0,
             0x0402,

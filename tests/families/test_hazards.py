@@ -1,8 +1,8 @@
-"""Hazards: what a naive client would send, and that this library sends the safe thing or refuses.
+"""Hazards: the frames of a naive client, and the safe frames or the refusal of this library.
 
-A row for each collision of addresses between families, and for each place where a family's document
-errs or is silent, as far as that concerns a client. `naive` must never leave: what the document
-prints, where it prints a frame. `sends` is all that leaves instead, reads left out. Both are
+A row for each collision of addresses between families, and for each error or gap in a family's document
+that concerns a client. `naive` must never be sent: the document's frame, if it prints one. `sends` is all
+that is sent instead, without reads. Both are
 without their checksum.
 """
 
@@ -55,7 +55,7 @@ def yd() -> Drive:
 
 @dataclass(frozen=True)
 class Hazard:
-    """`do(line, drive, sim)` is what a user does; `shows` is set on the simulated drive before."""
+    """`do(line, drive, sim)` is the user's action; `shows` is set on the simulated drive before."""
 
     place: str
     drive: Callable[[], Drive]
@@ -503,7 +503,7 @@ def test_y2_the_low_byte_of_the_checksum_goes_first(monkeypatch: pytest.MonkeyPa
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
 
 
-# ---- errata of what is read ----
+# ---- errata of reads ----
 
 
 def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
@@ -687,7 +687,7 @@ def test_0_8_eeprom_registers_are_declared() -> None:
 
 
 def test_0_3_adapter_echo_is_not_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing but the request's copy ever comes: no write leaves, because no read is answered."""
+    """Only copies of requests arrive: no write is sent, because no read is answered."""
     line = SimulatedBus(monkeypatch)
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:

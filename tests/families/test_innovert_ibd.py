@@ -98,7 +98,7 @@ def test_words_never_have_the_toggle_or_reserved_bits() -> None:
 
 def test_terminals() -> None:
     assert [bit.value for bit in Terminals] == [1 << at for at in (*range(11), 13)]
-    printed = InnovertIBD.terminals.decode(0x1800)  # in the example, where bits 11 and 12 have no name
+    printed = InnovertIBD.terminals.decode(0x1800)  # in the example; bits 11 and 12 have no name
     assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
 
 

@@ -166,7 +166,7 @@ def test_stop_waits_for_standby() -> None:
 
 
 def test_a_jog_that_goes_on_through_the_stop_is_stopped_at_once() -> None:
-    """Whoever began it: not when `stop_time` is over, nor only where more time than that is given."""
+    """For any caller: neither only after `stop_time`, nor only if more time is given."""
     wire = Wire(
         InvtCHE(1),
         {"status": CHEStatus.FORWARD},
@@ -245,7 +245,7 @@ def test_stop_refused_at_rest_counts_as_stopped() -> None:
         wire.drive.stop()
     assert told.value is refusal
     wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.STANDBY]}, loses)
-    wire.drive.stop()  # it stands when both were refused
+    wire.drive.stop()  # at rest after both were refused
     assert wire.sent == [STOP] * 3 + [STOP_JOG] * 3
     assert wire.reads == ["status"] * 2
 
@@ -363,7 +363,7 @@ def test_a_parameter_of_ones_own_is_written_to_ram() -> None:
 
 
 def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Written where it is kept, and counted; 11.6.2 has the frame, with a value that means nothing here."""
+    """Written to EEPROM, and counted; 11.6.2 has the frame, with an unexplained value."""
 
     class Mine(InvtCHE):
         """A CHE whose owner has its manual."""

@@ -196,7 +196,7 @@ def test_an_extended_parameter_has_its_name_s_number() -> None:
             name = register.place.removeprefix("6.2, ")
             assert f"F{register.address:03X}" == name
             with pytest.raises(ValueError, match=f"^{name} is declared by every YD1000, as {register.name}$"):
-                extended(name)  # nor is what is never written declared anew as writable
+                extended(name)  # nor is a register with `never` redeclared as writable
     for wrong in ("F1000", "F24A", "f240", "240", "F24"):
         with pytest.raises(ValueError, match="F and three digits"):
             extended(wrong)
@@ -414,7 +414,7 @@ def test_coast() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
-    assert wire.seconds == 0.1  # between two looks: the drive may show 0 for a moment
+    assert wire.seconds == 0.1  # between two readings: the drive may show 0 for a moment
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
     with pytest.raises(Unconfirmed, match="5 s"):
         wire.drive.coast()
@@ -438,7 +438,7 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
 
 
 def test_a_start_after_a_reset_is_at_the_setpoint_that_was_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The restart loses it: at another one, which the drive has by itself, nobody asked for a start."""
+    """The restart loses it: a start at the drive's own setpoint was not requested."""
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.set_frequency(30)
     wire.drive.reset_fault()
@@ -651,7 +651,7 @@ def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.Monk
 def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nothing is frozen then, and the record is new to nobody who did not look before."""
+    """No register is frozen then, and the record is new only to an object that read it before."""
     _, drive, _ = one(monkeypatch, YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)

@@ -38,7 +38,13 @@ def found(device: ImportedDevice) -> list[str]:
             "40001 may be the number that is sent, or register 1 of table 4",
         ),
         ("address,type", "32080,uint16", 2079, "input", "32080 may be the number"),
-        ("address,type,table", "30775,uint16,holding", 30775, None, ""),  # 3 is no holding register
+        (
+            "address,type,table",
+            "30775,uint16,holding",
+            30775,
+            None,
+            "",
+        ),  # 3 is not a holding register's digit
         ("address,type", "13001,uint16", 13001, None, "13001 names a discrete, and its row a number"),
         ("address,unit", "13001,kWh", 13001, None, "13001 names a discrete, and its row a number"),
         ("address,type", "00010,int16", 10, None, "00010 names a coil, and its row a number"),
@@ -84,7 +90,7 @@ def test_unit_of_a_bit_is_a_gap(tmp_path: Path) -> None:
     assert found(device) == ["its type, unit and scale were left out: a coil is a bit"]
 
 
-# ---- what one count is ----
+# ---- the value of one count ----
 
 
 @pytest.mark.parametrize(

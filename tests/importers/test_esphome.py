@@ -26,7 +26,7 @@ def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
     ("keys", "expected"),
     [
         ("value_type: U_WORD, bitmask: 0x00F0", {"part": "4-7"}),
-        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # what is masked has no sign there
+        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # a masked number has no sign there
         ("value_type: S_WORD, bitmask: 0xFFFF", {"number_format": "I16"}),
         ("value_type: U_DWORD, bitmask: 0xFFFF", {"number_format": "U32", "part": "0-15"}),
         ("value_type: U_QWORD, bitmask: 0xFFFF", {"number_format": "U64"}),  # ignored there
@@ -63,7 +63,7 @@ def test_other_value_changes_are_gaps(tmp_path: Path, keys: str, gap: str) -> No
 
 
 def test_a_number_is_divided_by_its_multiply(tmp_path: Path) -> None:
-    """`multiply` is what a written value is multiplied by there."""
+    """`multiply` multiplies written values there."""
     assert entries(entity(tmp_path, "multiply: 10", "number"))["a"] == {"at": 5, "step": 0.1}
 
 

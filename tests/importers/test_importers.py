@@ -227,7 +227,7 @@ def test_esphome(tmp_path: Path) -> None:
     assert loaded(tmp_path, device, "level", "part", "running")["part"].part == (4, 11)
 
 
-# ---- what is refused ----
+# ---- refusals ----
 
 
 def bomb(levels: int) -> str:
@@ -263,7 +263,7 @@ def test_yaml_that_would_be_costly_is_refused(tmp_path: Path, text: str, told: s
 def test_at_most_the_registers_of_one_family_are_declared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To look at what is beyond that would be in vain: a large file has ten times as many."""
+    """Further entries are not examined: a large file has ten times as many."""
     declared: list[str] = []
 
     def noted(found: ImportedRegister) -> Register[Any]:

@@ -149,7 +149,7 @@ PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
 
 
 def entries_of(needed: str, keys: str) -> st.SearchStrategy[list[dict[str, Any]]]:
-    """Return lists of entries that have what is needed, and some other keys with values that may be none."""
+    """Return lists of entries with the required keys, and some other keys with values or null."""
     value = {key: PLAUSIBLE.get(key, ANYTHING) for key in (*needed.split(), *keys.split())}
     plausible = st.fixed_dictionaries(
         {key: value[key] for key in needed.split()}, optional={key: value[key] for key in keys.split()}

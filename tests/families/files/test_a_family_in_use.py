@@ -80,7 +80,7 @@ def test_model_path_is_relative_to_the_plant_file(plant: Path, pump: type[Drive]
 
 
 def test_the_plan_is_that_of_a_class(plant: Path) -> None:
-    """A family from a file costs on the wire exactly what a class costs."""
+    """A family from a file causes the same frames as a class."""
     loaded = load_family(plant.parent / "families" / "meter.toml")(3)
     written = Meter(3)
 
@@ -147,14 +147,14 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
     assert run("report", "run.arrows")[0] == 0
 
 
-# ---- what a file is not trusted with ----
+# ---- confirmation ----
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
 def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
     pump: type[Drive], name: str, value: str
 ) -> None:
-    """Nor what it calls harmless: without a stop verb nobody has held that against anything."""
+    """Nor are its harmless counts sent: without a stop verb they are untested."""
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2)
@@ -165,7 +165,7 @@ def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
 
 
 def test_unconfirmed_file_sends_no_broadcast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor does stop_all send what it calls a broadcast, for nobody has held that against a stop."""
+    """Nor does stop_all send its broadcast counts, which are untested."""
     path = tmp_path / "fan.toml"
     head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
     path.write_text(head + "[command]\ncontrol = { at = 0, broadcast = [0x047F] }\n")

@@ -38,7 +38,7 @@ def mistakes(folder: Path, text: str) -> list[str]:
 
 
 def facts(register: Register[Any]) -> dict[str, Any]:
-    """Return a register's facts; enumerations by what they name."""
+    """Return a register's facts; enumerations as their names."""
     found = {one.name: getattr(register, one.name) for one in dataclasses.fields(register)}
     values = register.values
     found["values"] = values and ({each.name: each.value for each in values}, values.__mro__[1])

@@ -1,4 +1,4 @@
-"""Family files that somebody damaged: each is a family, or refused with sentences; nothing else happens."""
+"""Damaged family files: each loads, or is refused with sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hazards on the way to a motor, for a drive of every profile, before its simulation."""
+"""Hazards of motor commands, with a simulated drive of every profile."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(line: Line) -> None:
     with pytest.raises(Unconfirmed, match="no reply"):
         line.drive.start()
     assert len(line.starts) == 1
-    assert line.sim.motor.energised  # it did happen, and the caller was told that it may have
+    assert line.sim.motor.energised  # it took effect, and the caller knows that it may have
 
 
 def test_a_start_that_never_arrives_is_sent_once(line: Line) -> None:
@@ -137,7 +137,7 @@ def test_a_trip_while_starting(line: Line, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_reset_never_starts_the_motor(line: Line) -> None:
-    """Nor does it where the run command stood when the drive tripped, and the drive obeys its level."""
+    """Also if the run command was active at the trip, and the drive obeys its level."""
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -217,7 +217,7 @@ def test_a_start_without_a_setpoint_is_refused(line: Line) -> None:
 
 
 def test_a_power_cycle_forgets_the_setpoint(line: Line, model: str) -> None:
-    """The motor stays off, and the next start says so, where the drive shows its setpoint."""
+    """The motor stays off, and the next start reports it if the drive shows its setpoint."""
     line.runs()
     line.sim.power_cycle()
     line.bus.sleep(5)
@@ -335,7 +335,7 @@ def test_a_frequency_out_of_range_is_refused(line: Line) -> None:
 
 
 def test_a_ramp_goes_on_from_the_setpoint_in_force(line: Line) -> None:
-    """In Hz, also where the reference is a percentage that cannot be read."""
+    """In Hz, even if the reference is an unreadable percentage."""
     line.drive.set_frequency(20)
     begun = len(line.writes)
     ramp(line.drive, 22, rate=1, every=1)
@@ -358,7 +358,7 @@ def test_a_jog_that_goes_on_through_a_stop_is_stopped_on_its_own(monkeypatch: py
 
 @pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
 def test_stop_jog_follows_an_unconfirmed_stop(monkeypatch: pytest.MonkeyPatch, is_refused: bool) -> None:
-    """Replies are lost, as where one wire is broken; or it has no word for a stop in a jog."""
+    """Replies are lost, as with one broken wire; or the drive refuses a stop during a jog."""
     line = Line(monkeypatch, "invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.jog()
@@ -450,7 +450,7 @@ def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.Mo
     assert line.starts == []
 
 
-OF_ANOTHER = {  # what a drive of the family shows only while a setting is not in force yet, if at all
+OF_ANOTHER = {  # values that the family shows at most while a setting is not in force yet
     "status": 0x0241,  # of no state of PROFIdrive
     "station": 7,
     "signature": 1,
@@ -462,7 +462,7 @@ OF_ANOTHER = {  # what a drive of the family shows only while a setting is not i
 def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_drive_s(
     monkeypatch: pytest.MonkeyPatch, first: str, second: str
 ) -> None:
-    """One make's stop is another's run, but one value alone proves nothing, nor do two stale settings."""
+    """One make's stop is another's run, but one value or two stale settings are not a proof."""
     line = Line(monkeypatch, "abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
 

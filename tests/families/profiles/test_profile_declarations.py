@@ -1,4 +1,4 @@
-"""A family of a profile: what it must declare, may not declare, and how its drives are told from others."""
+"""A family of a profile: its required and forbidden declarations, and its identification."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from multidrop.drive.register import Register, command
 from multidrop.sim import SimulatedDrive, Simulator, simulated
 from multidrop.sim import Wire as SimulatedWire
 
-# Each without its checksum: address 1, function 06, where the manual has the word.
+# Each without its checksum: address 1, function 06, as printed in the manual.
 ABB = "01 06 00 00 "  # 40001 (ACS355 manual p. 313)
 FC = "01 06 C3 4F "  # 50000, counted from 1 (FC 202 design guide p. 175)
 DELTA = "01 06 20 00 "
@@ -207,7 +207,7 @@ def test_a_motor_that_turns_is_not_jogged(model: str, status: Any) -> None:
     assert sent(found) == []
 
 
-# A setpoint of 25 Hz: half of 50 Hz where it is a percentage.
+# A setpoint of 25 Hz: half of 50 Hz if it is a percentage.
 SETPOINTS = {
     "abb-acs355": "01 06 00 01 27 10",  # 10000 of 20000 (ACS355 manual p. 308)
     "siemens-v20": "01 06 00 64 20 00",  # 2000H of 4000H
@@ -327,7 +327,7 @@ def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:
         found.drive.start()
     assert found.sent == []
     found.say({"status": found.drive.status.values(GD_STANDBY)})
-    with pytest.raises(Unconfirmed):  # it stands and so may be started, and is not seen to run
+    with pytest.raises(Unconfirmed):  # at rest, so it may be started; it is not seen to run
         found.drive.start()
     assert sent(found) == [DELTA + "00 01"]
 
