@@ -410,7 +410,7 @@ def test_hubs_with_a_device_of_one_address_each(run: Run, tmp_path: Path) -> Non
     status, _, err = run("import", source, "--address", "1")
     assert status == 2
     assert "devices at 1 of 'north', 1 of 'south'" in err
-    assert "say which, such as --address 1 --title 'north'" in err
+    assert "choose one, such as --address 1 --title 'north'" in err
     status, out, _ = run("import", source, "--address", "1", "--title", "south")
     assert (status, "amp = " in out) == (0, True)
 
@@ -419,7 +419,7 @@ def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "meter.toml", "plant.toml"))
     source.write_text(MODPOLL)
     status, out, err = run("import", source, "--out", family, "--plant", plant)
-    assert (status, "not carried over: coils: which bits bool8 means" in err) == (0, True)
+    assert (status, "not imported: coils: which bits bool8 means" in err) == (0, True)
     assert f"multidrop check {family}" in out
     assert run("check", family)[0] == 0
     assert run("plan", plant)[0] == 0
@@ -438,7 +438,7 @@ def test_import_asks_which_device(run: Run, tmp_path: Path) -> None:
     source = tmp_path / "telegraf.conf"
     source.write_text(TELEGRAF)
     status, _, err = run("import", source)
-    assert (status, "the file has devices at 3, 4: say which, such as --address 3" in err) == (2, True)
+    assert (status, "the file has devices at 3, 4: choose one, such as --address 3" in err) == (2, True)
     status, out, _ = run("import", source, "--address", "4")
     assert status == 0
     assert "volt = { at = 0x0000" in out
