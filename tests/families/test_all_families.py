@@ -328,19 +328,6 @@ def test_formatted_values_can_be_parsed(
     assert register.encode(register.parse(shown)) == register.encode(value)
 
 
-@pytest.mark.slow
-def test_families_import_only_allowed_modules() -> None:
-    for path in Path(multidrop.families.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            assert not isinstance(node, ast.Import) or all(
-                not name.name.startswith("multidrop") for name in node.names
-            )
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
-                room = node.module.split(".")[1]
-                finds = {"family_file"} if path.name == "registry.py" else set()
-                assert room in {"drive", "register", "drives"} | finds, f"{path.name} imports {node.module}"
-
-
 def scripts_of(tree: ast.AST) -> set[str]:
     """Return the names of generator functions, which run only when iterated."""
     return {
