@@ -1,4 +1,4 @@
-"""A broadcast of a stop: sent to drives of one known family alone, and ended by nothing called before it."""
+"""Broadcasts: only to drives of one known family, and never after a later stop."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ every_broadcasting = pytest.mark.parametrize("model", BROADCASTING)
 
 
 def line_of(monkeypatch: pytest.MonkeyPatch, *models: str) -> tuple[SimulatedBus, list[Any], list[Any]]:
-    """Return a line of drives from address 1 on, that have shown what they are, and their simulations."""
+    """Return a line with confirmed drives from address 1 on, and their simulations."""
     sims = [simulated(MAKE[model](address)) for address, model in enumerate(models, 1)]
     line = SimulatedBus(monkeypatch, *sims)
     drives = [line.attach(sim.drive) for sim in sims]
@@ -50,9 +50,7 @@ def test_there_are_families_with_broadcasts() -> None:
 
 
 @every_broadcasting
-def test_a_stop_of_all_is_no_broadcast_where_families_differ(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     """One family's stop may be another's run, whichever was attached first."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
@@ -66,9 +64,7 @@ def test_a_stop_of_all_is_no_broadcast_where_families_differ(
 
 
 @every_broadcasting
-def test_a_stop_of_all_is_a_broadcast_where_all_are_alike(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_stop_all_broadcasts_if_all_drives_are_alike(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
     line.bus.stop_all()
     (sent,) = broadcasts(line)
@@ -76,7 +72,7 @@ def test_a_stop_of_all_is_a_broadcast_where_all_are_alike(
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 
-def test_a_stop_of_all_where_the_family_has_no_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_without_a_broadcast_of_the_family(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, sims = line_of(monkeypatch, "erman-er-g-220", "erman-er-g-220")
     for drive in drives:
         drive.set_frequency(20)
@@ -87,7 +83,7 @@ def test_a_stop_of_all_where_the_family_has_no_broadcast(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
-def test_where_nothing_was_broadcast_and_nothing_else_is_sent_all_failed(
+def test_drives_that_got_neither_broadcast_nor_stop_have_failed(
     monkeypatch: pytest.MonkeyPatch, models: tuple[str, str]
 ) -> None:
     line, _, _ = line_of(monkeypatch, *models)
@@ -100,7 +96,7 @@ def test_where_nothing_was_broadcast_and_nothing_else_is_sent_all_failed(
 
 
 class Quiet(Toy):
-    """Its word of all drives stops none of them."""
+    """Its broadcast word stops no drive."""
 
     model = "quiet"
     broadcasts = True
@@ -116,9 +112,7 @@ class Quiet(Toy):
 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
-def test_a_word_that_is_no_stop_is_broadcast_by_no_stop(
-    monkeypatch: pytest.MonkeyPatch, confirmed: int
-) -> None:
+def test_a_stop_broadcasts_only_stop_words(monkeypatch: pytest.MonkeyPatch, confirmed: int) -> None:
     drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in drives))
     for drive in drives:
@@ -135,7 +129,7 @@ def test_a_word_that_is_no_stop_is_broadcast_by_no_stop(
 
 
 @pytest.mark.parametrize("is_sent", [False, True])
-def test_a_broadcast_that_failed_is_told_as_sent_only_where_it_may_have_left(
+def test_a_failed_broadcast_counts_as_sent_only_if_it_may_have_left(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_sent: bool
 ) -> None:
     audit = tmp_path / "audit"
@@ -160,10 +154,10 @@ def test_a_broadcast_that_failed_is_told_as_sent_only_where_it_may_have_left(
 
 
 @pytest.mark.parametrize("address", [1, 2])
-def test_nothing_is_broadcast_where_one_is_of_another_family(
+def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
     monkeypatch: pytest.MonkeyPatch, address: int
 ) -> None:
-    """A Goodrive has its setpoint where a CHE has its control word."""
+    """A Goodrive's setpoint has the address of a CHE's control word."""
     sims = [simulated(InvtCHE(at, maximum_frequency=50)) for at in (1, 2)]
     sims[address - 1]["device"] = 0x010A
     line = SimulatedBus(monkeypatch, *sims)
@@ -205,7 +199,7 @@ def setpoint_of(drive: Any) -> Any:
 
 
 @pytest.mark.parametrize("model", SETTING)
-def test_a_setpoint_is_broadcast_to_nobody_once_the_bus_was_left(
+def test_a_setpoint_is_not_broadcast_after_the_bus_is_left(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
@@ -255,7 +249,7 @@ def test_a_setpoint_that_is_late_is_not_broadcast(monkeypatch: pytest.MonkeyPatc
     assert audit.read_text(encoding="utf-8") == ""
 
 
-def test_looks_at_many_drives_make_no_setpoint_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identity_checks_of_many_drives_do_not_expire_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
     """They take longer than the time in which a write's turn must come."""
     line, drives, _ = line_of(monkeypatch, *["invt-che"] * 20)
     line.sleep(60)
@@ -264,10 +258,10 @@ def test_looks_at_many_drives_make_no_setpoint_late(monkeypatch: pytest.MonkeyPa
     assert len(broadcasts(line)) == 1
 
 
-def test_a_setpoint_is_broadcast_to_nobody_where_another_drive_may_be_there_by_now(
+def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The last one's place was taken while nobody asked it; what is at the others was asked just now."""
+    """The last drive was silent for long enough to be replaced; the others just answered."""
     line, drives, sims = line_of(monkeypatch, "invt-che", "invt-che")
     line.sleep(60)
     sims[1]["device"] = 0x010A
@@ -276,8 +270,8 @@ def test_a_setpoint_is_broadcast_to_nobody_where_another_drive_may_be_there_by_n
     assert line.written == []
 
 
-def test_a_broadcast_is_told_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The port is lost after it: nothing else is sent to any drive."""
+def test_a_broadcast_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The port is lost after it, so no other frame is sent."""
     line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
 
     def lose(request: Message) -> bytes | None:

@@ -1,4 +1,4 @@
-"""A bus and its drives, on simulated lines: what is sent, what is returned, and what goes wrong."""
+"""A bus and its drives on simulated lines: frames, results and failures."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
 
 
 @patient
-def test_a_write_returns_what_the_drive_then_holds() -> None:
+def test_a_write_returns_the_value_read_back() -> None:
     rig = simulated(Rig(1))
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
@@ -219,7 +219,7 @@ def test_eeprom_is_written_on_change_only() -> None:
 
 
 @patient
-def test_the_alias_in_ram_is_written_where_there_is_one() -> None:
+def test_the_ram_alias_is_written_if_there_is_one() -> None:
     che = simulated(MyCHE(1))
     with unpaced(che) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(MyCHE, 1)
@@ -399,7 +399,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
 
 @pytest.mark.slow
 @table("mistake", MISTAKES)
-def test_a_mistake_is_told_before_anything_is_sent(mistake: str) -> None:
+def test_a_mistake_is_raised_before_the_first_frame(mistake: str) -> None:
     call, kind, sentence = MISTAKES[mistake]
     rig = simulated(Rig(1))
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
@@ -415,7 +415,7 @@ def test_a_verb_of_a_drive_that_is_on_no_bus() -> None:
         Toy(1).start()
 
 
-# ---- what goes wrong on the line ----
+# ---- failures on the line ----
 
 
 @pytest.fixture
@@ -650,7 +650,7 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
 @pytest.mark.slow
 @patient
 def test_a_bus_that_is_closed_while_others_use_it() -> None:
-    """Whoever comes too late gets an error, and nothing worse happens.
+    """A late call gets an error.
 
     Each bus has a line of its own: a reply that is lost with a port is owed to whoever opens that port again,
     and this would be waited for as patiently.

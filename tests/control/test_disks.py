@@ -98,7 +98,7 @@ def test_closing_waits_for_a_record_that_another_thread_writes(
     assert [record["write"] for record in read_audit(path)] == ["control = STOP"]
 
 
-def test_what_is_queued_is_noted_before_the_log_is_closed(tmp_path: Path) -> None:
+def test_queued_records_are_written_before_the_log_is_closed(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     line: Any = SimpleNamespace(port="/dev/ttyUSB0", identity="usb-1")
     records = write_records.WriteRecords(line, Ledger(tmp_path / "ledger"), AuditLog(path))
@@ -115,7 +115,7 @@ def _is_record(line: bytes) -> bool:
     return True
 
 
-def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
+def test_a_full_disk_prevents_no_stop_and_later_records_are_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -139,7 +139,7 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
     ]
 
 
-def test_what_must_be_noted_first_is_not_sent_on_a_full_disk_and_a_stop_is(
+def test_on_a_full_disk_noted_first_blocks_writes_but_no_stop(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -168,7 +168,7 @@ def test_what_must_be_noted_first_is_not_sent_on_a_full_disk_and_a_stop_is(
     assert noted[-2:] == [("setpoint = 50.00 %", "called", False), ("setpoint = 50.00 %", "done", True)]
 
 
-def test_a_stop_that_was_interrupted_is_noted_as_sent_but_unknown(
+def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -268,7 +268,7 @@ def test_a_ledger_on_a_full_disk_keeps_the_write_back_and_goes_on_afterwards(
 
 
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192])
-def test_a_ledger_that_was_begun_on_a_full_disk(tmp_path: Path, room: int) -> None:
+def test_a_ledger_that_was_created_on_a_full_disk(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     with full_at(room), pytest.raises(OSError, match="cannot be kept"):
         ledger.enter(CELL, NOON, 0.0)
@@ -368,7 +368,7 @@ def test_a_budget_of_a_drive_s_own_ledger_outlives_the_bus(
 @pytest.mark.parametrize(
     "time", ["'yesterday'", "x'00'", "null", "9e999", "-1e308", "1e308", "1" + "0" * 400]
 )
-def test_a_ledger_with_a_time_that_is_none_keeps_the_write_back(tmp_path: Path, time: str) -> None:
+def test_a_ledger_with_an_invalid_time_blocks_the_write(tmp_path: Path, time: str) -> None:
     ledger, cell = Ledger(tmp_path / "wear.sqlite"), LedgerCell("/dev/ttyUSB0", 1, "toy", "acceleration_time")
     assert ledger.enter(cell, 100.0, 60.0) == ""
     with closing(sqlite3.connect(ledger.path)) as file:

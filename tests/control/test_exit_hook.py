@@ -72,7 +72,7 @@ def test_a_second_signal_is_held_until_all_is_done(caught: list[int], number: in
 
 
 @BOTH
-def test_a_signal_while_one_bus_is_left_begins_the_others(caught: list[int], number: int) -> None:
+def test_a_signal_while_one_bus_closes_starts_the_stops_of_others(caught: list[int], number: int) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     made = [hook.add(act.begin, act.work) for act in acts]
     timer = threading.Thread(target=lambda: (acts[0].works.wait(PATIENCE), signal.raise_signal(number)))
@@ -88,7 +88,7 @@ def test_a_signal_while_one_bus_is_left_begins_the_others(caught: list[int], num
     release.join()
 
 
-def test_a_bus_that_asks_for_it_after_the_signal_is_begun_at_once(caught: list[int]) -> None:
+def test_a_bus_that_opens_after_the_signal_is_stopped_at_once(caught: list[int]) -> None:
     """Its motors would turn on, and the process would wait for it."""
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
@@ -123,7 +123,7 @@ def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
     assert len(caught) == 1
 
 
-def test_a_third_signal_cuts_it_short_though_nobody_can_be_told(
+def test_a_third_signal_cuts_the_stops_short_with_stderr_closed(
     caught: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Standard error may be closed, or a terminal that is gone."""
@@ -177,7 +177,7 @@ def threading_names() -> set[str]:
     return {thread.name for thread in threading.enumerate()}
 
 
-def test_an_act_that_fails_holds_nobody_up(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_act_does_not_delay_others(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
     def fail() -> None:
         raise ZeroDivisionError
 
@@ -222,9 +222,7 @@ def test_a_bus_that_comes_as_the_last_one_goes_has_the_signals(
     until(lambda: caught == [signal.SIGTERM])
 
 
-def test_a_bus_that_comes_too_late_for_the_signals_is_told_so(
-    caught: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_adding_an_act_without_the_signals_raises(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     first = hook.add(acts[0].begin, acts[0].work)
     has_taken, goes_on, told = threading.Event(), threading.Event(), list[ValueError]()
@@ -350,7 +348,7 @@ def test_a_thread_reports_that_the_program_took_the_signals_back(
     assert acts[0].is_over
 
 
-def test_a_child_begins_its_own_last_acts_though_its_parent_was_ending(caught: list[int]) -> None:
+def test_a_forked_child_has_its_own_last_acts(caught: list[int]) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
     signal.raise_signal(signal.SIGTERM)
@@ -568,7 +566,7 @@ def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("leaves", ["poller", "line"])
-def test_a_poller_gives_the_signals_back_that_one_of_its_buses_took(caught: list[int], leaves: str) -> None:
+def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int], leaves: str) -> None:
     from lines import line, plant, polled
 
     from multidrop.poller import Poller

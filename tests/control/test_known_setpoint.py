@@ -32,7 +32,7 @@ def told(monkeypatch: pytest.MonkeyPatch, make: Make) -> tuple[SimulatedBus, Dri
 
 
 @every_unreadable
-def test_what_a_rule_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
+def test_a_refused_setpoint_keeps_the_known_one(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
     bus, drive = told(monkeypatch, make)
     known = drive.commanded
     with pytest.raises((WriteForbidden, ValueError)):
@@ -43,7 +43,7 @@ def test_what_a_rule_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch, ma
 
 
 @every_unreadable
-def test_what_was_never_sent_changes_nothing(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
+def test_an_unsent_setpoint_keeps_the_known_one(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
     """Its turn came too late; a stop that ends it before its turn is told by the core in the same way."""
     bus, drive = told(monkeypatch, make)
     known = drive.commanded
@@ -60,7 +60,7 @@ def refused(request: Message) -> bytes | None:
     return bytes(build_reply(InnovertIBD(1).framing, replace(request, exception=4)))
 
 
-def test_what_the_drive_refuses_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_setpoint_that_the_drive_refuses_keeps_the_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
     known = drive.commanded
     bus.answers = refused
@@ -91,7 +91,7 @@ def test_after_a_lost_reply_nothing_is_known_and_no_motor_starts(
     assert bus.written == []
 
 
-def test_what_a_drive_takes_as_another_value_is_not_what_it_was_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clamped_setpoint_is_not_the_requested_one(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, ErmanERG220(1))
     drive.set_frequency(20)
     take = type(sim).answer
@@ -121,7 +121,7 @@ def test_a_stored_setpoint_that_is_held_already_is_known_without_a_write(
     assert drive.commanded == 20
 
 
-def test_a_plain_write_tells_the_setpoint_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plain_write_sets_the_known_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
     drive.write(drive.register("frequency"), 30)
     assert drive.commanded == 30
@@ -134,7 +134,7 @@ def test_a_plain_write_tells_the_setpoint_too(monkeypatch: pytest.MonkeyPatch) -
 # ---- writes on several threads ----
 
 
-def test_a_write_that_changed_nothing_leaves_what_another_one_wrote() -> None:
+def test_an_unsent_write_keeps_the_setpoint_of_another_one() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     take_back = setpoint.begin_write()
@@ -144,7 +144,7 @@ def test_a_write_that_changed_nothing_leaves_what_another_one_wrote() -> None:
     assert setpoint.value == 30.0
 
 
-def test_a_write_whose_end_is_unknown_is_not_taken_back_by_another_one() -> None:
+def test_a_write_with_an_unknown_end_is_not_restored_by_another_one() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     take_back = setpoint.begin_write()
@@ -153,7 +153,7 @@ def test_a_write_whose_end_is_unknown_is_not_taken_back_by_another_one() -> None
     assert setpoint.value is None
 
 
-def test_writes_that_changed_nothing_leave_what_was_known_before_both() -> None:
+def test_two_unsent_writes_restore_the_setpoint_before_both() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     first, second = setpoint.begin_write(), setpoint.begin_write()

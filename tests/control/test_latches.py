@@ -30,7 +30,7 @@ def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch:
     assert latches.latch(drive).permit().is_good
 
 
-def test_a_drive_that_is_attached_to_a_bus_that_was_left_is_not_moved(
+def test_a_drive_attached_after_leaving_is_not_moved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its process ends, and nobody would stop it; the drives from before are not moved either."""

@@ -50,20 +50,20 @@ def test_a_bus_says_whether_it_stops_its_drives_at_the_end(pair: RunningPair) ->
     assert pair.bus.stops_on_exit is True
 
 
-def test_the_stops_of_a_bus_that_is_left_begin_at_once(pair: RunningPair) -> None:
+def test_leaving_a_bus_starts_its_stops_at_once(pair: RunningPair) -> None:
     pair.bus.stop_on_exit()
     pair.bus.leave()
     until(lambda: pair.turning == [False, False])
 
 
-def test_a_bus_that_is_left_stops_nothing_unasked(pair: RunningPair) -> None:
+def test_leaving_a_bus_sends_no_stop_by_default(pair: RunningPair) -> None:
     pair.bus.leave()
     pair.bus.part()
     assert pair.turning == [True, True]
     assert pair.line.frames == []
 
 
-def test_drives_that_are_about_to_leave_are_stopped_where_that_was_asked_for(
+def test_detached_drives_are_stopped_with_stop_on_exit(
     pair: RunningPair, caplog: pytest.LogCaptureFixture
 ) -> None:
     first, second = pair.drives
@@ -93,7 +93,7 @@ def test_drives_that_are_about_to_leave_are_stopped_where_that_was_asked_for(
     pair.line.answers = lambda request: None
 
 
-def test_a_drive_that_is_about_to_leave_cannot_be_started_behind_its_stop(pair: RunningPair) -> None:
+def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPair) -> None:
     """Its start is called while its stop is under way, as the stop's first request leaves."""
     pair.bus.stop_on_exit()
     first = pair.drives[0]
@@ -111,7 +111,7 @@ def test_a_drive_that_is_about_to_leave_cannot_be_started_behind_its_stop(pair: 
     pair.line.answers = lambda request: None
 
 
-def test_other_stops_of_drives_that_are_about_to_leave_are_waited_for(
+def test_detaching_waits_for_other_stops_of_the_drives(
     pair: RunningPair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[list[Any]] = []

@@ -123,7 +123,7 @@ def test_a_port_without_a_device_is_known_by_its_name() -> None:
 @pytest.mark.parametrize(
     "old", ["link", "device", "socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001", "socket://hall:1"]
 )
-def test_what_an_older_ledger_counted_still_counts(tmp_path: Path, old: str) -> None:
+def test_entries_of_an_older_ledger_count(tmp_path: Path, old: str) -> None:
     (tmp_path / "device").touch()
     (tmp_path / "link").symlink_to("device")
     entered = old if "://" in old else f"{tmp_path}/{old}"
@@ -139,7 +139,7 @@ def test_what_an_older_ledger_counted_still_counts(tmp_path: Path, old: str) -> 
 
 
 @pytest.mark.parametrize("old", ["link", "socket://10.0.0.7:4001"])
-def test_what_an_older_ledger_counted_under_another_spelling_counts(tmp_path: Path, old: str) -> None:
+def test_entries_under_another_port_name_count(tmp_path: Path, old: str) -> None:
     (tmp_path / "device").touch()
     (tmp_path / "link").symlink_to("device")
     entered = old if "://" in old else f"{tmp_path}/{old}"
@@ -153,7 +153,7 @@ def test_what_an_older_ledger_counted_under_another_spelling_counts(tmp_path: Pa
 # ---- what wears ----
 
 
-def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_registers_in_ram_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Fan(Drive):
         """A user's own."""
 
@@ -238,7 +238,7 @@ def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Pa
     os.close(held)
 
 
-def test_a_real_port_is_not_taken_for_a_simulated_one() -> None:
+def test_a_real_port_is_not_a_simulated_one() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         line = Line(f"socket://127.0.0.1:{listener.getsockname()[1]}").open()
         assert not is_simulated(line.identity)

@@ -1,4 +1,4 @@
-"""Calls of a process that is not, or no more, the master of the line: nothing leaves, and it is said."""
+"""Calls of a process that is not, or no longer, the master of the line are not sent and say so."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Slow(Toy):
 
 
 class Watched(Brief):
-    """Its stop looks at what came of it."""
+    """Its stop reads the result."""
 
     @verb
     def stop(self) -> Script[None]:
@@ -150,7 +150,7 @@ def test_nothing_is_sent_after_it_was_master(scene: Scene, call: str) -> None:
     assert scene.requests == before
 
 
-def test_a_lost_mastership_is_no_failure_of_the_drive(scene: Scene) -> None:
+def test_a_lost_mastership_is_not_a_failure_of_the_drive(scene: Scene) -> None:
     for _ in range(3):
         with pytest.raises(NotMaster):
             scene.drive.read(Toy.output_current)
@@ -160,7 +160,7 @@ def test_a_lost_mastership_is_no_failure_of_the_drive(scene: Scene) -> None:
 
 @pytest.mark.long
 def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
-    """Nobody calls anything: the clock decides. Half a guard later this process would be killed."""
+    """Without any call, by the clock alone. Half a guard later this process would be killed."""
     mastership = Mastership(guard_s=8)
     path = scene.simulator.wires[0].path
     scene.bus.close()
@@ -211,7 +211,7 @@ def test_a_stop_of_all_says_it_of_each(scene: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_a_look_at_what_was_started_says_why_there_is_none(scene: Scene) -> None:
+def test_a_failed_read_after_a_start_raises_the_lost_mastership(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()
@@ -262,7 +262,7 @@ def test_a_write_of_which_a_part_has_left_is_unconfirmed(
 def test_a_script_that_is_held_back_at_its_second_write_says_so(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first write is done and told of in the audit; the second was certainly not sent."""
+    """The first write is done and recorded; the second was certainly not sent."""
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=0, after=1)
 
@@ -278,7 +278,7 @@ def test_a_script_that_is_held_back_at_its_second_write_says_so(
 def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is not told as unsent: it was sent."""
+    """It was sent, so it is not reported as unsent."""
     scene.become_master()
     carry_out = scene.bus.line.carry_out
 
@@ -301,7 +301,7 @@ def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
 
 @pytest.fixture
 def shared() -> Iterator[tuple[int, Bus, Mastership]]:
-    """A port that nobody answers on, seen from the line."""
+    """A port without replies, seen from the line."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -356,7 +356,7 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
 
 
 @pytest.mark.long
-def test_the_line_is_listened_to_where_another_one_may_have_been_master(
+def test_a_line_that_another_may_have_mastered_is_listened_to_first(
     shared: tuple[int, Bus, Mastership],
 ) -> None:
     far, bus, mastership = shared
@@ -372,7 +372,7 @@ def test_the_line_is_listened_to_where_another_one_may_have_been_master(
 
 
 @pytest.mark.long
-def test_another_master_is_told_and_nothing_is_sent(
+def test_another_master_is_reported_before_anything_is_sent(
     shared: tuple[int, Bus, Mastership], caplog: pytest.LogCaptureFixture
 ) -> None:
     far, bus, _ = shared
@@ -441,14 +441,14 @@ def test_a_network_s_port_is_held_back_too(port: str) -> None:
 # ---- ports and arguments that cannot be ----
 
 
-def test_who_is_not_the_master_opens_no_port(scene: Scene) -> None:
+def test_only_the_master_opens_the_port(scene: Scene) -> None:
     path = scene.simulator.wires[0].path
     scene.bus.close()
     with pytest.raises(LineError, match=r": it is not opened: this process is not its master"):
         Bus(path, mastership=scene.mastership)
 
 
-def test_a_stop_on_a_port_that_is_not_opened_says_that_it_was_not_sent(scene: Scene) -> None:
+def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
     scene.bus.line.drop()
     with pytest.raises(NotMaster, match="the stop was NOT sent"):
         scene.drive.stop()

@@ -8,20 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from motors import MAKE
+from motors import MAKE, STARTS
 from profile_families import MAKE as PROFILES
 from simulated_bus import SimulatedBus, is_write, one
+from stop_frames import Meanwhile, first, writes
 
 from multidrop.control.audit_log import read_audit
 from multidrop.control.author import written_by
-from multidrop.control.outcome import Seen, Stopped
+from multidrop.control.outcome import Effect, Seen, Stopped
 from multidrop.control.ramp import ramp
 from multidrop.control.time_limit import written_before
 from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import BusError, CancelledByStop, Expired, NotVerified, Unconfirmed, WriteForbidden
+from multidrop.errors import (
+    BusError,
+    CancelledByStop,
+    Expired,
+    LineError,
+    NotVerified,
+    Unconfirmed,
+    WriteForbidden,
+)
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, simulated
@@ -72,7 +81,7 @@ def call_stop_at(line: SimulatedBus, drive: Any, nth: int) -> None:
     line.answers = note
 
 
-def test_what_a_verb_returns_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verbs_result_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive = stubborn(monkeypatch)
     assert drive.start() == 7
 
@@ -97,7 +106,7 @@ def test_a_write_that_a_script_goes_on_to_after_a_stop_is_named(monkeypatch: pyt
     assert len(line.written) == before
 
 
-def test_what_a_reset_wrote_is_taken_back_after_a_stop_and_noted(
+def test_a_resets_word_is_taken_back_after_a_stop_and_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Else the reset would stay on, and reset the next fault by itself."""
@@ -118,7 +127,7 @@ def test_what_a_reset_wrote_is_taken_back_after_a_stop_and_noted(
     line.bus.close()
 
 
-def test_what_a_plain_write_stopped_is_noted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_plain_stop_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     drive.write(drive.control, CHEControl.STOP)
     line.bus._records.flush(60)
@@ -127,7 +136,7 @@ def test_what_a_plain_write_stopped_is_noted(monkeypatch: pytest.MonkeyPatch, tm
     line.bus.close()
 
 
-def test_a_raw_request_is_noted_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_raw_request_is_recorded_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     assert line.bus.audit_trouble == ""
     drive.send_raw(6, 0x1000, b"\0\5")
@@ -143,7 +152,7 @@ def test_nothing_is_even_read_for_a_write_that_is_too_late(monkeypatch: pytest.M
     assert line.frames == []
 
 
-def test_the_watchdog_of_a_drive_is_told_when_it_is_first_known(
+def test_the_watchdog_is_logged_at_the_first_check(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
@@ -219,7 +228,7 @@ def test_a_trip_while_the_motor_changes_its_direction_ends_the_start(monkeypatch
         drive.start(Direction.REVERSE)
 
 
-def test_a_write_is_told_to_the_log_with_who_asked_for_it(
+def test_a_write_is_logged_with_its_author(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
@@ -232,9 +241,7 @@ def test_a_write_is_told_to_the_log_with_who_asked_for_it(
     assert told == [sentence, f"{sentence} (by anna)", f"{sentence} (by anna, web)"]
 
 
-def test_what_is_refused_is_told_to_the_log(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_refusals_are_logged(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with pytest.raises(WriteForbidden) as refusal:
@@ -243,7 +250,7 @@ def test_what_is_refused_is_told_to_the_log(
     assert line.written == []
 
 
-def test_an_effect_that_was_neither_confirmed_nor_seen_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unseen_effect_is_reported_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reset cuts its own reply off, and then the drive does not say what its record of faults is."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     sim.trip(4)
@@ -273,6 +280,47 @@ def test_a_write_that_its_budget_holds_back_says_that_it_may_be_sent_later(
     assert not refusal.value.is_budget
 
 
-def test_the_end_of_a_stop_is_told_with_its_reason() -> None:
+def test_the_end_of_a_stop_is_logged_with_its_reason() -> None:
     assert str(Stopped("fan", Seen.STOPPED, 2.04)) == "fan: stopped after 2.0 s"
     assert str(Stopped("fan", Seen.SENT, 30.0, "no reply")) == "fan: sent but unknown after 30.0 s: no reply"
+
+
+# ---- lost ports and drives ----
+
+
+def test_a_port_that_is_lost_after_a_confirmed_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+
+    def lost(request: Message) -> bytes | None:
+        if first(line, 0, STARTS["invt-che"]) is not None and not is_write(request):
+            raise LineError("hall", "the port was lost (hung up)")
+        return None
+
+    line.answers = lost
+    with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*lost"):
+        drive.start()
+
+
+def test_a_port_that_is_lost_when_a_write_is_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
+
+    def lost(request: Message) -> bytes | None:
+        if writes(line) and not is_write(request):
+            raise LineError("hall", "the port was lost (hung up)")
+        return None
+
+    line.answers = lost
+    outcome = drive.try_write(drive.setpoint, 10.0)
+    assert outcome.effect is Effect.UNCONFIRMED
+    with pytest.raises(Unconfirmed, match="confirmed, but not read back"):
+        assert outcome.value
+
+
+def test_a_drive_that_is_taken_off_while_it_is_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
+    Meanwhile(line, 1, lambda: line.bus.detach(drive))
+    with pytest.raises(Unconfirmed, match=r"confirmed, but not read back: .*not attached"):
+        drive.write(drive.setpoint, 10.0)

@@ -1,4 +1,4 @@
-"""Ramps step by step, and staggered starts that fail: what is sent, when, and what is stopped beside what."""
+"""Ramps step by step, and staggered starts that fail."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def steps(line: SimulatedBus) -> list[int]:
     return [int(frame[12:17].replace(" ", ""), 16) for frame in line.written]
 
 
-def test_a_ramp_takes_its_time_between_its_steps_and_none_after_the_last(
+def test_a_ramp_waits_between_its_steps_but_not_after_the_last(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
@@ -98,7 +98,7 @@ def ramped(monkeypatch: pytest.MonkeyPatch, family: type[Drive], **options: floa
 
 
 def test_a_ramp_whose_setpoint_is_looked_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the last step, to which it is checked before, would write nothing."""
+    """Also if the last step, which is checked first, writes no setpoint."""
     line, drive, _ = ramped(monkeypatch, Ramped)
     ramp(drive, 2.0, rate=1.0, every=1.0)
     assert steps(line) == [100, 200]
@@ -136,7 +136,7 @@ class Nameless(Ramped):
     identify = Drive.identify
 
 
-def test_a_ramp_of_a_drive_that_nobody_confirmed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_of_an_unconfirmed_drive_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = ramped(monkeypatch, Nameless, confirmed=0)
     with pytest.raises(WriteForbidden, match="confirmed = 1"):
         ramp(drive, 2.0, rate=1.0)
@@ -169,9 +169,7 @@ def test_starts_may_follow_at_once(monkeypatch: pytest.MonkeyPatch, gap: float) 
 
 
 @pytest.mark.parametrize("gap", [4.0, 25.0])
-def test_those_that_wait_for_their_start_are_heard_meanwhile(
-    monkeypatch: pytest.MonkeyPatch, gap: float
-) -> None:
+def test_drives_that_wait_for_their_start_are_read(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
     """Else those that cannot say their setpoint would be refused: they may have lost it with their power."""
     sims: list[Any] = [simulated(InnovertIBD(address, maximum_frequency=50)) for address in range(1, 6)]
     line = SimulatedBus(monkeypatch, *sims)
@@ -184,7 +182,7 @@ def test_those_that_wait_for_their_start_are_heard_meanwhile(
     assert 4 * gap <= line.seconds - begun < 4 * gap + 10
 
 
-def test_what_a_staggered_start_did_not_come_to_is_not_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_staggered_start_does_not_stop_drives_it_never_reached(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, sims = che(monkeypatch, 3)
     sims[1].trip(4)
     line.frames.clear()

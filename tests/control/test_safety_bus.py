@@ -40,6 +40,7 @@ from multidrop.errors import (
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.invt_che import CHEControl, parameter
 from multidrop.sim import MotorDrive, simulated
+from multidrop.transport.aside_log import flush
 from multidrop.transport.exchange import READ_ATTEMPTS
 
 every_family = pytest.mark.parametrize("model", MAKE)
@@ -116,7 +117,7 @@ def test_a_stop_may_be_written_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     ],
 )
-def test_what_is_against_a_rule_is_refused_and_not_sent(
+def test_writes_against_a_rule_are_refused_and_not_sent(
     monkeypatch: pytest.MonkeyPatch, drive: Drive, name: str, value: float, sentence: str
 ) -> None:
     line, _, _ = one(monkeypatch, drive)
@@ -128,7 +129,9 @@ def test_what_is_against_a_rule_is_refused_and_not_sent(
     assert line.written == []
 
 
-def test_what_changes_only_at_rest_is_refused_while_the_motor_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_registers_that_change_at_rest_are_refused_while_the_motor_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(20)
     drive.start()
@@ -158,7 +161,7 @@ def test_raw_goes_past_every_rule_and_is_called_that(monkeypatch: pytest.MonkeyP
 
 
 @every_family
-def test_the_first_write_is_preceded_by_a_look_and_the_second_is_not(
+def test_only_the_first_write_is_preceded_by_an_identity_check(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
@@ -221,7 +224,7 @@ def test_a_stop_is_sent_to_a_drive_that_cannot_be_heard_and_nothing_else_is(
     assert 30 <= line.seconds - begun < 32
 
 
-def test_an_ibd_that_cannot_be_told_apart_needs_its_owner_s_word(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ambiguous_ibd_needs_its_owners_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     for confirmed in (0, 1):
         line, drive, sim = one(monkeypatch, InnovertIBD(1, confirmed=confirmed))
         sim["address_setting"] = 0
@@ -284,7 +287,7 @@ def test_only_a_stop_is_sent_before_an_earlier_answer_has_come(
     assert all(insisted)
 
 
-def test_the_first_look_tells_the_watchdog_once(
+def test_the_first_check_logs_the_watchdog_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
@@ -309,7 +312,7 @@ def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.Monke
     assert len(line.written) == 1
 
 
-def test_a_raw_request_that_is_refused_is_noted_as_that(
+def test_a_refused_raw_request_is_recorded_as_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
@@ -322,7 +325,7 @@ def test_a_raw_request_that_is_refused_is_noted_as_that(
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_what_became_of_a_raw_request_is_noted(
+def test_the_outcome_of_a_raw_request_is_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_lost: bool
 ) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1), audit=tmp_path / "audit")
@@ -335,14 +338,14 @@ def test_what_became_of_a_raw_request_is_noted(
     assert entry["outcome"] == ("unconfirmed" if is_lost else "done")
 
 
-def test_a_drive_that_refuses_to_tell_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_refuses_to_read_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
     line.answers = lambda request: refusal if request.function == 3 else None
     assert line.bus.watchdog(drive) == drive.watchdog
 
 
-def test_a_write_whose_turn_comes_too_late_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_expired_write_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     written = list(line.written)
@@ -372,9 +375,7 @@ class Tidy(Drive):
 
 
 @pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
-def test_what_was_not_sent_is_not_called_unconfirmed(
-    monkeypatch: pytest.MonkeyPatch, result: Failure
-) -> None:
+def test_an_unsent_write_is_not_unconfirmed(monkeypatch: pytest.MonkeyPatch, result: Failure) -> None:
     """Nor is it by a look that fails afterwards."""
     line = SimulatedBus(monkeypatch, simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
@@ -473,7 +474,7 @@ def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.Mon
     assert sim.motor.energised
 
 
-def test_noise_at_the_start_hides_a_look_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_at_the_start_spoils_only_the_identity_check(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     spoilt: list[Message] = []
@@ -540,7 +541,7 @@ def test_two_clients_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not sim.motor.energised
 
 
-def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clamped_setpoint_is_reported_with_the_value_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, ErmanERG220(1))
     accept = type(sim).accept
     monkeypatch.setattr(
@@ -585,9 +586,7 @@ def test_the_budget_of_a_year(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     drive.set_frequency(45)
 
 
-def test_what_its_owner_knows_to_be_ram_is_not_counted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_register_declared_as_ram_is_not_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
     line, drive, _ = one(monkeypatch, ErmanERG220(1, ram=["frequency"]), ledger=ledger)
     for step in range(20):
@@ -650,7 +649,7 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
     assert len(line.written) == 1
 
 
-def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
@@ -693,7 +692,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     assert driver.now == over + 100 * MS
 
 
-def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
@@ -709,7 +708,7 @@ def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pyt
     assert all_stopped(line, sims)
 
 
-def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """The port fails with it, and comes back."""
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
@@ -745,7 +744,7 @@ def test_stop_all_on_a_line_of_every_family(monkeypatch: pytest.MonkeyPatch) -> 
     assert not any(frame.startswith(("00 ", ":00")) for frame in line.written)
 
 
-def test_stop_all_says_of_each_what_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_reports_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [
         simulated(InvtCHE(1, maximum_frequency=50)),
         simulated(ErmanERG220(2)),
@@ -791,7 +790,7 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
     assert all_stopped(line, sims)
 
 
-def test_a_gap_that_is_no_time_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_gap_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     line.frames.clear()
@@ -852,9 +851,7 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])
-def test_nothing_of_a_ramp_to_what_the_drive_does_not_take_is_sent(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drive, _ = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -866,7 +863,7 @@ def test_nothing_of_a_ramp_to_what_the_drive_does_not_take_is_sent(
     assert len(line.written) == 1
 
 
-def test_a_ramp_looks_at_the_drive_s_own_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_reads_the_drives_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -915,7 +912,7 @@ class ShareToy(Toy):
         yield from self._hold(self.share, hz / 80 * 100)
 
 
-def test_a_ramp_of_a_share_of_nobody_knows_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
     with pytest.raises(
         WriteForbidden, match=r"is in %: a ramp needs maximum_frequency, which is not declared"
@@ -946,7 +943,7 @@ def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch
     assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
 
 
-def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch)
     toy = line.attach(Toy(1, name="toy"))
     with pytest.raises(
@@ -1012,6 +1009,7 @@ def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
     drive.stop()
     line.bus.close()
+    flush(60)
     assert [each[:17] for each in line.written] == ["01 06 10 00 00 05"]
     assert "the audit log cannot be written" in caplog.text
 
@@ -1020,7 +1018,7 @@ LOST = LineError("hall", "the port was lost")
 LOST.is_sent = True
 
 
-def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
+def test_a_write_during_a_port_failure_is_recorded_as_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     log = tmp_path / "audit.jsonl"
@@ -1066,7 +1064,7 @@ ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], objec
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_write_whose_outcome_never_came_is_noted_all_the_same(
+def test_a_write_without_an_outcome_is_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ending: str
 ) -> None:
     failure, function, act, what = ENDINGS[ending]
@@ -1099,7 +1097,7 @@ def test_a_torn_tail_harms_no_other_line(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert json.loads(log.read_text().splitlines()[-1])["outcome"] == "done"
 
 
-def test_the_watchdog_is_read_where_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     assert line.bus.watchdog(drive) == (
         "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
@@ -1139,7 +1137,7 @@ def test_a_family_of_one_s_own_is_looked_at_too(monkeypatch: pytest.MonkeyPatch)
     assert line.written == []
 
 
-def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_check_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     class Sleepy(Toy):
         """It says who it is a while after it was asked for the first time."""
 
@@ -1156,7 +1154,7 @@ def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch
     assert line.seconds - begun == pytest.approx(3.0 + 2 * EXCHANGE_TIME)
 
 
-def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_check_that_writes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     class Meddler(Toy):
         """Its author took a write for a look."""
 
@@ -1171,7 +1169,7 @@ def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.M
     assert line.frames == []
 
 
-def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rests(
+def test_registers_that_change_at_rest_need_a_readable_state(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Mute(Drive):

@@ -1,4 +1,4 @@
-"""An adapter that begins to echo just when the drive dies: no write is told to be done."""
+"""An adapter that starts to echo when the drive dies: no write is reported as done."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DRIVES = (
 
 
 def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
-    """From now on all that is heard of a write is what was sent, and of a read nothing."""
+    """From now on each write is answered by its echo, and reads are not answered."""
     line.deafens = lambda request: True
     line.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None
 
@@ -58,7 +58,7 @@ def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
 
 
 def test_an_echo_that_shows_at_the_next_read_confirmed_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The drive missed the write, and answers what is read after it."""
+    """The drive missed the write, and answers the read after it."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     drive.set_frequency(20)
 
@@ -84,10 +84,10 @@ def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
 
-def test_what_is_told_of_an_adapter_that_is_known_to_echo_is_believed(
+def test_confirmations_through_a_known_echo_are_believed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """There the core tells the drive's copy from the adapter's."""
+    """There the core distinguishes the drive's copy from the adapter's."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     line.has_echo = True
     drive.set_frequency(20)

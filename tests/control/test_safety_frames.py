@@ -172,7 +172,7 @@ def values(register: Register[Any]) -> st.SearchStrategy[Any]:
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(data=st.data())
-def test_no_sequence_of_calls_sends_what_is_forbidden(
+def test_no_sequence_of_calls_sends_a_forbidden_frame(
     monkeypatch: pytest.MonkeyPatch, model: str, data: st.DataObject
 ) -> None:
     sim: Any = simulated(MAKE[model](1))

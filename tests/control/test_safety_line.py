@@ -103,7 +103,7 @@ def test_a_goodrive_is_not_taken_for_a_che() -> None:
         assert received.writes == []
 
 
-def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clamped_setpoint_is_reported_with_the_value_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     with line(ErmanERG220(1)) as (drive, sim, received):
         accept = sim.accept
         monkeypatch.setattr(

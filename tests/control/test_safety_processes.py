@@ -146,7 +146,7 @@ def test_the_budget_spends_10_000_cycles_in_ten_years() -> None:
     assert BUDGET * 10 == 10_000
 
 
-def test_a_ledger_that_is_none_is_a_sentence(tmp_path: Path) -> None:
+def test_an_invalid_ledger_file_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     path.write_text("this is no database, and long enough to be looked at as one" * 20)
     with pytest.raises(OSError, match=r"the ledger of EEPROM writes .* cannot be kept"):
@@ -175,7 +175,7 @@ def test_processes_do_not_mix_their_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn_at", range(0, 120, 7))
-def test_wherever_a_line_was_torn_the_others_stay(tmp_path: Path, torn_at: int) -> None:
+def test_a_truncated_line_leaves_the_others(tmp_path: Path, torn_at: int) -> None:
     path = tmp_path / "audit.jsonl"
     log = AuditLog(path)
     log.add(0, {"write": "first"})

@@ -1,4 +1,4 @@
-"""A second client on the same line, whose frames collide with ours: what left, and what we were told.
+"""A second client on the same line, whose frames collide with ours: sent frames and results.
 
 No drive can tell its requests from ours, and we cannot tell the reply to its read of our drive from that
 to our own: what is read on a line with two clients is not to be trusted. What is commanded is: nothing
@@ -35,7 +35,7 @@ ROUNDS, MOST_ROUNDS = 3, 60  # as many as it takes until both have talked at onc
 
 @contextmanager
 def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[ReceivedRequests]]]:
-    """Our drive 1, the pair, and what the drives 1 and 2 hear."""
+    """Our drive 1, the pair of ports, and the requests that drives 1 and 2 receive."""
     ours = MAKE[model](1)
     received = []
     for drive in (ours, MAKE[model](2)):
@@ -53,7 +53,7 @@ def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[R
 
 
 def requests(pair: SharedPair) -> list[Message]:
-    """Return what left our port: whole requests, one after another."""
+    """Return the whole requests that left our port."""
     found, sent = [], pair.sent
     while sent:
         used, message = parse_request(Framing.RTU, sent)
@@ -177,7 +177,7 @@ PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
 
 
 def running(drive: Any, received: ReceivedRequests) -> None:
-    """By the hand of whoever stands there."""
+    """Pressed on the keypad."""
     set_frequency(drive, 20)
     received.sim.motor.run(1)
 
@@ -192,7 +192,7 @@ MOMENTS = [("start", says) for says in SAYS] + [
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
-def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
+def test_another_clients_frames_confirm_no_pulse(verb: str, says: str) -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         set_frequency(drive, 20)
         if verb == "reset_fault":
@@ -209,7 +209,7 @@ def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> Non
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("says", usually(*SAYS))
-def test_what_another_client_says_confirms_no_stop(says: str) -> None:
+def test_another_clients_frames_confirm_no_stop(says: str) -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])
         pair.says = SAYS[says]
@@ -235,7 +235,7 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -> None:
+def test_another_clients_equal_request_is_not_our_echo_for_long(verb: str) -> None:
     """Ours is lost and theirs answered, as if an adapter echoed: the stop is confirmed all the same."""
     look = rtu("01 03 10 01 00 01")
     with shared_line("invt-che", seed=3) as (drive, pair, received):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from decimal import Decimal
 from errno import EMFILE
 from fractions import Fraction
+from functools import cache
 from itertools import chain, count
 from linecache import getline
 from pathlib import Path
@@ -15,21 +17,25 @@ from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
-from interruptions import calling_at, interrupted_at
+from examples import in_turn
+from interruptions import calling_at, failing_at, interrupted_at
+from motors import MAKE
 from own_fan import Fan
-from simulated_bus import SimulatedBus, is_write
+from profile_families import ALL
+from simulated_bus import SimulatedBus, is_write, one
 
 import multidrop
 from multidrop.control import eeprom_ledger, ramp, stops
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
-from multidrop.control.stops import LEAST_S, StopAttempt
+from multidrop.control.records import WriteRecords
+from multidrop.control.stops import LEAST_S, StopAttempt, stop_together
 from multidrop.core import Completion, Exchange
-from multidrop.drive import Script, verb
+from multidrop.drive import Drive, Script, verb
 from multidrop.errors import CancelledByStop, Unconfirmed, WriteForbidden
 from multidrop.families import InvtCHE
-from multidrop.sim import simulated
+from multidrop.sim import MotorDrive, simulated
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush
 
@@ -223,7 +229,7 @@ def test_a_failed_staggered_start_stops_each_though_the_stop_of_one_raises_anyth
 
 @pytest.mark.parametrize("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
 @pytest.mark.parametrize("is_sent", [False, True])
-def test_a_stop_is_repeated_where_the_system_had_no_room_for_it(
+def test_a_stop_is_repeated_after_the_system_had_no_resources(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, is_sent: bool
 ) -> None:
     line, drives, sims = running(monkeypatch, 2)
@@ -264,7 +270,7 @@ class NoRoom:
 
 @pytest.mark.parametrize("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
 @pytest.mark.parametrize("all_of_them", [False, True])
-def test_a_stop_is_made_once_the_system_has_room_for_it(
+def test_a_stop_is_created_once_the_system_has_resources(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, all_of_them: bool
 ) -> None:
     line, drives, sims = running(monkeypatch)
@@ -286,7 +292,7 @@ def test_a_stop_that_can_never_be_made_raises_why(monkeypatch: pytest.MonkeyPatc
     assert len(line.written) == before
 
 
-def test_a_stop_for_which_there_is_never_room_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_never_gets_resources_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = running(monkeypatch)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -350,7 +356,7 @@ def test_a_locked_ledger_is_tried_once_for_a_stop_however_often_it_was_sent(
     assert sum(wear.writes for wear in ledger.wear(1.8e9)) == len(line.written) - before > 40
 
 
-def test_a_port_whose_name_is_no_text_keeps_no_stop_from_being_told(
+def test_a_port_name_that_is_not_text_prevents_no_stop(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Fan(1)), ledger=tmp_path / "wear")
@@ -360,3 +366,89 @@ def test_a_port_whose_name_is_no_text_keeps_no_stop_from_being_told(
     line.bus._records.flush(60)
     flush(60)
     assert "stops were not counted: " in caplog.text
+
+
+# ---- faults at lines of each family ----
+
+
+FAMILIES: dict[str, Callable[[int], Drive]] = {
+    **MAKE,
+    "a profile": ALL["abb-acs355"],
+    "a shipped file": ALL["shipped delta-ms300"],
+}
+
+
+FAILURES: dict[str, Callable[[], BaseException]] = {
+    "signal": KeyboardInterrupt,
+    "no memory": MemoryError,
+    "no descriptors": lambda: OSError(EMFILE, "Too many open files"),
+}
+
+
+HOME = Path(multidrop.__file__).parent
+
+
+SCRIPTS = tuple(str(HOME / name) for name in ("families", "drive/script.py"))
+
+
+ATTEMPT = (str(HOME / "control/stops.py"), str(HOME / "drive/family.py"))
+
+
+@cache
+def has_lines_that_count(file: str) -> bool:
+    return file.startswith((*SCRIPTS, *ATTEMPT))
+
+
+def counts(frame: FrameType) -> bool:
+    code = frame.f_code
+    return has_lines_that_count(code.co_filename) or code is stop_together.__code__
+
+
+@pytest.fixture
+def _unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let setpoints be written as often as these tests begin anew."""
+    monkeypatch.setattr(WriteRecords, "count", lambda *_: None)
+
+
+def running_family(monkeypatch: pytest.MonkeyPatch, family: str) -> tuple[SimulatedBus, Drive, MotorDrive]:
+    """Return a bus whose motor turns."""
+    line, drive, sim = one(monkeypatch, FAMILIES[family](1))
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 1.0
+    drive.set_frequency(20)
+    drive.start()
+    line.sleep(3)
+    sim.pass_time(line.seconds)
+    assert sim.motor.energised
+    return line, drive, sim
+
+
+def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int) -> None:
+    """Stop the motor again and again, with this failure at a later line each time until it is too late."""
+    for nth in count(1, step):
+        line, drive, sim = running_family(monkeypatch, family)
+        told = ""
+        try:
+            with failing_at(nth, counts, FAILURES[failure]()) as place:
+                drive.stop() if nth % 2 else line.bus.stop_all()
+        except BaseException as raised:
+            told = "".join(getattr(raised, "__notes__", ()))
+            assert f"{drive.name}: the stop was sent" in told or not sim.motor.goal, place
+        if not place:
+            break
+        sim.pass_time(line.seconds + 60)
+        assert not sim.motor.energised, place
+        assert not line.bus.stops_under_way(), place
+        line.bus.part()  # waits for no stop that is over
+    assert nth > 80
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # as a script ends
+@pytest.mark.usefixtures("_unbounded")
+@pytest.mark.parametrize("step", [37, pytest.param(11, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
+def test_a_motor_stops_although_its_stop_failed_at_some_line(
+    monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
+) -> None:
+    """Steps are prime, so that loops are met in different places; 1 tries each line, in a quarter hour."""
+    check_stops(monkeypatch, family, failure, step)

@@ -1,8 +1,8 @@
-"""A stop always wins: after one was called, by anybody, nothing moves a motor that was not called after it.
+"""A stop always wins: no call from before a stop moves a motor after it.
 
 Real ports and threads, and responders of our own that note every frame. Order is judged on the wire alone:
-a line delivers in order, so what comes after a stop's first frame has left after the stop was called.
-Threads that start motors are held in the middle of their looks until the stop is called. More of it:
+a line delivers in order, so any frame after a stop's first one was sent after its call.
+Threads that start motors are held during their checks until the stop is called. More of it:
 `STOP_EXAMPLES=100 pytest -m '' tests/control/test_stop_wins.py`.
 """
 
@@ -44,13 +44,13 @@ from multidrop.errors import BusError
 from multidrop.poller import Poller
 
 EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
-EXPIRY = 60.0  # s: a busy machine is slow, and nothing is wrong with it
+EXPIRY = 60.0  # s: a busy machine is slow
 DRIVES = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Signalled(Exception):
-    """A signal's effect, where it would have ended the process."""
+    """A signal's effect that would have ended the process."""
 
 
 def _signalled(number: int, frame: object) -> None:
@@ -82,7 +82,7 @@ class Stops(RuleBasedStateMachine):
     # ---- the client ----
 
     def _open(self) -> None:
-        """A client anew, that has written its setpoints, and a mark on the wire."""
+        """A new client that has written its setpoints, and a mark on the wire."""
         self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
         self.drives = [
@@ -109,7 +109,7 @@ class Stops(RuleBasedStateMachine):
         self._mark()
 
     def _mark(self, drive: Drive | None = None) -> None:
-        """An episode begins: a read is on the wire behind all that was sent before."""
+        """Start an episode: put a read on the wire behind all earlier frames."""
         drive = drive or self.drives[0]
         self.line.troubles.clear()
         begun = len(self.line.log)
@@ -137,9 +137,9 @@ class Stops(RuleBasedStateMachine):
         after=st.integers(0, 12),
     )
     def start_and_hold(self, number: int, name: str, after: int) -> None:
-        """A thread starts a motor; from some request on nothing is answered until a stop is called.
+        """A thread starts a motor; from some request on there is no reply until a stop is called.
 
-        A staggered start that fails is a stop too, after which nothing is started in this episode.
+        A staggered start that fails is a stop too, and ends the starts of this episode.
         """
         self.staggered = name == "staggered"
         self.line.hold(after)
@@ -161,7 +161,7 @@ class Stops(RuleBasedStateMachine):
         signals=st.lists(st.sampled_from(SIGNALS), min_size=1, max_size=2),
     )
     def stop(self, how: str, verbs: list[tuple[int, int]], signals: list[signal.Signals]) -> None:
-        """Somebody stops; what was held is let go when that is called."""
+        """Call a stop, and release the held requests at that moment."""
         if how in ("leave", "signal") and not self.on_exit:
             how = "stop_all"
         stopped = {number for number, _ in verbs} if how == "verb" else set(range(DRIVES))
@@ -193,7 +193,7 @@ class Stops(RuleBasedStateMachine):
             self._mark()
 
     def _release(self) -> None:
-        """A moment after the stop was called: what is held is only held back for a better chance to fail."""
+        """Wait a moment after the stop was called, which gives a wrong frame more time to appear."""
         time.sleep(0.005)
         self.far.release(self.line)
 
@@ -231,7 +231,7 @@ class Stops(RuleBasedStateMachine):
     @precondition(lambda self: self.threads)
     @rule(detaches=st.booleans())
     def part(self, detaches: bool) -> None:
-        """Close the bus, or take the first drive off: what began to move it writes nothing after that."""
+        """Close the bus, or detach the first drive: calls that started earlier write no frame afterwards."""
         releasing = threading.Thread(target=self._release)
         releasing.start()
         if detaches and self.poller:
@@ -240,7 +240,7 @@ class Stops(RuleBasedStateMachine):
             self.bus.detach(self.drives[0])
         else:
             self._close()
-            releasing.join()  # no client can tell an answer to the one before it
+            releasing.join()  # a client cannot distinguish it from the reply to the request before
             self._open()
         self._mark(self.drives[1])
         for thread in (releasing, *self.threads):
@@ -257,7 +257,7 @@ class Stops(RuleBasedStateMachine):
     @precondition(lambda self: self.threads and not self.staggered)
     @rule()
     def lose_the_port(self) -> None:
-        """Pull the adapter out and plug it in again: nothing that was under way comes then."""
+        """Unplug the adapter and plug it in again: no earlier frame follows."""
         self.far.lose(self.line)
         failures: list[BaseException] = []
         stopping = self._thread(self.drives[0].stop, failures)
@@ -341,7 +341,7 @@ class Stops(RuleBasedStateMachine):
         if not hasattr(self, "_stack"):
             return
         failure = sys.exc_info()[1]
-        if isinstance(failure, Exception):  # it may not come again, and then nobody else tells of it
+        if isinstance(failure, Exception):  # a failure may not be reproducible
             print(f"{type(failure).__name__}: {failure}\n{self._story()}\n")
         self.line.troubles.clear()
         self.far.release(self.line)
@@ -385,7 +385,7 @@ def test_a_stop_in_the_middle_of_a_start(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
-    """Else the tests above ask nothing of this kind."""
+    """Otherwise the tests above would pass without any start."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)
     try:

@@ -77,7 +77,7 @@ def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseExc
 
 
 @pytest.mark.parametrize(("what", "ending"), in_turn(["start", "write", "raw"], ["close", "detach"]))
-def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
+def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
     monkeypatch: pytest.MonkeyPatch, ending: str, what: str
 ) -> None:
     """Never as if nothing had been sent."""
@@ -263,7 +263,7 @@ def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
         assert received.starts == []
 
 
-def test_a_stop_that_never_left_is_no_sent_write_in_the_audit_log(tmp_path: Path) -> None:
+def test_an_unsent_stop_is_not_recorded_as_sent(tmp_path: Path) -> None:
     """It is repeated while the poller, which opens the port again, has not done so."""
     audit = tmp_path / "audit.jsonl"
     wire = Wire([simulated(MAKE["invt-che"](1))], unpaced=True)

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import pytest
-from simulated_bus import SimulatedBus, one
+from c_programs import preloaded
+from motors import MAKE, STARTS
+from simulated_bus import EXCHANGE_TIME, SimulatedBus, one
+from stop_frames import Own, first, started_while, writes
 from tables import table
 
+from multidrop.bus import Bus
+from multidrop.control.ramp import ramp
 from multidrop.control.time_limit import written_before
+from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read, wait, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import CancelledByStop, Expired
-from multidrop.families import InvtCHE
-from multidrop.sim import simulated
+from multidrop.errors import (
+    CancelledByStop,
+    Expired,
+)
+from multidrop.families import YD1000, InvtCHE
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 
 @pytest.fixture
@@ -35,7 +49,7 @@ def written(line: SimulatedBus) -> list[str]:
     return [text for request, text in line.frames if request.function in (5, 6, 15, 16)]
 
 
-def test_what_is_called_in_time_is_sent(line: SimulatedBus) -> None:
+def test_a_call_in_time_is_sent(line: SimulatedBus) -> None:
     before = len(written(line))
     with within(line, 0.5):
         line.sleep(0.4)
@@ -44,7 +58,7 @@ def test_what_is_called_in_time_is_sent(line: SimulatedBus) -> None:
 
 
 @pytest.mark.parametrize("seconds", [0, 0.5, 0.9])
-def test_what_is_held_up_after_the_call_is_not_sent(line: SimulatedBus, seconds: float) -> None:
+def test_a_call_delayed_past_its_limit_is_not_sent(line: SimulatedBus, seconds: float) -> None:
     """The bus alone would send it: it has a second from the call on."""
     before = len(written(line))
     with within(line, seconds):
@@ -90,7 +104,7 @@ class Slow(Drive):
 
 
 @pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
-def test_no_verb_begins_later_and_none_is_cut_off(
+def test_no_verb_starts_after_the_limit_and_none_is_cut_off(
     monkeypatch: pytest.MonkeyPatch, before: float, between: float, sent: int
 ) -> None:
     """A bus alone counts no time that a script waits by itself."""
@@ -110,13 +124,13 @@ def test_an_inner_limit_is_never_longer_and_ends_with_its_block(line: SimulatedB
     line.bus.drives[0].set_frequency(20)
 
 
-def test_a_bus_s_own_expiry_counts_where_it_is_shorter(line: SimulatedBus) -> None:
+def test_a_shorter_expiry_of_the_bus_applies(line: SimulatedBus) -> None:
     line.queue_time = 1.5
     with within(line, 60), pytest.raises(Expired):
         line.bus.drives[0].set_frequency(20)
 
 
-def test_a_limit_that_is_no_number_is_past(line: SimulatedBus) -> None:
+def test_a_limit_that_is_not_a_number_is_past(line: SimulatedBus) -> None:
     before = len(written(line))
     with written_before(lambda: float("nan")), pytest.raises(Expired):
         line.bus.drives[0].set_frequency(20)
@@ -146,7 +160,7 @@ def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBu
 
 
 @table("limit", [0.5, True, "1", None])
-def test_under_what_is_no_function_a_stop_alone_is_sent(monkeypatch: pytest.MonkeyPatch, limit: Any) -> None:
+def test_with_an_invalid_limit_only_a_stop_is_sent(monkeypatch: pytest.MonkeyPatch, limit: Any) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with written_before(limit):
         for call in (lambda: drive.set_frequency(20), drive.start):
@@ -155,3 +169,175 @@ def test_under_what_is_no_function_a_stop_alone_is_sent(monkeypatch: pytest.Monk
         assert not written(line)
         drive.stop()
     assert len(written(line)) == 1
+
+
+# ---- a bus's own expiry ----
+
+
+def check_not_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, hold_up: Callable[[SimulatedBus], None]
+) -> None:
+    """Check that a start delayed at any of its reads is not sent."""
+    for frames in range(1, 100):
+        line, _, meanwhile, begun, failure = started_while(
+            monkeypatch, tmp_path, model, frames, lambda line, drive: hold_up(line)
+        )
+        start = first(line, begun, STARTS[model])
+        if not meanwhile.has_come or (start is not None and start < frames):
+            break
+        assert start is None
+        assert isinstance(failure, Expired)
+    assert frames > 2
+
+
+class Looking(Own):
+    """A drive whose start reads it twenty times."""
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor."""
+        for _ in range(20):
+            yield from read(self.speed)
+        yield from write(self.ratio, 1)
+
+
+class Resting(Own):
+    """One that is given rests of five seconds."""
+
+    least_interval = 5.0
+
+
+@pytest.mark.parametrize("model", MAKE)
+def test_a_start_delayed_in_its_checks_is_not_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
+) -> None:
+    """The process is suspended at each read, as by Ctrl-Z."""
+    check_not_sent(monkeypatch, tmp_path, model, lambda line: line.sleep(5))
+
+
+@pytest.mark.parametrize("model", MAKE)
+def test_a_start_whose_machine_slept_is_not_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
+) -> None:
+    """CLOCK_MONOTONIC does not advance during sleep, so by that clock the start is not late."""
+
+    def sleep_for_a_night(line: SimulatedBus) -> None:
+        line.slept += 8 * 3600
+
+    check_not_sent(monkeypatch, tmp_path, model, sleep_for_a_night)
+
+
+def test_slow_reads_do_not_expire_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Sleepy(Own):
+        """It is waited for."""
+
+        @verb
+        def start(self, direction: Direction | None = None) -> Script[None]:
+            """Start the motor."""
+            for _ in range(20):
+                yield from wait(1.0)
+                yield from read(self.speed)
+            yield from write(self.ratio, 1)
+
+    line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
+    line.attach(Sleepy(1, confirmed=1)).start()
+    assert len(writes(line)) == 1
+
+
+@pytest.mark.parametrize(("more", "is_sent"), [(0.25, True), (0.35, False)])
+def test_reads_may_take_as_long_as_their_silences_and_characters(
+    monkeypatch: pytest.MonkeyPatch, more: float, is_sent: bool
+) -> None:
+    """Twice the silence of 100 ms, and 64 characters, beside the time-out: twenty that take more are late."""
+    line = SimulatedBus(monkeypatch, simulated(Looking(1)))
+    drive = line.attach(Looking(1, confirmed=1, silence=0.1))
+    line.bus.check_identity(drive)
+    line.queue_time = drive.response_timeout + more - EXCHANGE_TIME
+    if is_sent:
+        drive.start()
+    else:
+        with pytest.raises(Expired):
+            drive.start()
+    assert len(line.written) == is_sent
+
+
+@pytest.mark.parametrize(("waits", "is_sent"), [(5.9, True), (6.1, False)])
+def test_the_rest_of_a_drive_makes_no_write_late(
+    monkeypatch: pytest.MonkeyPatch, waits: float, is_sent: bool
+) -> None:
+    line = SimulatedBus(monkeypatch, simulated(Resting(1)))
+    drive = line.attach(Resting(1, confirmed=1))
+    line.bus.check_identity(drive)
+    line.queue_time = waits
+    if is_sent:
+        drive.write(drive.ratio, 3.0)
+    else:
+        with pytest.raises(Expired):
+            drive.write(drive.ratio, 3.0)
+    assert len(line.written) == is_sent
+
+
+def test_slow_writes_do_not_expire_a_verb(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ramp has more writes than fit into the expiry of one call."""
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(1)
+    before = len(writes(line))
+    ramp(drive, 51, rate=0.5, every=1)
+    assert len(writes(line)) - before == 100
+    assert 100 * EXCHANGE_TIME > 1.0  # the expiry of a call
+
+
+@table("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])
+def test_an_invalid_expiry_is_refused(expiry: Any) -> None:
+    with pytest.raises(ValueError, match=r"expiry = .* is not a number of seconds above 0"):
+        Bus("/dev/none", expiry=expiry)
+
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="CLOCK_BOOTTIME is Linux's")
+
+
+CLIENT = """
+import sys
+from pathlib import Path
+from multidrop import Bus, Expired, InvtCHE
+class Pump(InvtCHE):  # is waited for however busy the machine is
+    response_timeout = 60.0
+    response_delay = 15.0
+with Bus(sys.argv[1], expiry=600) as bus:
+    pump = bus.attach(Pump(1, maximum_frequency=50))
+    pump.set_frequency(20)
+    Path(sys.argv[2]).touch()
+    try:
+        pump.start()
+    except Expired as failure:
+        print(failure)
+    pump.stop()
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sleeps", [True, False])
+def test_a_start_is_not_sent_when_the_machine_wakes(tmp_path: Path, sleeps: bool) -> None:
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, MotorDrive)
+    sim.motor.deceleration_time = 0.2
+    answer, begun, slept = sim.answer, tmp_path / "begun", tmp_path / "slept"
+
+    def answer_and_sleep(request: Message, now: float) -> Message | None:
+        if sleeps and begun.exists():  # at the first look of the start
+            slept.touch()
+        return answer(request, now)
+
+    sim.answer = answer_and_sleep  # type: ignore[method-assign]
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        ran = subprocess.run(
+            [sys.executable, "-c", CLIENT, simulator.wires[0].path, str(begun)],
+            env=os.environ | {"LD_PRELOAD": preloaded("sleeping_clock", tmp_path), "SLEPT": str(slept)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert ran.returncode == 0, ran.stderr
+    commands = [write.raw for write in sim.counters.writes if write.name == "control"]
+    assert commands == ([5] if sleeps else [1, 5])
+    assert ("was not sent" in ran.stdout) == sleeps

@@ -95,7 +95,7 @@ def test_a_late_do_is_not_sent(desk: Desks, seconds: float, outcome: CommandOutc
     assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
 
 
-def test_what_is_held_up_on_its_way_to_the_drive_is_not_sent(tmp_path: Path) -> None:
+def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
     """The library has the rest of the second, and no more."""
     with desks(tmp_path, patience_s=0) as desk:
         _is_held_up(desk)
@@ -119,7 +119,7 @@ def _is_held_up(desk: Desks) -> None:
     assert desk.writes == []
 
 
-def test_what_a_stop_makes_void_on_its_way_to_the_drive_is_not_sent(tmp_path: Path) -> None:
+def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(tmp_path: Path) -> None:
     """The library asks again right before it sends."""
     with desks(tmp_path) as desk:
         token = desk.offered()
@@ -177,7 +177,7 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-def test_what_comes_between_keeps_it_from_being_sent(desk: Desks, deed: str, is_late: bool) -> None:
+def test_a_command_is_not_sent_after_a_change_in_between(desk: Desks, deed: str, is_late: bool) -> None:
     """Between the offer and the word to do it, and between that word and the sending."""
     if is_late:
         answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
@@ -205,7 +205,7 @@ def test_a_restarted_master_knows_no_token_of_before(desk: Desks, tmp_path: Path
     assert desk.writes == []
 
 
-def test_who_is_not_the_master_keeps_silent(desk: Desks) -> None:
+def test_only_the_master_answers(desk: Desks) -> None:
     """Another gateway may be the master, and the first answer counts."""
     desk.is_master = False
     assert desk.ask(register=SETPOINT, value=20.0) is None
@@ -224,7 +224,7 @@ def test_a_stop_waits_for_no_guard_and_a_command_does(desk: Desks) -> None:
     assert desk.written == {"control"}
 
 
-def test_who_asks_what_became_of_it_first_ends_it(desk: Desks) -> None:
+def test_asking_for_the_result_withdraws_the_offer(desk: Desks) -> None:
     token = desk.offered()
 
     async def main() -> list[CommandAnswer]:
@@ -271,7 +271,7 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_that_goes_on_says_what_is_known_of_it(desk: Desks) -> None:
+def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
     """Its asker is told that it was sent long before the motor stands; this one stands when that was told."""
     desk.sim["output_frequency"] = 10.0
     data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
@@ -298,7 +298,7 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_who_loses_the_line_at_a_stop_leaves_it_to_the_next_master(
+def test_a_gateway_that_loses_the_line_leaves_the_answer_to_the_next(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
 ) -> None:
     """A copy may have reached that one. Where we have the line again, the asker's next copy stops it."""
@@ -319,7 +319,7 @@ def test_who_loses_the_line_at_a_stop_leaves_it_to_the_next_master(
     assert desk.written == {"control"}
 
 
-def test_a_stop_ends_what_was_offered_before_and_copies_of_it_are_one(desk: Desks) -> None:
+def test_a_stop_withdraws_offers_and_its_copies_count_once(desk: Desks) -> None:
     token = desk.offered()
 
     async def main() -> CommandAnswer:
@@ -489,7 +489,7 @@ def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
         ({"id": "one", "drives": ["fan"]}, {"id": "one", "drives": ["pump"]}),
     ],
 )
-def test_a_stop_that_is_no_copy_is_another_stop(
+def test_a_stop_with_another_id_is_another_stop(
     desk: Desks, first: dict[str, Any], then: dict[str, Any]
 ) -> None:
     asyncio.run(desk.stop_by(json.dumps(first).encode()))
@@ -519,6 +519,6 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 
 
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
-def test_an_asker_believes_no_answer_that_is_none(data: bytes) -> None:
+def test_an_asker_rejects_invalid_answers(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)

@@ -230,7 +230,7 @@ def test_an_offer_is_of_no_use_to_another_gateway(tell: Callable[[Story], None])
     tell(story)
 
 
-def test_what_a_path_hears_moves_with_it(fleet: Cluster) -> None:
+def test_subscriptions_follow_their_path(fleet: Cluster) -> None:
     async def main() -> None:
         path, asker = (ServerPath(fleet.urls[number:]) for number in (0, 1))
         heard: list[str] = []
@@ -309,7 +309,7 @@ def test_the_command_line_writes_and_stops(drill: CommandDrill) -> None:
     assert all(got >= asked for got, asked in zip(stops, (3, 2, 1, 1), strict=True)), stops  # or repeated
 
 
-def test_no_command_is_carried_out_twice_and_nobody_is_told_wrongly(drill: CommandDrill) -> None:
+def test_commands_are_carried_out_once_and_answers_are_true(drill: CommandDrill) -> None:
     """`python -m bench.questions.fleet_commands --commands 6000` is the whole."""
     before = {drive: drill.setpoints(drive) for drive in drill.sims}
     found = asyncio.run(drill.ask(120, 15.0))

@@ -195,16 +195,14 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
 
 
 @pytest.mark.parametrize("case", STOPS)
-def test_a_stop_is_sent_until_somebody_answers_and_told_at_once_where_nobody_can(
-    tmp_path: Path, case: str
-) -> None:
+def test_a_stop_is_sent_until_a_gateway_answers_and_news_come_at_once(tmp_path: Path, case: str) -> None:
     path, outcome, text = STOPS[case]
     told = asked(tmp_path, path, stop)
     assert told.outcome is outcome
     assert told.text.startswith(text)
 
 
-def test_what_is_known_of_a_stop_meanwhile_is_told_once(tmp_path: Path) -> None:
+def test_progress_of_a_stop_is_reported_once(tmp_path: Path) -> None:
     sent, turning = answer("under way", "sent"), answer("under way", "still turning")
     path = ScriptedPath(stop=[sent, sent, LOST, turning, sent, IT_IS_DONE])
     told: list[CommandAnswer] = []
@@ -216,7 +214,7 @@ def test_what_is_known_of_a_stop_meanwhile_is_told_once(tmp_path: Path) -> None:
     assert last.outcome is DONE
 
 
-def test_that_a_line_has_no_master_yet_is_told_once_and_at_once(tmp_path: Path) -> None:
+def test_a_missing_master_is_reported_once_at_once(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
     last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
@@ -228,7 +226,7 @@ def test_that_a_line_has_no_master_yet_is_told_once_and_at_once(tmp_path: Path) 
     ]
 
 
-def test_who_hears_no_more_of_a_stop_is_told_what_was_heard_last(tmp_path: Path) -> None:
+def test_a_stop_without_further_answers_reports_the_last_one(tmp_path: Path) -> None:
     path = ScriptedPath(
         stop=[{**answer("under way", "pump-1: the stop was sent"), "gateway": "gw-1"}, NOBODY]
     )
@@ -237,7 +235,7 @@ def test_who_hears_no_more_of_a_stop_is_told_what_was_heard_last(tmp_path: Path)
     assert last.text.endswith("; its last answer: pump-1: the stop was sent")
 
 
-def test_who_hears_nothing_of_a_stop_is_told_so_before_it_is_given_up(tmp_path: Path) -> None:
+def test_a_stop_without_answers_is_reported_before_giving_up(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[LOST])
     last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
@@ -267,7 +265,7 @@ def test_a_stop_waits_for_no_path_that_hangs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
-def test_a_stop_is_unsent_for_certain_where_each_path_says_so(tmp_path: Path, others: list[Given]) -> None:
+def test_a_stop_is_certainly_unsent_if_each_path_says_so(tmp_path: Path, others: list[Given]) -> None:
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
     async def stop_on_all(asker: FleetCommands) -> CommandAnswer:
@@ -302,7 +300,7 @@ def test_a_log_that_cannot_be_opened_keeps_a_command_back_and_no_stop(tmp_path: 
     assert path.asked == ["stop"]
 
 
-def test_a_person_agreed_to_what_is_done_and_to_nothing_else(tmp_path: Path) -> None:
+def test_only_the_agreed_text_is_carried_out(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
 
     async def agreed(asker: FleetCommands) -> CommandAnswer:
@@ -315,7 +313,7 @@ def test_a_person_agreed_to_what_is_done_and_to_nothing_else(tmp_path: Path) -> 
     assert path.asked == ["cmd"]
 
 
-def test_all_lines_are_stopped_and_the_worst_is_told(tmp_path: Path) -> None:
+def test_all_lines_are_stopped_and_the_worst_outcome_is_returned(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}, NOBODY])
     told = asked(tmp_path, path, lambda asker: asker.stop())
     assert told.outcome is NOT_SENT
@@ -371,7 +369,7 @@ def test_a_plant_that_was_read_before_will_do(tmp_path: Path) -> None:
     assert asked(tmp_path, path, stop, plant).outcome is DONE
 
 
-def test_a_stop_needs_no_plant_where_its_line_is_named(tmp_path: Path) -> None:
+def test_a_stop_of_a_named_line_needs_no_plant(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
     plant = Plant(FleetError("no server"))
     told = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], line="hall-1"), plant)

@@ -94,7 +94,7 @@ async def nobody_is_asked(asker: Client) -> bool:
         return False
 
 
-def test_where_nobody_polls_the_line_each_server_says_so(servers: SecuredCluster, tmp_path: Path) -> None:
+def test_servers_report_a_line_without_gateway(servers: SecuredCluster, tmp_path: Path) -> None:
     """That nobody was asked is certain, though asker and gateway have accounts of their own."""
 
     async def main(made: Desks) -> None:

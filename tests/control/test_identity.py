@@ -1,9 +1,9 @@
-"""A drive that did not answer may be another now: the next start looks again; a stop does not."""
+"""Identity checks before starts and stops, and their repetition after silences."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -11,6 +11,7 @@ from examples import usually
 from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
 from simulated_bus import SimulatedBus, is_write, one
+from stop_frames import STOPS, first, writes
 
 from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, WriteForbidden
 from multidrop.control import records
@@ -19,17 +20,22 @@ from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, bui
 from multidrop.drive import Script, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import CheckAgain
+from multidrop.errors import (
+    BusError,
+    CheckAgain,
+)
+from multidrop.families import YD1000, DelixiModbus
+from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 
 every_family = pytest.mark.parametrize("model", usually(*MAKE))
-GOODRIVE = 0x010A  # what another of INVT's series says it is, where a CHE says 0101H
+GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
 
 
 @contextmanager
 def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
-    """One drive on a line of its own, which was found to be what it is said to be."""
+    """One confirmed drive on a line of its own."""
     sim = simulated(MAKE[model](1))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
@@ -50,7 +56,7 @@ def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
 
 
 @pytest.mark.slow
-def test_another_drive_in_the_place_of_a_known_one_is_not_started() -> None:
+def test_a_replaced_drive_is_not_started() -> None:
     with known("invt-che") as (bus, drive, received):
         drive.set_frequency(10)
         be_silent(bus, drive, received)
@@ -63,7 +69,7 @@ def test_another_drive_in_the_place_of_a_known_one_is_not_started() -> None:
 
 
 @pytest.mark.slow
-@every_family
+@pytest.mark.parametrize("model", MAKE)
 def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
     model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,7 +86,7 @@ def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
         assert looks == ["look"]
 
 
-@every_family
+@pytest.mark.parametrize("model", MAKE)
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
 def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
@@ -105,7 +111,7 @@ def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
         assert looks == ["look"]
 
 
-@every_family
+@pytest.mark.parametrize("model", MAKE)
 def test_a_stop_of_a_drive_that_was_idle_asks_nothing_first(model: str) -> None:
     with known(model) as (bus, drive, received):
         bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
@@ -115,7 +121,7 @@ def test_a_stop_of_a_drive_that_was_idle_asks_nothing_first(model: str) -> None:
 
 
 @pytest.mark.slow
-@every_family
+@pytest.mark.parametrize("model", MAKE)
 def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
@@ -159,7 +165,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
     model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Asked or not: nobody has seen then whether it was there all the time."""
+    """Whether it was polled or not: it may have been replaced unseen."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         received.requests.clear()
@@ -173,7 +179,7 @@ def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_los
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
-def test_a_setpoint_is_forgotten_where_the_look_before_start_ends_a_long_silence(model: str) -> None:
+def test_a_setpoint_is_forgotten_if_the_check_before_start_ends_a_long_silence(model: str) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         be_silent(bus, drive, received)
@@ -198,7 +204,7 @@ def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
-def test_a_setpoint_is_kept_where_one_reply_was_lost(model: str) -> None:
+def test_a_setpoint_is_kept_if_one_reply_was_lost(model: str) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         be_silent(bus, drive, received)
@@ -206,8 +212,8 @@ def test_a_setpoint_is_kept_where_one_reply_was_lost(model: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_polling_missed_counts_too() -> None:
-    """Also while the drive was interrupted, its line was polled: nobody has to ask by hand."""
+def test_missed_polls_count_as_silence() -> None:
+    """Polling during the interruption is enough."""
     sim = simulated(MAKE["invt-che"](1))
     assert isinstance(sim, MotorDrive)
     received = ReceivedRequests(sim)
@@ -243,7 +249,7 @@ def test_a_drive_that_was_taken_off_is_asked_again_before_it_is_moved(
 
 
 def test_a_drive_that_was_taken_off_is_asked_again_before_its_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """That nothing was found against a stop says nothing of what is there now."""
+    """An allowed stop does not confirm the drive for a start."""
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None
@@ -268,11 +274,11 @@ def test_a_suspicion_of_a_drive_that_was_taken_off_is_forgotten(monkeypatch: pyt
         bus.attach(drive)
 
 
-# ---- the looks themselves ----
+# ---- the checks themselves ----
 
 
 class Mute(Drive):
-    """A drive of a user's own, whose class cannot tell what it is."""
+    """A user's drive whose class cannot identify it."""
 
     model = "mute"
     title = "OWN 5"
@@ -314,7 +320,7 @@ def test_something_is_read_once_before_the_first_stop_and_waits_for_nothing(
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
-def test_the_look_before_a_stop_counts_where_it_can_be_no_other_request_s_answer(
+def test_the_check_before_a_stop_counts_if_its_reply_is_unambiguous(
     monkeypatch: pytest.MonkeyPatch, is_in_step: bool
 ) -> None:
     bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
@@ -330,7 +336,7 @@ def test_the_look_before_a_stop_counts_where_it_can_be_no_other_request_s_answer
     assert bus.bus.knows_identity(drive) is is_in_step
 
 
-def test_a_family_that_little_proves_is_no_reason_to_withhold_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_weak_identity_check_never_withholds_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """An IBD is recognised by places that its manual does not name."""
     bus = SimulatedBus(monkeypatch, simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
@@ -347,7 +353,7 @@ def test_a_family_that_little_proves_is_no_reason_to_withhold_a_stop(monkeypatch
 
 
 @pytest.mark.parametrize(("share", "looks"), [(0.6, 0), (1.1, 1)])
-def test_a_drive_that_was_asked_just_now_is_not_looked_at_again(
+def test_a_drive_that_just_answered_is_not_checked_again(
     monkeypatch: pytest.MonkeyPatch, share: float, looks: int
 ) -> None:
     bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
@@ -357,3 +363,231 @@ def test_a_drive_that_was_asked_just_now_is_not_looked_at_again(
     drive.set_frequency(20)
     asked = [is_write(request) for request, _ in bus.frames[begun:]]
     assert asked[: looks + 1] == [False] * looks + [True]
+
+
+# ---- before a stop ----
+
+
+REFUSALS = [
+    ("invt-che", 0x11),
+    ("invt-che", 0x06),
+    ("delixi-native", 0xFF),
+    ("yd1000", 0x04),
+    ("innovert-ibd", 0x06),
+    ("erman-er-g-220", 0x02),
+]
+
+
+@pytest.mark.parametrize(("model", "code"), REFUSALS)
+def test_an_exception_to_the_identity_check_prevents_no_stop(
+    monkeypatch: pytest.MonkeyPatch, model: str, code: int
+) -> None:
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
+    sim.motor.energised = True
+
+    def refuse(request: Message) -> bytes | None:
+        if is_write(request) or writes(line):
+            return None
+        return build_reply(
+            drive.framing, Message(1, request.function, request.start, exception=code, data=bytes(4))
+        )
+
+    line.answers = refuse
+    begun = line.seconds
+    drive.stop()
+    stop = first(line, 0, STOPS[model])
+    assert stop is not None
+    assert line.seconds - begun < 60
+    assert STOPS[model](writes(line)[0])  # nothing else was written
+
+
+@pytest.mark.parametrize("model", MAKE)
+def test_a_stop_and_its_identity_check_wait_for_no_late_reply(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    insisted: list[bool] = []
+    carry_out = line.carry_out
+
+    def watched(exchange: Any, **times: Any) -> Any:
+        if not writes(line):
+            insisted.append(bool(exchange.c.insists))
+        return carry_out(exchange, **times)
+
+    monkeypatch.setattr(line, "carry_out", watched)
+    drive.stop()
+    assert len(insisted) >= 2
+    assert all(insisted)
+
+
+@pytest.mark.parametrize("model", MAKE)
+def test_a_lost_identity_check_is_not_repeated_before_the_stop(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line.loses = lambda request: not writes(line)
+    drive.stop()
+    assert first(line, 0, STOPS[model]) == 1
+
+
+def test_one_odd_reply_does_not_prove_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
+    line.answers = lambda request: odd if len(line.frames) == 1 else None
+    drive.stop()
+    assert first(line, 0, STOPS["invt-che"]) is not None
+
+
+def test_two_different_odd_replies_do_not_prove_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
+    line.answers = lambda request: odd.pop(0) if odd else None
+    drive.stop()
+    assert odd == []
+    assert STOPS["invt-che"](writes(line)[0])
+
+
+def test_a_drive_that_was_ever_silent_proves_no_other_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its reply may be the answer to an earlier request."""
+    line, drive, sim = one(monkeypatch, InvtCHE(1))
+    sim["device"] = 0x010A
+    line.bus.peer(drive).c.history.ended[10] = 1
+    drive.stop()
+    assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # without a look
+
+
+def test_a_withheld_stop_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = one(monkeypatch, InvtCHE(1))
+    sim["device"] = 0x010A
+    with pytest.raises(
+        WriteForbidden, match=r"no stop was sent .* said twice .*010AH.* Use the hard-wired stop"
+    ):
+        drive.stop()
+    assert line.written == []
+    sim["device"] = 0x0101
+    drive.stop()  # it is looked at again
+    assert line.written != []
+
+
+OTHERS: Sequence[tuple[Drive, Drive]] = (  # declared, and there: of one framing and baud rate
+    (InvtCHE(1, maximum_frequency=50), YD1000(1)),
+    (InnovertIBD(1, confirmed=0), InvtCHE(1)),
+    (YD1000(1), InvtCHE(1)),
+    (DelixiModbus(1, framing="rtu", format="8E1"), YD1000(1, format="8E1")),
+)
+
+
+@pytest.mark.parametrize("pair", OTHERS, ids=lambda pair: f"{pair[0].model} for {pair[1].model}")
+def test_a_withheld_stop_names_the_stop_of_the_other_family(
+    monkeypatch: pytest.MonkeyPatch, pair: tuple[Drive, Drive]
+) -> None:
+    declared, there = pair
+    sim = simulated(there)
+    line = SimulatedBus(monkeypatch, sim)
+    drive = line.attach(declared)
+    with pytest.raises(WriteForbidden, match=f"multidrop stop PORT {there.model} 1"):
+        drive.stop()
+    assert line.written == []
+    line.bus.detach(drive)
+    line.attach(type(there)(1, format=there.settings.format)).stop()
+    assert line.written != []
+
+
+OUT_OF_DATE = [  # a register of `identify`, and a count that the family's own drive may hold for a while
+    ("delixi-modbus", "baudrate_setting", 4),
+    ("delixi-modbus", "address_setting", 7),
+    ("delixi-modbus", "fault", 99),
+    ("delixi-native", "baudrate_setting", 4),
+    ("delixi-native", "address_setting", 7),
+    ("innovert-ibd", "baudrate_setting", 3),
+    ("innovert-ibd", "address_setting", 7),
+    ("invt-che", "device", 0x0103),
+    ("invt-che", "device", 0x0001),
+    ("yd1000", "address_setting", 7),
+    ("yd1000", "maximum_frequency", 800),
+]
+
+
+def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
+    """Let each read of this register return `count`, whatever the simulated drive holds."""
+    register = drive.register(name)
+    data = count.to_bytes(4 if drive.framing is Framing.DELIXI else 2, "big")
+    start = register.address if drive.framing is Framing.DELIXI else 0
+    reply = build_reply(drive.framing, Message(1, register.table.read, start, data=data))
+    line.answers = lambda request: reply if request.start == register.address else None
+
+
+@pytest.mark.parametrize(("model", "name", "count"), OUT_OF_DATE)
+@pytest.mark.parametrize("how", ["stop", "stop_all", "write"])
+def test_one_odd_value_withholds_a_start_but_no_stop(
+    monkeypatch: pytest.MonkeyPatch, model: str, name: str, count: int, how: str
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    shows(line, drive, name, count)
+    with pytest.raises(WriteForbidden):
+        drive.set_frequency(20)
+    assert line.written == []
+    if how == "stop":
+        drive.stop()
+    elif how == "stop_all":
+        line.bus.detach(drive)
+        line.bus.attach(drive)
+        (stopped,) = line.bus.stop_all().values()
+        assert stopped.seen is Seen.STOPPED
+    else:
+        drive.write(drive.control, drive.control.decode(drive.control.broadcast[0]))
+    assert STOPS[model](writes(line)[0])
+
+
+@pytest.mark.parametrize("model", MAKE)
+def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    """Some other makes answer function 04 too, which is all that an ERMAN's identity check asks."""
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+
+    def refuse(request: Message) -> bytes | None:
+        if is_write(request) or request.function == 4:
+            return None
+        return build_reply(drive.framing, Message(1, request.function, request.start, exception=2))
+
+    if drive.framing is Framing.RTU:
+        line.answers = refuse
+    with suppress(BusError):
+        drive.stop(seconds=1)
+    assert STOPS[model](writes(line)[0])
+
+
+def test_no_stop_waits_for_a_second_check_of_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor for the first one, of a drive that is known."""
+    others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
+    line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
+    line.attach(InvtCHE(1, maximum_frequency=50))
+    for drive in others[1:]:
+        line.attach(drive)
+    line.bus.check_identity(others[2])
+    begun = len(line.frames)
+    found = line.bus.stop_all()
+    addresses = [request.address for request, _ in line.frames[begun:]]
+    assert [request.address for request in writes(line, begun)][:2] == [3, 2]
+    assert addresses[0] == 3
+    before = first(line, begun, lambda each: each.address == 2)
+    assert before is not None
+    assert addresses[:before].count(1) == 1
+    assert found["invt-che@1"].seen is Seen.FAILED
+    assert all(write.address != 1 for write in writes(line, begun))
+
+
+@pytest.mark.parametrize("suspicions", [1, 2])
+def test_a_plain_stop_is_withheld_if_another_family_answers_twice(
+    monkeypatch: pytest.MonkeyPatch, suspicions: int
+) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
+    line.answers = lambda request: odd if len(line.frames) <= suspicions else None
+    if suspicions == 1:
+        drive.write(drive.control, CHEControl.STOP)
+    else:
+        with pytest.raises(WriteForbidden, match="no stop was sent"):
+            drive.write(drive.control, CHEControl.STOP)
+    assert len(line.written) == 2 - suspicions

@@ -1,0 +1,253 @@
+"""Ctrl-C at any step of an exchange: what may have been sent is told, and nothing is left behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+from linecache import getline
+from types import FrameType
+from typing import Any
+
+import pytest
+from interruptions import interrupted_at
+from lines import PATIENCE
+from motors import MAKE, STARTS, ReceivedRequests
+from simulated_bus import SimulatedBus, is_write, one
+from stop_frames import STOPS, Own, first, writes
+
+from multidrop import Bus
+from multidrop.control.outcome import Seen
+from multidrop.core import Message
+from multidrop.drive import Script, insist, read, wait, write
+from multidrop.drive.verbs import verb
+from multidrop.families import InvtCHE
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+from multidrop.transport import clock
+from multidrop.transport import line as of_a_port
+
+BAUDRATE = 38400  # its silences are short
+CODE = of_a_port.Line.carry_out.__code__
+
+
+def counts(frame: FrameType) -> bool:
+    """Say whether a signal comes before this line: not before the last one, after which nothing is left."""
+    return frame.f_code is CODE and "discard" not in getline(CODE.co_filename, frame.f_lineno)
+
+
+def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
+    """Call it, and raise before the nth line of the exchanges that it makes; None where there are fewer."""
+    try:
+        with interrupted_at(nth, counts):
+            call()
+    except KeyboardInterrupt as interruption:
+        return interruption
+    return None
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["start", "coast", "stop"])
+def test_an_interruption_reports_what_may_have_been_sent(verb: str) -> None:
+    sim = simulated(InvtCHE(1, baudrate=BAUDRATE, maximum_frequency=50))
+    assert isinstance(sim, MotorDrive)
+    received = ReceivedRequests(sim)
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        for nth in count(1):
+            with Bus(simulator.wires[0].path, expiry=PATIENCE) as bus:
+                drive = bus.attach(InvtCHE, address=1, baudrate=BAUDRATE, maximum_frequency=50)
+                drive.set_frequency(25.0)
+                before = len(received.writes)
+                interruption = interrupted(getattr(drive, verb), nth)
+                sent = received.writes[before:]
+            if interruption is None:
+                break
+            (told,) = interruption.__notes__
+            assert "sent" in told
+            if sent:
+                assert "nothing of the" not in told
+                assert "no stop was sent" not in told
+    assert nth > 8
+
+
+def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    with Simulator([Wire([simulated(InvtCHE(1, baudrate=BAUDRATE))], unpaced=True)]) as simulator:
+        for nth in count(1):
+            bus = Bus(simulator.wires[0].path)
+            drive = bus.attach(InvtCHE, address=1, baudrate=BAUDRATE)
+            interruption = interrupted(partial(drive.read, drive.status), nth)
+            with monkeypatch.context() as patched:
+                patched.setattr(clock, "sleep", waits.append)
+                bus.close()
+            assert waits == []
+            if interruption is None:
+                break
+    assert nth > 8
+
+
+# ---- interrupted stops and starts ----
+
+
+OF_TWO_WRITES = ("erman-er-g-220", "invt-che")  # START is taken back too, or a jog stopped
+
+
+class Restless(Own):
+    """One whose stop reads without a wait, and never sees it stand."""
+
+    model = "restless"
+    title = "OWN 4"
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from insist(self.run, 0)
+        while (yield from read(self.ratio)) >= 0:
+            pass
+
+
+class Careful(Own):
+    """A drive whose stop reads first, and waits before the last write."""
+
+    model = "careful"
+    title = "OWN 3"
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        ratio = yield from read(self.ratio)
+        yield from write(self.run, 7 if ratio else 0)
+        yield from wait(2)
+        yield from write(self.run, 9)
+
+
+@pytest.mark.parametrize("model", MAKE)
+@pytest.mark.parametrize("all_of_them", [False, True])
+def test_a_stop_that_is_interrupted_is_sent_once_more(
+    monkeypatch: pytest.MonkeyPatch, model: str, all_of_them: bool
+) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(20)
+    drive.start()
+    begun = len(line.frames)
+    pressed: list[Message] = []
+
+    def press(request: Message) -> bytes | None:
+        if len(line.frames) > begun and not pressed:
+            pressed.append(request)
+            raise KeyboardInterrupt
+        return None
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        line.bus.stop_all() if all_of_them else drive.stop()
+    stops = [write for write in writes(line, begun) if STOPS[model](write)]
+    assert len(stops) == 2
+    assert interruption.value.__notes__ == [
+        f"{drive.name}: the stop was sent {'2 to 3' if model in OF_TWO_WRITES else '1 to 2'} times; "
+        "the motor is not seen to stand"
+    ]
+
+
+def test_an_interrupted_stop_ends_a_jog_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The motor's state is no longer read, so it may be jogging."""
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.jog()
+    begun = len(writes(line))
+
+    def press(request: Message) -> bytes | None:
+        if len(writes(line)) == begun + 1:
+            raise KeyboardInterrupt
+        return None
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt):
+        drive.stop()
+    sent = writes(line)[begun:]
+    assert [write.data for write in sent] == [b"\0\5", b"\0\5", b"\0\x08"]
+    assert [request for request, _ in line.frames[-3:]] == sent
+
+
+def test_a_stop_that_reads_without_a_wait_keeps_no_other_one_from_being_repeated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sims: list[Any] = [simulated(Restless(1)), simulated(InvtCHE(2, maximum_frequency=50))]
+    line = SimulatedBus(monkeypatch, *sims)
+    restless, other = (line.attach(sim.drive) for sim in sims)
+    other.set_frequency(20)
+    other.start()
+    line.bus.check_identity(restless)
+    begun, heard = len(line.frames), line.seconds + 1.0
+    line.deafens = lambda request: request.address == 2 and line.seconds < heard
+    found = line.bus.stop_all(seconds=12)
+    assert {name: stopped.seen for name, stopped in found.items()} == {
+        restless.name: Seen.SENT,
+        other.name: Seen.STOPPED,
+    }
+    assert [request.address for request in writes(line, begun)][:4] == [1, 2, 2, 2]
+
+
+def test_an_interrupted_stop_is_sent_after_its_reads_without_its_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line = SimulatedBus(monkeypatch, simulated(Careful(1)))
+    drive = line.attach(Careful(1))
+    drive.write(drive.ratio, 3.0)
+    line.bus.check_identity(drive)
+    begun, pressed = len(line.frames), [KeyboardInterrupt()]
+
+    def press(request: Message) -> bytes | None:
+        if pressed:
+            raise pressed.pop()
+        return None
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        drive.stop()
+    assert [write.data for write in writes(line, begun)] == [b"\0\7"]
+    assert interruption.value.__notes__ == [
+        f"{drive.name}: the stop was sent 1 times; the motor is not seen to stand"
+    ]
+
+
+def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
+
+    def press(request: Message) -> bytes | None:
+        raise KeyboardInterrupt
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        drive.stop()
+    assert len(writes(line)) == 2
+    assert interruption.value.__notes__ == [
+        f"{drive.name}: the stop was sent 0 to 2 times; the motor is not seen to stand"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("moment", "note"),
+    [
+        ("look", "the start was not sent"),
+        ("start", "control = FORWARD may have been sent; its effect is unknown"),
+        ("after", "control = FORWARD was sent and confirmed, but its effect was not seen"),
+    ],
+)
+def test_an_interrupted_start_says_what_was_sent(
+    monkeypatch: pytest.MonkeyPatch, moment: str, note: str
+) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+
+    def press(request: Message) -> bytes | None:
+        is_start = is_write(request) and STARTS["invt-che"](request)
+        was_sent = first(line, 0, STARTS["invt-che"]) is not None
+        if {"look": True, "start": is_start, "after": was_sent and not is_start}[moment]:
+            raise KeyboardInterrupt
+        return None
+
+    line.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        drive.start()
+    assert interruption.value.__notes__ == [f"{drive.name}: {note}"]
