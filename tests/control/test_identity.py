@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from examples import usually
@@ -27,7 +28,7 @@ from multidrop.errors import (
 from multidrop.families import YD1000, DelixiModbus
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
-from multidrop.transport import clock
+from multidrop.transport import clock, peers
 
 every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
@@ -40,7 +41,11 @@ def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
     received = ReceivedRequests(sim)
-    with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+    with (
+        patch.object(peers, "LEAST_TIMEOUT", 0.3),  # s, for a busy machine
+        Simulator([Wire([sim], unpaced=True)]) as simulator,
+        Bus(simulator.wires[0].path) as bus,
+    ):
         drive = bus.attach(MAKE[model](1))
         bus.check_identity(drive)
         yield bus, drive, received
