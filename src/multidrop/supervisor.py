@@ -44,7 +44,7 @@ class Supervisor:
 
     def __init__(self) -> None:
         self.dead: dict[str, str] = {}  # tasks and threads that must go on, and why they ended
-        self.has_dead = asyncio.Event()  # set at the first of them
+        self.has_dead = asyncio.Event()  # set at the first one
         self._kept: dict[str, asyncio.Task[Any]] = {}
         self._watched: dict[str, Callable[[], bool]] = {}
         self._short: set[asyncio.Task[Any]] = set()
@@ -239,5 +239,5 @@ def for_a_future(failure: BaseException) -> Exception:
 
 
 def reason_of(failure: BaseException | None) -> str:
-    """Return why something ended that raised this; None: it raised nothing."""
+    """Return why a task or thread ended: the exception it raised, or None if it returned."""
     return "it returned" if failure is None else f"{type(failure).__name__}: {failure}"

@@ -292,7 +292,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "no address": (
         lambda bus, rig: bus.attach(Toy),
         TypeError,
-        "attach(Toy, address=...): which address does it have?",
+        "attach(Toy, address=...): the address is missing",
     ),
     "a drive of another bus": (
         lambda bus, rig: Toy(5).read(Toy.status),
@@ -362,12 +362,12 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "a drive that is made is attached by another name": (
         lambda bus, rig: bus.attach(Toy(3, name="pump"), name="fan"),
         TypeError,
-        "pump is made already: what it is to be goes into Toy(…)",
+        "pump already exists: give its address and options to Toy(…)",
     ),
     "a drive that is made is attached at another address": (
         lambda bus, rig: bus.attach(Toy(3, name="pump"), 2),
         TypeError,
-        "pump is made already: what it is to be goes into Toy(…)",
+        "pump already exists: give its address and options to Toy(…)",
     ),
     "a name is detached": (
         lambda bus, rig: bus.detach(cast(Any, "pump")),

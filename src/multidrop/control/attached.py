@@ -1,4 +1,4 @@
-"""Drives that are attached to a bus, which carries out their verbs; each is on one bus at a time."""
+"""Attached: the drives of a bus, which carries out their verbs. A drive is on one bus at a time."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ D = TypeVar("D", bound=Drive)
 
 
 def made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
-    """Return a drive that was made before, or a new one of a family: `details` go before those of the line.
+    """Return `drive`, or a new drive of this family; `details` override those of the line.
 
-    Raises TypeError for what is neither, an address that is missing, and details that come too late.
+    Raises TypeError for any other object, for a missing address, and for details of an existing drive.
     """
     family = drive if isinstance(drive, type) else type(drive)
     if not issubclass(family, Drive):
         raise TypeError(f"attach takes a family such as InnovertIBD, or a drive of one, not {drive!r}")
     if isinstance(drive, type):
         if address is None:
-            raise TypeError(f"attach({drive.__name__}, address=...): which address does it have?")
+            raise TypeError(f"attach({drive.__name__}, address=...): the address is missing")
         return drive(address, **{**line, **details})
     if address is not None or details:
-        raise TypeError(f"{drive.name} is made already: what it is to be goes into {family.__name__}(…)")
+        raise TypeError(f"{drive.name} already exists: give its address and options to {family.__name__}(…)")
     return drive
 
 
 class BusLink:
-    """Link of the drives of a bus."""
+    """Reads and writes of a bus's drives by their own methods."""
 
     def __init__(self, exchanges: Exchanges, performer: Performer) -> None:
         self._exchanges = exchanges
@@ -79,13 +79,13 @@ class BusLink:
 
 
 class Attached:
-    """The drives of a bus, which come and go on any thread."""
+    """The drives of a bus; any thread may add and remove them."""
 
     def __init__(
         self, bus: Any, exchanges: Exchanges, latches: Latches, performer: Performer, stopper: Stopper
     ) -> None:
         self.drives: list[Drive] = []
-        self.lock = threading.RLock()  # one drive comes or goes at a time
+        self.lock = threading.RLock()  # one drive is added or removed at a time
         self._bus = bus
         self._exchanges = exchanges
         self._latches = latches
@@ -94,12 +94,12 @@ class Attached:
         self._link = BusLink(exchanges, performer)
 
     def forked(self) -> None:
-        """Let them be attached to a bus of the child."""
+        """Release the drives in a forked child, so that a bus of the child can have them."""
         self.lock = threading.RLock()
         self._free(self.drives)
 
     def add(self, drive: Drive) -> None:
-        """Attach a drive; ValueError where its address is taken, or it is on another bus."""
+        """Attach a drive. Raises ValueError if its address is taken or it is on another bus."""
         with self.lock:
             for other in self.drives:
                 if other.address == drive.address:
@@ -111,7 +111,7 @@ class Attached:
                 )
             self._exchanges.add(drive)
             self._give_verbs(drive, self._latches.add(drive))
-            self.drives = [*self.drives, drive]  # anew, for others may be going through them
+            self.drives = [*self.drives, drive]  # replaced, never mutated: readers iterate without a lock
 
     def _give_verbs(self, drive: Drive, latch: Latch) -> None:
         bus, performer, stopper = self._bus, self._performer, self._stopper
@@ -124,7 +124,7 @@ class Attached:
         drive.begin_stop = lambda verb, script, seconds: stopper.stop(drive, verb, script, seconds)
 
     def remove(self, drive: Drive) -> None:
-        """Take a drive off the bus: nothing moves it any more. NotAttached where it is not there."""
+        """Remove a drive from the bus. Raises NotAttached if it is not there."""
         with self.lock:
             self._exchanges.peer(drive)
             self.drives = [other for other in self.drives if other is not drive]
@@ -132,7 +132,7 @@ class Attached:
             self._free([drive])
 
     def free(self) -> None:
-        """Let them be attached to other buses, once this one is closed."""
+        """Release the drives once this bus is closed, so that other buses can have them."""
         with self.lock:
             self._free(self.drives)
 

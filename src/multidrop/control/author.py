@@ -1,4 +1,4 @@
-"""Author of a write, for the audit log: a person or program, and the interface it used."""
+"""Author of a write in the audit log: a person or program, and the interface it used."""
 
 from __future__ import annotations
 

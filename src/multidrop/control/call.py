@@ -84,7 +84,7 @@ class Call:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Log a refusal; on Ctrl-C, add a note on what was already sent.
+        """Log a refusal; on Ctrl-C, add a note on the writes already sent.
 
         If a signal's stops ended the call, raise the signal's own effect, such as KeyboardInterrupt.
         """

@@ -1,4 +1,4 @@
-"""CommandResult: the outcome of a command, by what is certain about its effect. Pure."""
+"""CommandResult: the outcome of a command, stating only certain facts. Pure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from multidrop.errors import (
 
 
 class CommandOutcome(StrEnum):
-    """The end of a command, by what is known about it."""
+    """The end of a command; UNKNOWN unless its effect is certain."""
 
     DONE = "done"
     FAILED = "failed"  # sent, but the drive refused it, or was seen not to do it

@@ -42,7 +42,7 @@ class Latches:
         return latch
 
     def end(self, drives: Iterable[Drive]) -> None:
-        """Cancel the calls of these drives, which are about to be removed, and refuse new ones."""
+        """Cancel all calls that move these drives before their removal, and refuse new ones."""
         for drive in drives:
             self.latch(drive).shut(REMOVED)
 
@@ -59,7 +59,7 @@ class Latches:
             latch.shut(LEFT)
 
     def await_stops(self, drives: Collection[Drive] | None = None) -> None:
-        """Wait for the stops of these drives, or all; not for those of the calling thread."""
+        """Wait for the stops of some drives, or all; the calling thread's own stops do not count."""
         own, asked = threading.get_ident(), None if drives is None else frozenset(drives)
         while any(
             thread != own and (asked is None or not asked.isdisjoint(stopped))
@@ -76,7 +76,7 @@ class Latches:
         return latch
 
     def rise(self, drives: Sequence[Drive]) -> None:
-        """Cancel the calls of these drives: a stop is about to be written."""
+        """Cancel all calls that move these drives: a stop is about to be written."""
         for drive in drives:
             self.latch(drive).rise(STOPPED)
 

@@ -1,7 +1,7 @@
 """Commands: check and carry out everything that is written through the gateway, over every interface.
 
-The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs the
-role alone, and waits for nothing.
+The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs
+the role alone, and does not wait.
 """
 
 from __future__ import annotations
@@ -314,7 +314,7 @@ def _printable(text: str) -> str:
 
 
 def as_one(results: Mapping[str, CommandResult]) -> CommandResult:
-    """Return one result for a stop that went to several drives because its name may mean each of them."""
+    """Return one result for a stop whose drive name was ambiguous, so that several drives were stopped."""
     if len(results) == 1:
         return next(iter(results.values()))
     failed = [result for result in results.values() if not result.is_done]
