@@ -170,7 +170,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
     model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether it was polled or not: it may have been replaced unseen."""
+    """Polled or not, it may have been replaced unseen."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         received.requests.clear()
