@@ -162,7 +162,7 @@ def test_a_family_that_cannot_say_its_state_is_stopped_all_the_same(
     (tmp_path / "mute.py").write_text(MUTE)
     words = ("stop", port, f"{tmp_path}/mute.py:Mute", 1)
     status, out, err = run(*words)
-    is_run = f"multidrop: {tmp_path}/mute.py is run as Python: a model of one's own is a program\n"
+    is_run = f"multidrop: {tmp_path}/mute.py is run as Python: a user's model is a program\n"
     assert (status, err) == (0, is_run)
     assert out.startswith("mute@1: stop done; state: the family cannot say")
     assert json.loads(run(*words, "--json")[1])["state"] is None

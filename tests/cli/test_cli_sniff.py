@@ -293,7 +293,7 @@ def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: obj
             writer.write(raw, side, number * 1_000_000, "hall-1")
     status, out, err = run("decode", path, *words)
     assert status == 0
-    assert not err or err.endswith("/meter.py is run as Python: a model of one's own is a program\n")
+    assert not err or err.endswith("/meter.py is run as Python: a user's model is a program\n")
     return [line.partition("  ")[2] or line for line in out.splitlines()]
 
 

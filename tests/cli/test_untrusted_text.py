@@ -275,6 +275,6 @@ def test_a_plant_file_that_runs_a_file_says_so_once(tmp_path: Path, command: str
     done = subprocess.run([*MULTIDROP, command, str(plant)], capture_output=True, text=True)
     assert (tmp_path / "ran").exists()
     told, *rest = done.stderr.splitlines()
-    assert told == f"multidrop: {tmp_path}/fan.py is run as Python: a model of one's own is a program"
+    assert told == f"multidrop: {tmp_path}/fan.py is run as Python: a user's model is a program"
     assert not any("is run as Python" in line for line in rest)
     assert done.returncode == (0 if command == "plan" else 1)

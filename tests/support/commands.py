@@ -17,7 +17,7 @@ MULTIDROP = [sys.executable, "-m", "multidrop"]
 TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
 find_model(TOY)  # says that the file is run, once in a process: not in the midst of a test
 Run = Callable[..., tuple[int, str, str]]
-TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a model of one's own is a program\n"
+TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a user's model is a program\n"
 
 
 def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
