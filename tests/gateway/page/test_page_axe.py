@@ -117,7 +117,7 @@ def test_axe_finds_nothing_in_rare_states(
     }
     page.goto(f"{gateway.url}?again#/drives/pump-2")  # a page that has seen no value
     page.evaluate(axe)
-    page.get_by_text(f"{few_drives} of unknown state").wait_for()
+    page.get_by_text(f"{few_drives} in unknown state").wait_for()
     look("nothing known")
     first = fake_plant.plant({})["lines"][0]
     gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
