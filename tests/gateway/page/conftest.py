@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Callable, Iterator
-from typing import Any, NoReturn
+from collections.abc import Iterator
+from typing import Any
 
 import fake_plant
 import pytest
 from fake_gateway import FakeGateway
 from network_changes import steady_network
-from watching import LIVE, PATIENCE_S, until
+from watching import LIVE, PATIENCE_S, SIZES, Opener, missing, until
 
-SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
 # The first is the same engine without windows: a test takes a third of the processor time.
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # a rebound name
-Opener = Callable[..., Any]
-
-
-def missing(what: str) -> NoReturn:
-    """Skip on a user's machine; fail where everything must run."""
-    if os.environ.get("CI") == "true":
-        pytest.fail(what)
-    pytest.skip(what)
 
 
 # Not for the session: playwright keeps a loop running in this thread, which other files' tests may not have.

@@ -6,10 +6,9 @@ import time
 from typing import Any
 
 import pytest
-from conftest import Opener
 from fake_gateway import FakeGateway
 from fake_plant import alarm, lines, ms
-from watching import cell, until_met
+from watching import Opener, cell, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import fake_plant
 import pytest
-from conftest import Opener, missing
 from fake_gateway import FakeGateway
-from watching import press_enter, until, until_still
+from watching import Opener, missing, press_enter, until, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import until, until_met
+from watching import Opener, until, until_met
 
 NONE = "\u2013"  # a dash
 pytestmark = pytest.mark.long  # Chromium is started for each file

@@ -10,9 +10,8 @@ from typing import Any
 import fake_gateway
 import fake_plant
 import pytest
-from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import LIVE, STALE, cell, link, until, until_met
+from watching import LIVE, STALE, Opener, cell, link, until, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

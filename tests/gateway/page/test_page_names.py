@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from watching import AT_ITS_PLACE, VIEWS
+from watching import AT_ITS_PLACE, SIZES, VIEWS, Opener
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

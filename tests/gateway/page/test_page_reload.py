@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Opener
 from fake_gateway import FakeGateway
 from gateways import served
-from watching import LIVE, press_enter, until
+from watching import LIVE, Opener, press_enter, until
 
 from multidrop.gateway.http.rights import Right
 

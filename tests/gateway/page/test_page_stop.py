@@ -8,9 +8,8 @@ from typing import Any
 
 import fake_gateway
 import pytest
-from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from watching import AT_ITS_PLACE, LIVE, VIEWS, press_enter, until, until_met
+from watching import AT_ITS_PLACE, LIVE, SIZES, VIEWS, Opener, press_enter, until, until_met
 
 from multidrop.control.stops import LEAST_S
 

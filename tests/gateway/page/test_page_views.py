@@ -8,9 +8,8 @@ from urllib.parse import parse_qs, urlsplit
 
 import fake_plant
 import pytest
-from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import cell, until, until_met
+from watching import Opener, cell, until, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import fake_plant
 import pytest
-from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from watching import until, until_met
+from watching import SIZES, Opener, until, until_met
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

@@ -6,9 +6,8 @@ import time
 from typing import Any
 
 import pytest
-from conftest import Opener
 from fake_gateway import FakeGateway
-from watching import press_enter, until, until_met, until_still
+from watching import Opener, press_enter, until, until_met, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
+
+import pytest
+
+SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
+Opener = Callable[..., Any]
+
+
+def missing(what: str) -> NoReturn:
+    """Skip on a user's machine; fail where everything must run."""
+    if os.environ.get("CI") == "true":
+        pytest.fail(what)
+    pytest.skip(what)
+
 
 PATIENCE_S = 60.0  # for what comes at once but on a machine that has much else to do
 LOOK_MS = 60  # each look takes four programs 2 ms of their processor
