@@ -84,7 +84,7 @@ class FleetGateway:
         self.member = Member(
             *(name, self.paths, commanded, self.mastership),
             lock=self.lock,
-            why_lost=lambda line: self.lines.bus(line).why_lost,
+            port_loss=self.lines.port_loss,
         )
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()

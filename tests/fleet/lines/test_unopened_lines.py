@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from fleets import HandClock
 from peers import require_module
 
@@ -15,6 +16,7 @@ from multidrop.fleet.lines.unopened_lines import (  # noqa: E402
     LOST_NS,
     MOST_BYTES,
     OPENINGS,
+    REPLY_NS,
     TRIAL_NS,
     UnopenedLines,
 )
@@ -53,6 +55,26 @@ def test_a_polled_line_is_named_once_its_port_is_lost_for_long() -> None:
     clock.pass_s(1)
     unopened.lost("a")
     assert unopened.named() == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "named_after_s"),
+    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # an old reply, and none at all
+)
+def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s: float) -> None:
+    """The port is reported lost, and reopening fails, only some seconds after the line was cut."""
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+
+    def lost_after(seconds: float) -> bool:
+        clock.pass_s(seconds)
+        silent_ns = None if silent_s is None else round((silent_s + seconds) * SECOND)
+        unopened.lost("a", silent_ns)
+        return "a" in unopened.named()
+
+    assert not lost_after(0.0)
+    assert not lost_after(named_after_s - 0.1)
+    assert lost_after(0.1)
 
 
 def test_one_line_at_a_time_is_tried_again_and_ever_more_rarely() -> None:
@@ -95,6 +117,21 @@ def test_once_a_trial_ended_well_the_others_are_tried_without_a_wait() -> None:
     for line, left in (("a", {"b", "c"}), ("b", {"c"}), ("c", set[str]())):
         assert unopened.named() == left
         unopened.opened(line)
+
+
+def test_a_trial_takes_a_line_of_our_own_share_and_its_success_forgets_the_others() -> None:
+    """A line of another gateway's share would not come back: a trial of it proves nothing."""
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abcd":
+        failed(unopened, line)
+    unopened.home = frozenset("bd")
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"a", "c", "d"}
+    unopened.opened("b")
+    assert unopened.named() == frozenset()  # d is on trial at once
+    unopened.opened("d")
+    assert unopened.named() == frozenset()
 
 
 def test_a_line_that_does_not_come_back_ends_its_trial() -> None:

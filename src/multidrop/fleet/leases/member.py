@@ -29,7 +29,7 @@ from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.protocol_version import OtherRules
 from multidrop.fleet.leases.rules import SECOND, USUAL, Terms
 from multidrop.fleet.leases.weak_session import WeakSession
-from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, TakenLine
+from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, PortLoss, TakenLine, no_loss
 from multidrop.fleet.lines.ownership import decide, owner_of
 from multidrop.fleet.lines.releases import WAIT_S, Releases
 from multidrop.fleet.lines.share_records import ShareRecords
@@ -71,7 +71,7 @@ class Member:
         *,
         lock: LifeLock | None = None,
         terms: Terms = USUAL,
-        why_lost: Callable[[str], str | None] = lambda line: None,
+        port_loss: Callable[[str], PortLoss | None] = no_loss,
     ) -> None:
         self.name = names.checked_name("gateway", name)
         self.paths = paths
@@ -85,7 +85,7 @@ class Member:
         self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
         self.unopened = UnopenedLines(lambda: self.lease.clock())
         self.keeper = LineKeeper(
-            lines, self.lease, self.records, self._mark_dirty, unopened=self.unopened, why_lost=why_lost
+            lines, self.lease, self.records, self._mark_dirty, unopened=self.unopened, port_loss=port_loss
         )
         self._shares = Shares()
         self._share: set[str] = set()  # the lines that should be ours
@@ -296,6 +296,9 @@ class Member:
         sharers = Sharers(tuple(sorted(sharing)), lines, self._unopened(present, sharing, lines))
         if await self._shares.make(sharers, self.lease.clock(), is_settled=self._is_settled):
             self._share = self._shares.of(self.name)
+            self.unopened.home = frozenset(
+                line for line, name in self._shares.home.items() if name == self.name
+            )
             self.records.want(self._share)
             self._is_dirty = True
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from multidrop import Bus, Plant, Poller, PollingFailed
 from multidrop.core import Mastership
+from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
@@ -67,6 +68,15 @@ class FleetLines:
 
     def bus(self, line: str) -> Bus:
         return self.poller.bus(line)
+
+    def port_loss(self, line: str) -> PortLoss | None:
+        """Return how the port of a polled line is lost; None if it is open."""
+        bus = self.poller.bus(line)
+        if not bus.line.is_lost:
+            return None
+        replied_ns = max((bus.peer(drive).answered_ns for drive in bus.drives), default=0)
+        silent_ns = time.monotonic_ns() - replied_ns if replied_ns else None
+        return PortLoss(bus.why_lost, silent_ns)
 
     async def close(self) -> None:
         """Stop polling; the last rows are handed out. Raises PollingFailed if polling had failed."""

@@ -40,6 +40,21 @@ class Lines(Protocol):
         """Poll the line no more, and close it: when this returns nothing of ours is sent on it."""
 
 
+class PortLoss(NamedTuple):
+    """A polled line's lost port: why it could not be reopened, and how old the newest reply is (ns).
+
+    `why` is None before the first attempt has failed, `silent_ns` is None if no drive ever replied.
+    """
+
+    why: str | None
+    silent_ns: int | None
+
+
+def no_loss(line: str) -> PortLoss | None:
+    """Return None: the port is open."""
+    return None
+
+
 class TakenLine(NamedTuple):
     """A line that is polled: the revision of its description, and since when (CLOCK_BOOTTIME, ns)."""
 
@@ -50,8 +65,8 @@ class TakenLine(NamedTuple):
 class LineKeeper:
     """The lines that one gateway polls, and what is under way on each of them.
 
-    `on_change` is called when something is to be looked at anew. `why_lost` returns why the port of a polled
-    line is lost and could not be opened again; None where it is open.
+    `on_change` is called when the next step is due. `port_loss` says how the port of a polled line is lost,
+    None if it is open.
     """
 
     def __init__(
@@ -62,7 +77,7 @@ class LineKeeper:
         on_change: Callable[[], object],
         *,
         unopened: UnopenedLines | None = None,
-        why_lost: Callable[[str], str | None] = lambda line: None,
+        port_loss: Callable[[str], PortLoss | None] = no_loss,
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
@@ -75,7 +90,7 @@ class LineKeeper:
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
         self._unopened = unopened or UnopenedLines(lambda: lease.clock())
-        self._why_lost = why_lost
+        self._port_loss = port_loss
         self._is_leaving = False
         self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
         self._tasks: set[asyncio.Task[None]] = set()
@@ -163,11 +178,12 @@ class LineKeeper:
     def _look_at_ports(self) -> None:
         """Note which ports of polled lines are lost: after a while others should take the lines."""
         for line in self.polled.keys() - self._at_work.keys():
-            if why := self._why_lost(line):
-                if line not in self.lost:
-                    _log.warning("line %s is not polled, for its port is lost: %s", line, why)
-                self.lost[line] = why
-                self._unopened.lost(line)
+            if loss := self._port_loss(line):
+                if loss.why and line not in self.lost:
+                    _log.warning("line %s is not polled, for its port is lost: %s", line, loss.why)
+                if loss.why:
+                    self.lost[line] = loss.why
+                self._unopened.lost(line, loss.silent_ns)
             else:
                 self._opened(line)
 

@@ -24,6 +24,7 @@ class Shares:
 
     def __init__(self) -> None:
         self.wanted: dict[str, str] = {}  # each line's gateway
+        self.home: dict[str, str] = {}  # the same if each gateway could open all lines
         self._made: Sharers | None = None
         self._others: frozenset[str] = frozenset()
         self._seen_at = 0
@@ -47,8 +48,8 @@ class Shares:
         if sharers == self._made or is_early:
             return False
         loop = asyncio.get_running_loop()
-        wanted = await loop.run_in_executor(None, balance.assign, sharers.lines, sharers.gateways)
-        self.wanted = balance.hand_over(wanted, dict(sharers.unopened))
+        self.home = await loop.run_in_executor(None, balance.assign, sharers.lines, sharers.gateways)
+        self.wanted = balance.hand_over(self.home, dict(sharers.unopened))
         self._made = sharers
         return True
 

@@ -13,7 +13,8 @@ from collections.abc import Callable
 from multidrop.fleet.leases.rules import SECOND
 
 OPENINGS = 3  # that failed, before a line is named
-LOST_NS = 6 * SECOND  # for which a polled line's port is lost, before it is named
+LOST_NS = 6 * SECOND  # from the last reply on a line whose port is lost, before it is named
+REPLY_NS = 3 * SECOND  # an older reply says nothing about when the port was lost
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # before a trial
 TRIAL_NS = 60 * SECOND  # after which a line that did not come back is tried no more
 MOST_BYTES = 8_000  # of names in a lease's record
@@ -27,6 +28,7 @@ class UnopenedLines:
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have named
+        self.home: frozenset[str] | None = None  # lines that the balance gives this gateway; None: unknown
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
@@ -42,10 +44,15 @@ class UnopenedLines:
         if self._failures[line] >= OPENINGS:
             self._name(line)
 
-    def lost(self, line: str) -> None:
-        """Note that the port of a polled line is lost, and was not opened again yet."""
-        since = self._lost_since.setdefault(line, self._clock())
-        if self._clock() - since >= LOST_NS:
+    def lost(self, line: str, silent_ns: int | None = None) -> None:
+        """Note that the port of a polled line is lost. The newest reply on the line is `silent_ns` old.
+
+        The time counts from that reply: a network that drops everything lets no write fail for a second, and
+        lets an attempt to connect hang for several. None, or an old reply: it counts from the first call.
+        """
+        now = self._clock()
+        since = now - silent_ns if silent_ns is not None and silent_ns <= REPLY_NS else now
+        if now - self._lost_since.setdefault(line, since) >= LOST_NS:
             self._name(line)
 
     def opened(self, line: str) -> None:
@@ -55,6 +62,8 @@ class UnopenedLines:
         self._named.pop(line, None)
         if line == self._tried:  # the way to the lines is there again: the others are tried without a wait
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
+            for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
+                del self._named[other]  # it stays where it is: a trial would bring no proof
 
     def gone(self, line: str) -> None:
         """Note that the line is another gateway's: what counted towards naming it is over."""
@@ -68,8 +77,9 @@ class UnopenedLines:
             self._tried = ""
         hopeless = [line for line in self._named if line in self.hopeless]
         trial_at = min(self._trial_at, self._tried_since + FIRST_WAIT_NS) if hopeless else self._trial_at
+        home = [line for line in self._named if self.home is None or line in self.home]
         if self._named and not self._tried and now >= trial_at:
-            self._tried, self._tried_since = next(iter(hopeless or self._named)), now
+            self._tried, self._tried_since = next(iter(hopeless or home or self._named)), now
             del self._named[self._tried]
             self._trial_at = now + self._wait_ns
         return frozenset(self._named)
