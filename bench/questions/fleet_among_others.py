@@ -46,7 +46,7 @@ def main() -> None:
     from nats_clusters import cluster
     from serial_hall import SerialHall
 
-    from multidrop.fleet.lines.balance import assign
+    from multidrop.fleet.lines.shares import assign
     from multidrop.fleet.servers.plant_store import read_plant
 
     tables.heading("Does a real gateway among a fleet's others keep the rate of its lines?")

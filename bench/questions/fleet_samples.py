@@ -34,7 +34,7 @@ from multidrop.fleet.samples.message import Packed, RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.postgres_sink import PostgresSink
-from multidrop.fleet.samples.spool_folder import SpoolFolder
+from multidrop.fleet.samples.spool import SpoolFolder
 from multidrop.polling import BatchColumns
 
 UTC = 1_795_253_399_123_456_789

@@ -22,6 +22,8 @@ from weakref import WeakKeyDictionary
 
 R = TypeVar("R")
 
+CANCEL_AGAIN_S = 0.2
+
 _log = logging.getLogger("multidrop.supervisor")
 
 
@@ -210,6 +212,19 @@ def supervisor() -> Supervisor:
     if loop not in _supervisors:
         _supervisors[loop] = Supervisor()
     return _supervisors[loop]
+
+
+async def end_tasks(*tasks: asyncio.Task[Any]) -> list[Any]:
+    """Cancel tasks until each is over; return their results and exceptions.
+
+    One cancellation is not enough: `asyncio.wait_for` of Python 3.11 swallows one that meets its own timeout.
+    """
+    left = set(tasks)
+    while left:
+        for task in left:
+            task.cancel()
+        _, left = await asyncio.wait(left, timeout=CANCEL_AGAIN_S)
+    return await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:

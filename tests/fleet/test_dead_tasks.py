@@ -30,7 +30,7 @@ from multidrop import Poller, PollingFailed  # noqa: E402
 from multidrop.cli.fleet.tables import count_sentence, failing_lines  # noqa: E402
 from multidrop.core import Mastership  # noqa: E402
 from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
-from multidrop.fleet import metrics_port  # noqa: E402
+from multidrop.fleet import metrics  # noqa: E402
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
 from multidrop.fleet.commands.log import CommandLog  # noqa: E402
 from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
@@ -38,8 +38,8 @@ from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  #
 from multidrop.fleet.gateway import FleetGateway  # noqa: E402
 from multidrop.fleet.lines import fleet_lines  # noqa: E402
 from multidrop.fleet.lines.fleet_lines import FleetLines  # noqa: E402
-from multidrop.fleet.samples import compaction  # noqa: E402
 from multidrop.fleet.samples import forwarder as forwarder_module  # noqa: E402
+from multidrop.fleet.samples import parquet_sink  # noqa: E402
 from multidrop.fleet.samples import spool as spool_module  # noqa: E402
 from multidrop.fleet.samples.forwarder import Forwarder  # noqa: E402
 from multidrop.fleet.samples.polled_units import PolledUnits  # noqa: E402
@@ -53,8 +53,8 @@ STARTERS = {
     *("create_task", "ensure_future", "to_thread", "run_in_executor"),
 }
 WAITED_FOR = {  # modules that start tasks and threads, and themselves wait for them
-    *("direct_gets", "fleet_commands", "forwarder", "gateway", "hub", "leaders", "line_keeper", "member"),
-    *("observer", "owner_records", "page_part", "servers", "shares"),
+    *("connections", "direct_gets", "fleet_commands", "forwarder", "gateway", "hub", "leaders"),
+    *("line_keeper", "member", "observer", "owner_records", "page_part", "servers", "shares"),
     *("command_log", "fleet_lines"),  # whose callers wait for their threads
     "spool",  # whose thread the gateway watches
 }
@@ -78,7 +78,7 @@ async def fail(*details: object) -> None:
 
 def test_no_other_module_of_the_fleet_starts_a_task_or_a_thread() -> None:
     found = set()
-    for path in Path(multidrop.fleet.__file__).parent.glob("*.py"):
+    for path in Path(multidrop.fleet.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
                 found.add(path.stem)
@@ -271,12 +271,12 @@ def test_a_compaction_that_cannot_begin_is_tried_again(
         raise BlockingIOError("no process is left")
 
     async def main() -> None:
-        merging = asyncio.create_task(compaction.compact_for_ever(tmp_path, every=0.0))
+        merging = asyncio.create_task(parquet_sink.compact_for_ever(tmp_path, every=0.0))
         while len(tried) < 3:
             await asyncio.sleep(0)
         merging.cancel()
 
-    monkeypatch.setattr(compaction, "_compact", fail_to_begin)
+    monkeypatch.setattr(parquet_sink, "_compact", fail_to_begin)
     asyncio.run(main())
     assert "no process is left" in caplog.text
 
@@ -286,7 +286,7 @@ def test_metrics_that_fail_are_an_error_of_the_server(caplog: pytest.LogCaptureF
         raise Ill("a mistake")
 
     head = b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n"
-    assert metrics_port._answer(head, families).startswith(b"HTTP/1.1 500 Internal Server Error\r\n")
+    assert metrics._answer(head, families).startswith(b"HTTP/1.1 500 Internal Server Error\r\n")
     assert "Ill: a mistake" in caplog.text
 
 

@@ -23,8 +23,11 @@ require_module("nkeys")
 from nats.aio.client import Client  # noqa: E402
 from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
 
-from multidrop.fleet.errors import MayNotSend, NoRight  # noqa: E402
-from multidrop.fleet.lines.refusals import Denials  # noqa: E402
+from multidrop.fleet.errors import (  # noqa: E402
+    Denials,
+    MayNotSend,
+    NoRight,
+)
 from multidrop.fleet.servers.credentials import connect_options, inbox_of, public_key  # noqa: E402
 from multidrop.fleet.servers.rights import OTHERS, rights_of  # noqa: E402
 

@@ -29,8 +29,10 @@ from multidrop.cli.fleet import look  # noqa: E402
 from multidrop.cli.fleet import watch as fleet_watch  # noqa: E402
 from multidrop.cli.fleet.screen import picture  # noqa: E402
 from multidrop.cli.fleet.tables import moment, move_table, size  # noqa: E402
-from multidrop.fleet.overview import is_shown  # noqa: E402
-from multidrop.fleet.watching import FleetWatch  # noqa: E402
+from multidrop.fleet.overview import (  # noqa: E402
+    FleetWatch,
+    is_shown,
+)
 from multidrop.supervisor import Ended, supervisor  # noqa: E402
 
 SPOOL = {"bytes": 81234, "lost": 0, "behind": 2, "lag_s": 1.5, "trouble": None}

@@ -18,7 +18,7 @@ from terminals import closing_terminal
 
 from multidrop import History
 from multidrop.cli import main
-from multidrop.fleet.samples import compaction, samples_stream
+from multidrop.fleet.samples import parquet_sink, samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.hub import SampleHub
 from multidrop.fleet.samples.samples_stream import connect, create_stream
@@ -124,7 +124,7 @@ def test_a_hub_whose_compaction_ends_fails(
     async def end(folder: Path) -> None:
         raise ZeroDivisionError("a mistake")
 
-    monkeypatch.setattr(compaction, "compact_for_ever", end)
+    monkeypatch.setattr(parquet_sink, "compact_for_ever", end)
     assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert "Traceback" in said  # in the log

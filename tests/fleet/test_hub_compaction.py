@@ -13,10 +13,9 @@ from peers import require_module
 from spooled import NOON, STEP, exchanges_in, numbered
 
 from multidrop import History
-from multidrop.fleet.samples.compaction import compact_for_ever
 from multidrop.fleet.samples.hub import Commit, KeptPlace
 from multidrop.fleet.samples.message import RowBuffer, unpack
-from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.parquet_sink import ParquetSink, compact_for_ever
 from multidrop.history import compact as compact_module
 from multidrop.history.compact import main as compact
 

@@ -18,10 +18,12 @@ require_module("nats")
 require_module("starlette")
 
 from multidrop import PlantError  # noqa: E402
-from multidrop.fleet.overview import FleetView  # noqa: E402
+from multidrop.fleet.overview import (  # noqa: E402
+    FleetView,
+    FleetWatch,
+)
 from multidrop.fleet.page_part import FleetPart  # noqa: E402
 from multidrop.fleet.servers.connections import ServerPath  # noqa: E402
-from multidrop.fleet.watching import FleetWatch  # noqa: E402
 from multidrop.gateway.settings import read_settings  # noqa: E402
 
 

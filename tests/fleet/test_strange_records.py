@@ -22,15 +22,18 @@ from nats.aio.msg import Msg  # noqa: E402
 from multidrop.fleet.errors import FleetError  # noqa: E402
 from multidrop.fleet.gateway import ask_gateway  # noqa: E402
 from multidrop.fleet.leases import member as member_module  # noqa: E402
-from multidrop.fleet.leases.bucket import LeaseBucket  # noqa: E402
 from multidrop.fleet.leases.lease import boottime_ns  # noqa: E402
 from multidrop.fleet.leases.member import Member  # noqa: E402
 from multidrop.fleet.leases.rules import SECOND, USUAL  # noqa: E402
-from multidrop.fleet.lines.record_shapes import LARGE, SMALL, parsed  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import Bucket, ServerError  # noqa: E402
+from multidrop.fleet.servers.buckets import (  # noqa: E402
+    Bucket,
+    LeaseBucket,
+    ServerError,
+)
 from multidrop.fleet.servers.connections import ServerPath, paths_of  # noqa: E402
 from multidrop.fleet.servers.plant_store import store  # noqa: E402
+from multidrop.fleet.servers.record_shapes import LARGE, SMALL, parsed  # noqa: E402
 from multidrop.fleet.servers.setup import open_all, set_up  # noqa: E402
 
 LEASE = {

@@ -10,7 +10,7 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.task_end import end_tasks  # noqa: E402
+from multidrop.supervisor import end_tasks  # noqa: E402
 
 PATIENCE_S = 60.0
 

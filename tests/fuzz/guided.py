@@ -21,7 +21,6 @@ import multidrop.capture
 import multidrop.families.files
 import multidrop.families.registry
 import multidrop.fleet.samples.message
-import multidrop.fleet.samples.unpacked_size
 import multidrop.gateway.modbus_server.protocol
 import multidrop.gateway.modbus_server.server
 import multidrop.importers
@@ -46,7 +45,7 @@ MODULES = (  # and of several
     multidrop.families.registry,
     multidrop.sim.faulty_wire,
     multidrop.fleet.samples.message,
-    multidrop.fleet.samples.unpacked_size,
+    multidrop.fleet.samples.message,
     multidrop.gateway.modbus_server.protocol,
     multidrop.gateway.modbus_server.server,
     multidrop.gateway.modbus_server.protocol,

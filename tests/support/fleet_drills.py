@@ -22,9 +22,8 @@ from nats_clusters import Cluster, Node, cluster
 from serial_hall import SerialHall
 
 from multidrop.fleet.errors import Conflict, FleetError
-from multidrop.fleet.leases.bucket import LeaseBucket
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.buckets import ask
+from multidrop.fleet.servers.buckets import LeaseBucket, ask
 from multidrop.fleet.servers.connections import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")

@@ -16,9 +16,9 @@ from typing import Any
 from nats_clusters import PATIENCE_S, Cluster, Node, begun, server_program
 from peers import require_program
 
-from multidrop.fleet.servers.accounts import STORE
 from multidrop.fleet.servers.credentials import connect_options
 from multidrop.fleet.servers.files import ROUTE_PORTS, TlsFiles, write_files
+from multidrop.fleet.servers.rights import STORE
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 Change = Callable[[str], str]  # of rights.conf

@@ -89,10 +89,10 @@ async def _read_until_signal(
 
 
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
-    from multidrop.fleet.samples.compaction import compact_for_ever
     from multidrop.fleet.samples.hub import SampleHub
+    from multidrop.fleet.samples.parquet_sink import compact_for_ever
     from multidrop.fleet.samples.samples_stream import close, connect
-    from multidrop.fleet.task_end import end_tasks
+    from multidrop.supervisor import end_tasks
 
     client = await connect(arguments.servers, **options)
     try:

@@ -17,23 +17,22 @@ from multidrop.core import Mastership
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight
-from multidrop.fleet.leases.life_lock import LifeLock
+from multidrop.fleet.file_lock import LifeLock
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines.fleet_lines import FleetLines
 from multidrop.fleet.lines.held_lines import HeldLines
 from multidrop.fleet.lines.line_keeper import SILENT_S
 from multidrop.fleet.lines.moves import TOLD
-from multidrop.fleet.lines.record_shapes import misshapen
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.samples_stream import close, connect
 from multidrop.fleet.samples.spool import Spool
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.record_shapes import misshapen
 from multidrop.fleet.servers.setup import check_buckets, open_all
-from multidrop.fleet.task_end import end_tasks
-from multidrop.supervisor import Ended, supervisor
+from multidrop.supervisor import Ended, end_tasks, supervisor
 
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Mapping
 from contextlib import suppress
 from types import NoneType
 from typing import Any
@@ -15,9 +15,10 @@ from multidrop.fleet.gateway import ask_gateway
 from multidrop.fleet.leases.observer import BELIEVING
 from multidrop.fleet.lines.moves import move_of
 from multidrop.fleet.lines.ownership import owner_of
+from multidrop.fleet.lines.records import FleetRecords
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.servers.fleet_records import FleetRecords
 from multidrop.fleet.servers.setup import check_buckets
+from multidrop.printable import masked
 
 MOVES_SHOWN = 20
 MISSED_MS = 30 * 24 * 3600 * 1000  # for which a gateway that did not come back is told as missing
@@ -125,3 +126,42 @@ def is_shown(state: Mapping[str, Any]) -> bool:
     return isinstance(state.get("trouble"), str) and all(
         name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()
     )
+
+
+EVERY_S = 1.0  # between looks
+
+
+class FleetWatch:
+    """The newest look at a fleet that came to its end, its age, and why there is no newer one."""
+
+    def __init__(self, view: FleetView, clock: Callable[[], float] = time.monotonic) -> None:
+        self._view = view
+        self._clock = clock
+        self._looked: float | None = None
+        self.trouble: str | None = None  # with the newest look
+
+    async def look(self) -> None:
+        """Look anew; where that fails, what was seen before is kept, and grows old."""
+        begun = self._clock()
+        try:
+            await self._view.look()
+        except OSError as failure:
+            self.trouble = masked(str(failure))
+        else:
+            self._looked, self.trouble = begun, None
+
+    async def run(self) -> None:
+        """Look for ever, once a second."""
+        while True:
+            await self.look()
+            await asyncio.sleep(EVERY_S)
+
+    @property
+    def age_s(self) -> float | None:
+        """Return how old the newest look is; None before there is one."""
+        return None if self._looked is None else round(self._clock() - self._looked, 3)
+
+    def told(self) -> dict[str, Any]:
+        """Return what `fleet watch --json` prints and the gateway's page shows."""
+        about = {"at_ms": time.time_ns() // 1_000_000, "age_s": self.age_s, "trouble": self.trouble}
+        return {**about, **self._view.fleet()}

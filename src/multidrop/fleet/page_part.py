@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from multidrop.fleet.task_end import end_tasks
 from multidrop.printable import masked
+from multidrop.supervisor import end_tasks
 
 if TYPE_CHECKING:
     from multidrop.fleet.commands.fleet_commands import FleetCommands
+    from multidrop.fleet.overview import FleetWatch
     from multidrop.fleet.servers.connections import ServerPath
-    from multidrop.fleet.watching import FleetWatch
 
 EXAMPLE = "nats://127.0.0.1:4222"
 OLD_S = 5.0  # an older look is not well
@@ -138,10 +138,9 @@ def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
     Raises ImportError without NATS' client, OSError or ValueError for files that are none.
     """
     from multidrop.fleet.commands.fleet_commands import FleetCommands
-    from multidrop.fleet.overview import FleetView
+    from multidrop.fleet.overview import FleetView, FleetWatch
     from multidrop.fleet.servers.connections import ServerPath
     from multidrop.fleet.servers.credentials import connect_options
-    from multidrop.fleet.watching import FleetWatch
 
     def options(credentials: str) -> dict[str, Any]:
         files = (inside.folder / name if name else None for name in (credentials, settings.ca))

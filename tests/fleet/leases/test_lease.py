@@ -15,10 +15,10 @@ from tables import table
 
 require_module("nats")
 
+from multidrop.fleet import file_lock  # noqa: E402
 from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
-from multidrop.fleet.leases import life_lock  # noqa: E402
+from multidrop.fleet.file_lock import LifeLock  # noqa: E402
 from multidrop.fleet.leases.lease import Lease  # noqa: E402
-from multidrop.fleet.leases.life_lock import LifeLock  # noqa: E402
 from multidrop.fleet.leases.observer import Observer  # noqa: E402
 from multidrop.fleet.leases.rules import SECOND, USUAL  # noqa: E402
 
@@ -437,7 +437,7 @@ def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() 
 def test_who_holds_the_lock_file_knows_that_the_one_before_is_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
 
     async def main() -> None:
         trial = Trial()
@@ -460,11 +460,11 @@ def test_a_lock_file_of_another_machine_proves_nothing(
 ) -> None:
     async def main() -> None:
         trial = Trial()
-        monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
+        monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
         lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
         lock.close()
-        monkeypatch.setattr(life_lock, "machine_id", lambda: machine)
+        monkeypatch.setattr(file_lock, "machine_id", lambda: machine)
         with closing(LifeLock(tmp_path / "a.lock")) as lock:
             assert not await trial.lease(lock=lock).try_to_begin()
 
@@ -475,7 +475,7 @@ def test_another_file_at_the_same_path_proves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two containers of one machine may both have /var/lib/multidrop/a.lock."""
-    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
 
     async def main() -> None:
         trial = Trial()
@@ -493,7 +493,7 @@ def test_two_machines_without_an_id_prove_nothing_to_each_other(
 ) -> None:
     async def main() -> None:
         trial = Trial()
-        monkeypatch.setattr(life_lock, "machine_id", lambda: "")
+        monkeypatch.setattr(file_lock, "machine_id", lambda: "")
         lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
         lock.close()
@@ -513,7 +513,7 @@ def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_sta
         machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
         machine.write_text("copied\n", "utf-8")
         boot.write_text("first\n", "utf-8")
-        monkeypatch.setattr(life_lock, "IDS", (machine, boot))
+        monkeypatch.setattr(file_lock, "IDS", (machine, boot))
         lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
         lock.close()
@@ -529,9 +529,9 @@ def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_sta
 def test_a_machines_id_has_the_kernels_boot_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = tmp_path / "machine-id"
     own.write_text("of a trial", "utf-8")
-    monkeypatch.setattr(life_lock, "IDS", (own, *life_lock.IDS[1:]))
+    monkeypatch.setattr(file_lock, "IDS", (own, *file_lock.IDS[1:]))
     boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    assert life_lock.machine_id() == f"of a trial.{boot}"
+    assert file_lock.machine_id() == f"of a trial.{boot}"
 
 
 @pytest.mark.parametrize("empty", [0, 1])
@@ -541,12 +541,12 @@ def test_without_one_of_its_ids_a_machine_has_none(
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
     for path in ids:
         path.write_text("something\n", "utf-8")
-    monkeypatch.setattr(life_lock, "IDS", ids)
-    assert life_lock.machine_id() == "something.something"
+    monkeypatch.setattr(file_lock, "IDS", ids)
+    assert file_lock.machine_id() == "something.something"
     ids[empty].write_text("\n", "utf-8")
-    assert life_lock.machine_id() == ""
+    assert file_lock.machine_id() == ""
     ids[empty].unlink()
-    assert life_lock.machine_id() == ""
+    assert file_lock.machine_id() == ""
 
 
 # ---- those who watch ----

@@ -19,8 +19,6 @@ require_module("nats")
 
 from multidrop.fleet.errors import Conflict  # noqa: E402
 from multidrop.fleet.leases import member as member_module  # noqa: E402
-from multidrop.fleet.leases import weak_session  # noqa: E402
-from multidrop.fleet.leases.bucket import LeaseBucket  # noqa: E402
 from multidrop.fleet.leases.lease import Lease, boottime_ns  # noqa: E402
 from multidrop.fleet.leases.member import Member, MemberState  # noqa: E402
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms  # noqa: E402
@@ -31,10 +29,13 @@ from multidrop.fleet.lines import (  # noqa: E402
 )
 from multidrop.fleet.lines.line_keeper import PortLoss  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
-from multidrop.fleet.servers.cluster import Cluster as Servers  # noqa: E402
-from multidrop.fleet.servers.cluster import Replica  # noqa: E402
+from multidrop.fleet.servers.buckets import (  # noqa: E402
+    Bucket,
+    LeaseBucket,
+)
 from multidrop.fleet.servers.connections import paths_of  # noqa: E402
+from multidrop.fleet.servers.leaders import Cluster as Servers  # noqa: E402
+from multidrop.fleet.servers.leaders import Replica  # noqa: E402
 from multidrop.fleet.servers.plant_store import store  # noqa: E402
 from multidrop.fleet.servers.setup import open_all  # noqa: E402
 
@@ -379,7 +380,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it would fall silent with the next server that dies."""
-    monkeypatch.setattr(weak_session, "WEAK_NS", 3600 * SECOND)
+    monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:
         other = LeaseBucket(names.LEASES[1], member.best, "other")
@@ -395,7 +396,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
             for member in members.values():
                 await lose_a_path(member)
                 assert "a new session begins soon" in member.trouble
-            monkeypatch.setattr(weak_session, "WEAK_NS", 0)
+            monkeypatch.setattr(member_module, "WEAK_NS", 0)
             began = {name: member.lease.session for name, member in members.items()}
             await until(lambda: members["a"].lease.session > began["a"], "a's new session")
             assert members["b"].lease.session == began["b"]

@@ -13,8 +13,8 @@ require_module("nats")
 
 from multidrop.fleet.leases import rules as lease_rules  # noqa: E402
 from multidrop.fleet.leases.lease import Lease  # noqa: E402
+from multidrop.fleet.leases.member import OtherRules  # noqa: E402
 from multidrop.fleet.leases.observer import Observer  # noqa: E402
-from multidrop.fleet.leases.protocol_version import OtherRules  # noqa: E402
 from multidrop.fleet.leases.rules import RULES, USUAL  # noqa: E402
 
 SENTENCE = "another version of multidrop runs in this fleet: no line is taken until {} is stopped"

@@ -22,7 +22,7 @@ from multidrop.fleet.lines import (  # noqa: E402
 )
 from multidrop.fleet.lines.line_keeper import LineKeeper  # noqa: E402
 from multidrop.fleet.lines.ownership import owner_of, owner_value  # noqa: E402
-from multidrop.fleet.lines.share_records import ShareRecords  # noqa: E402
+from multidrop.fleet.lines.records import ShareRecords  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
 from multidrop.fleet.servers.buckets import Record  # noqa: E402
 

@@ -12,7 +12,6 @@ from tables import table
 
 require_module("nats")
 
-from multidrop.fleet.lines.balance import assign  # noqa: E402
 from multidrop.fleet.lines.ownership import (  # noqa: E402
     NEEDED,
     Claim,
@@ -22,6 +21,7 @@ from multidrop.fleet.lines.ownership import (  # noqa: E402
     owner_by,
     owner_value,
 )
+from multidrop.fleet.lines.shares import assign  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
 from multidrop.fleet.servers.buckets import Record  # noqa: E402
 

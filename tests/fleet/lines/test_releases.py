@@ -13,7 +13,7 @@ require_module("nats")
 from multidrop.fleet.lines import releases  # noqa: E402
 from multidrop.fleet.lines.releases import WAIT_S, Releases  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.cluster import Cluster, Replica  # noqa: E402
+from multidrop.fleet.servers.leaders import Cluster, Replica  # noqa: E402
 
 FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # one of each
 LINES = set(FIRST.values())

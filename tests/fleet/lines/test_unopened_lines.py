@@ -9,7 +9,7 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet.leases.rules import SECOND  # noqa: E402
-from multidrop.fleet.lines.balance import assign, hand_over  # noqa: E402
+from multidrop.fleet.lines.shares import assign, hand_over  # noqa: E402
 from multidrop.fleet.lines.unopened_lines import (  # noqa: E402
     FIRST_WAIT_NS,
     LAST_WAIT_NS,

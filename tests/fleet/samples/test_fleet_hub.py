@@ -22,7 +22,6 @@ from spooled import NOON, STEP, exchanges_in, numbered, rows_of
 from multidrop import History
 from multidrop.fleet.samples import hub as hub_module
 from multidrop.fleet.samples import samples_stream
-from multidrop.fleet.samples.batch_client import BatchClient
 from multidrop.fleet.samples.hub import (
     Commit,
     HubState,
@@ -35,8 +34,8 @@ from multidrop.fleet.samples.hub import (
 from multidrop.fleet.samples.message import RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.postgres_sink import PostgresSink
-from multidrop.fleet.samples.sample_reader import StreamMessage
-from multidrop.fleet.samples.samples_stream import StreamError, publish
+from multidrop.fleet.samples.samples_stream import StreamError, StreamMessage, publish
+from multidrop.fleet.servers.batch_client import BatchClient
 
 LOG = "00112233aabbccdd"
 PATIENCE_S = 60.0

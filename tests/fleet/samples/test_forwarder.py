@@ -23,15 +23,16 @@ from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.message import MOST_BYTES, unpack
-from multidrop.fleet.samples.sample_reader import StreamMessage, read_after
 from multidrop.fleet.samples.samples_stream import (
     StreamError,
+    StreamMessage,
     about,
     connect,
     create_stream,
     digest_of,
     last_of,
     publish,
+    read_after,
     subject_of,
 )
 from multidrop.fleet.samples.spool import Spool

@@ -17,8 +17,7 @@ from tables import table
 
 from multidrop import Batch
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
-from multidrop.fleet.samples.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack
-from multidrop.fleet.samples.unpacked_size import unpacked_size
+from multidrop.fleet.samples.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack, unpacked_size
 
 
 def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:

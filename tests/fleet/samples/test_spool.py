@@ -25,8 +25,7 @@ from spooled import exchanges_in, numbered, rows_in, rows_of
 
 from multidrop.fleet.samples import spool as spool_module
 from multidrop.fleet.samples.message import unpack
-from multidrop.fleet.samples.spool import Spool
-from multidrop.fleet.samples.spool_folder import SpoolError, SpoolFolder
+from multidrop.fleet.samples.spool import Spool, SpoolError, SpoolFolder
 
 GATEWAY = "gateway-1"
 

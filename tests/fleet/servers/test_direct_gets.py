@@ -12,7 +12,7 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet.errors import FleetError, NoRight, Unsure  # noqa: E402
-from multidrop.fleet.samples.batch_client import DirectGet, DirectMessage, Request  # noqa: E402
+from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request  # noqa: E402
 from multidrop.fleet.servers.direct_gets import AGAIN_S, EARNED, MOST_SPARE, Spare, first_answer  # noqa: E402
 
 NEVER = 1e9

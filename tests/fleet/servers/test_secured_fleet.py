@@ -34,20 +34,21 @@ from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, u
 from spooled import numbered  # noqa: E402
 
 from multidrop.fleet.errors import Conflict  # noqa: E402
-from multidrop.fleet.leases.bucket import LeaseBucket  # noqa: E402
-from multidrop.fleet.samples.sample_reader import StreamMessage, read_after  # noqa: E402
+from multidrop.fleet.samples.hub import SourceCheck  # noqa: E402
 from multidrop.fleet.samples.samples_stream import (  # noqa: E402
     DIGEST,
     LOST,
     SEQUENCE,
+    StreamMessage,
     connect,
     digest_of,
     publish,
+    read_after,
     subject_of,
 )
-from multidrop.fleet.samples.sources import SourceCheck  # noqa: E402
 from multidrop.fleet.samples.spool import Spool  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.servers.buckets import LeaseBucket  # noqa: E402
 from multidrop.fleet.servers.connections import paths_of  # noqa: E402
 
 AN_HOUR_AHEAD = """

@@ -15,11 +15,10 @@ from nats_clusters import Cluster, cluster, free_ports, old_server_program, serv
 from tables import table
 
 from multidrop.fleet.errors import FleetError, Unsure
-from multidrop.fleet.leases import bucket as lease_bucket
-from multidrop.fleet.samples.batch_client import DirectMessage
 from multidrop.fleet.servers import connections as servers
 from multidrop.fleet.servers import names, setup
-from multidrop.fleet.servers.buckets import ask
+from multidrop.fleet.servers.batch_client import DirectMessage
+from multidrop.fleet.servers.buckets import LeaseBucket, ask
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.leaders import have_leaders
 
@@ -120,7 +119,7 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such ones would give a lease to its gateway and to who ends it. Some answers may come too late."""
-    monkeypatch.setattr(lease_bucket.LeaseBucket, "_all_of", lease_bucket.LeaseBucket._subject)
+    monkeypatch.setattr(LeaseBucket, "_all_of", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"gave one revision of a key to [2-6] of 6 claimants at once"):
         asyncio.run(_init(nats.urls))
 

@@ -43,8 +43,7 @@ async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
     from importlib.metadata import version
 
     from multidrop.fleet.gateway import FleetGateway
-    from multidrop.fleet.gateway_metrics import families_of
-    from multidrop.fleet.metrics_port import listen, serving
+    from multidrop.fleet.metrics import families_of, listen, serving
     from multidrop.recording.segments import parse_size
 
     name = arguments.gateway

@@ -19,8 +19,8 @@ from multidrop.cli.support.signals import on_end_signals
 from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
+    from multidrop.fleet.overview import FleetWatch
     from multidrop.fleet.servers.connections import ServerPath
-    from multidrop.fleet.watching import FleetWatch
 
 EVERY_S = 1.0
 
@@ -35,10 +35,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
     """Show the fleet until Ctrl-C. While no server answers, what was seen last stays, with its age."""
-    from multidrop.fleet.overview import FleetView
+    from multidrop.fleet.overview import FleetView, FleetWatch
     from multidrop.fleet.servers.setup import open_all
-    from multidrop.fleet.task_end import end_tasks
-    from multidrop.fleet.watching import FleetWatch
+    from multidrop.supervisor import end_tasks
 
     if not is_json:
         require_extra("rich", "monitor", "fleet watch")

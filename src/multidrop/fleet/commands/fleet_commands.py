@@ -30,9 +30,8 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.setup import open_all
-from multidrop.fleet.task_end import end_tasks
 from multidrop.plant import drive_meant
-from multidrop.supervisor import Ended, reason_of
+from multidrop.supervisor import Ended, end_tasks, reason_of
 
 LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
 AGAIN_S = 0.2

@@ -11,11 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
+from multidrop.fleet import file_lock
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.leases import life_lock
+from multidrop.fleet.file_lock import LifeLock
 from multidrop.fleet.leases import rules as lease_rules
-from multidrop.fleet.leases.bucket import put_end
-from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 
@@ -194,7 +193,7 @@ class Lease:
             "ended": ended,
             "began": self.began_ms,
             "host": os.uname().nodename,
-            "machine": life_lock.machine_id(),
+            "machine": file_lock.machine_id(),
             "lock": str(self._lock.path) if self._lock else "",
             "lock_id": self._lock.id if self._lock else "",
             "pid": os.getpid(),
@@ -298,3 +297,17 @@ class Lease:
 def _least_session(record: Record) -> int:
     """Return a number that no session before was above, also where somebody has written nonsense."""
     return int(record.value["session"]) if record.value else record.revision
+
+
+async def put_end(bucket: Bucket, end: Record) -> None:
+    """Replace our own record by this end of its session. Raises Conflict and FleetError as `put` does.
+
+    A renewal whose answer nobody waited for any more may have been stored meanwhile. It is replaced too.
+    """
+    try:
+        await bucket.put(end.key, end.value, end.revision)
+    except Conflict:
+        newest = await bucket.get(end.key)
+        if not newest.value or newest.value["ended"] or newest.value["nonce"] != end.value["nonce"]:
+            raise
+        await bucket.put(end.key, end.value, newest.revision)

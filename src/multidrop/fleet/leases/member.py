@@ -23,26 +23,82 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from multidrop.fleet.leases.bucket import LeaseBucket
+from multidrop.fleet.file_lock import LifeLock
 from multidrop.fleet.leases.lease import Lease, MayPoll
-from multidrop.fleet.leases.life_lock import LifeLock
-from multidrop.fleet.leases.protocol_version import OtherRules
-from multidrop.fleet.leases.rules import SECOND, USUAL, Terms
-from multidrop.fleet.leases.weak_session import WeakSession
+from multidrop.fleet.leases.observer import Observer
+from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, PortLoss, TakenLine, no_loss
 from multidrop.fleet.lines.ownership import decide, owner_of
+from multidrop.fleet.lines.records import ShareRecords
 from multidrop.fleet.lines.releases import WAIT_S, Releases
-from multidrop.fleet.lines.share_records import ShareRecords
 from multidrop.fleet.lines.shares import Sharers, Shares
 from multidrop.fleet.lines.unopened_lines import UnopenedLines
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.buckets import Record
+from multidrop.fleet.servers.buckets import LeaseBucket, Record
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.servers.leader_keeper import keep_leaders
-from multidrop.fleet.task_end import end_tasks
-from multidrop.supervisor import Ended, supervisor
+from multidrop.fleet.servers.leaders import have_leaders, keep_leaders
+from multidrop.supervisor import Ended, end_tasks, supervisor
 
 _log = logging.getLogger("multidrop.fleet")
+
+WEAK_LOOK_S = 1.0
+WEAK_NS = 10 * SECOND  # for which it goes on first, from when its gateway has settled
+
+
+class WeakSession:
+    """Watches our own session; `is_too_weak` while it is to be given up."""
+
+    def __init__(self, lease: Lease, observer: Observer, path: Callable[[], ServerPath]) -> None:
+        self.is_too_weak = False
+        self._lease = lease
+        self._observer = observer
+        self._path = path
+
+    async def watch(self, settled_at: Callable[[], int]) -> None:
+        """Look at it for ever.
+
+        Its lines are others' for a moment, so one gateway at a time gives up, once all paths answer and lines
+        can be claimed.
+        """
+        while True:
+            await asyncio.sleep(WEAK_LOOK_S)
+            lease = self._lease
+            if not (lease.is_weak and lease.is_valid) or lease.clock() < settled_at() + WEAK_NS:
+                continue
+            if self._observer.weak()[:1] == [lease.name]:
+                self.is_too_weak = await have_leaders(self._path()) and await lease.could_be_whole()
+
+
+UNSAID = 1  # the rules of who says none
+
+
+class OtherRules:
+    """The other `gateways` that live by other rules than ours, by what their sessions say."""
+
+    def __init__(self, me: str, observer: Observer) -> None:
+        self.gateways: frozenset[str] = frozenset()
+        self._me = me
+        self._observer = observer
+
+    def look(self, present: Mapping[str, Mapping[str, Any]]) -> None:
+        """Note who there is of those with a session.
+
+        One that is renewed no more does not count, though nobody may have ended it yet.
+        """
+        others = {name for name, value in present.items() if value.get("rules", UNSAID) != RULES}
+        found = frozenset(others - {self._me} - self._observer.dead(others).keys())
+        if found != self.gateways:
+            self.gateways = found
+            _log.warning("%s", self.trouble or "no gateway with other rules is left")
+
+    @property
+    def trouble(self) -> str:
+        """Return the sentence about them; "" where there are none."""
+        if not self.gateways:
+            return ""
+        names = ", ".join(sorted(self.gateways))
+        return f"another version of multidrop runs in this fleet: no line is taken until {names} is stopped"
+
 
 GUARD_LOOK_S = 0.02
 STEP_S = 0.05  # between steps; at once where records have changed

@@ -18,7 +18,7 @@ from multidrop.fleet.leases import rules as lease_rules
 from multidrop.fleet.leases.lease import boottime_ns
 from multidrop.fleet.leases.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
-from multidrop.fleet.task_end import end_tasks
+from multidrop.supervisor import end_tasks
 
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for who only looks: every end counts at once
 

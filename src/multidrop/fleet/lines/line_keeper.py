@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop.fleet.leases.lease import Lease
 from multidrop.fleet.lines.owner_records import OwnerRecords
 from multidrop.fleet.lines.ownership import Claim
-from multidrop.fleet.lines.share_records import ShareRecords
+from multidrop.fleet.lines.records import ShareRecords
 from multidrop.fleet.lines.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")

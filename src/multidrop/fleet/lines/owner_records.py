@@ -24,10 +24,10 @@ from multidrop.fleet.lines.ownership import (
     owner_value,
     turn_of,
 )
-from multidrop.fleet.lines.share_records import ShareRecords
+from multidrop.fleet.lines.records import ShareRecords
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
-from multidrop.fleet.task_end import end_tasks
+from multidrop.supervisor import end_tasks
 
 WRITERS = 2  # batches at a time in each bucket
 LAG_NS = SECOND  # two renewals

@@ -1,12 +1,83 @@
-"""Shares: which gateway each line should have, made anew where gateways or lines come or go."""
+"""Balance: which gateway each line belongs to, by rendezvous hashing with a bound. Pure.
+
+Each line goes to the gateway with the highest weight for this pair that is not full yet; full is 110 % of the
+mean. So a gateway that comes or goes moves its own share of the lines and few others.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import functools
+import hashlib
+from array import array
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from multidrop.fleet.leases.rules import SECOND
-from multidrop.fleet.lines import balance
+
+BOUND = 110  # percent of the mean
+NUMBER_BITS = 16  # the low bits of a weight: its gateway's number
+
+
+def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
+    """Return the gateway of each line; empty where there is no gateway.
+
+    20 gateways and 10,000 lines take 20 ms, so call it outside of an event loop.
+    """
+    if not gateways:
+        return {}
+    lines, gateways = sorted(lines), sorted(gateways)
+    hashes = _words(map(_hash, lines))
+    weights = [_weigh(hashes, name, number) for number, name in enumerate(gateways)]
+    highest = pc.max_element_wise(*weights).to_pylist()
+    room = [-(-len(lines) * BOUND // (100 * len(gateways)))] * len(gateways)
+    found = {}
+    for at, line in enumerate(lines):
+        number = highest[at] & _NUMBER
+        if not room[number]:
+            number = max(one[at].as_py() for one in weights if room[one[at].as_py() & _NUMBER]) & _NUMBER
+        room[number] -= 1
+        found[line] = gateways[number]
+    return found
+
+
+def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]) -> dict[str, str]:
+    """Return each line's gateway, where `unopened` says which lines each of these gateways cannot open.
+
+    A line that all of them cannot open stays where it is. Gateways that are not named are given nothing.
+    """
+    found = dict(wanted)
+    for line in {line for lines in unopened.values() for line in lines} & wanted.keys():
+        able = [name for name, lines in unopened.items() if line not in lines]
+        if able and line in unopened.get(wanted[line], ()):
+            found[line] = max(able, key=lambda name: _hash(f"{line}/{name}"))
+    return found
+
+
+def _words(values: Iterable[int]) -> pa.UInt64Array:
+    """Return an array of these; `pa.array` imports pandas where there is one, which takes far longer."""
+    words = array("Q", values)
+    return pa.Array.from_buffers(pa.uint64(), len(words), [None, pa.py_buffer(words)])
+
+
+_NUMBER = (1 << NUMBER_BITS) - 1
+_WEIGHT = _words([(1 << 64) - 1 - _NUMBER])[0]
+_MIXER = _words([0x9E3779B97F4A7C15])[0]  # odd: a product's upper bits depend on all bits of the other number
+
+
+def _weigh(hashes: pa.UInt64Array, gateway: str, number: int) -> pa.UInt64Array:
+    """Return the weight of a gateway for each of these lines."""
+    own, place = _words([_hash(gateway), number])
+    return pc.bit_wise_or(pc.bit_wise_and(pc.multiply(pc.bit_wise_xor(hashes, own), _MIXER), _WEIGHT), place)
+
+
+@functools.lru_cache(1 << 16)
+def _hash(name: str) -> int:
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+
 
 QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares are made anew while we settle
 
@@ -48,8 +119,8 @@ class Shares:
         if sharers == self._made or is_early:
             return False
         loop = asyncio.get_running_loop()
-        self.home = await loop.run_in_executor(None, balance.assign, sharers.lines, sharers.gateways)
-        self.wanted = balance.hand_over(self.home, dict(sharers.unopened))
+        self.home = await loop.run_in_executor(None, assign, sharers.lines, sharers.gateways)
+        self.wanted = hand_over(self.home, dict(sharers.unopened))
         self._made = sharers
         return True
 

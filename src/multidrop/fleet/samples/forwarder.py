@@ -28,8 +28,7 @@ from multidrop.fleet.samples.samples_stream import (
     publish,
     subject_of,
 )
-from multidrop.fleet.samples.spool import Spool
-from multidrop.fleet.samples.spool_folder import StoredMessage
+from multidrop.fleet.samples.spool import Spool, StoredMessage
 
 AGAIN_S = 0.25  # between attempts at a stream that failed
 LOOKING_S = 1.0  # for a message that nobody announced

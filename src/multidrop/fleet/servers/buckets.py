@@ -11,9 +11,9 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.lines.record_shapes import largest, parsed
-from multidrop.fleet.samples.batch_client import Request
+from multidrop.fleet.servers.batch_client import Request
 from multidrop.fleet.servers.connections import ServerPath
+from multidrop.fleet.servers.record_shapes import largest, parsed
 
 NONE_YET = 0  # the revision of a key without a record
 BATCH = 1000  # records asked for at a time
@@ -259,3 +259,26 @@ class Follower:
         self.records[record.key] = record
         self._on_take(before, record)
         return True
+
+
+class LeaseBucket(Bucket):
+    """A bucket of leases, written to in the name of `writer`."""
+
+    def __init__(self, name: str, path: Callable[[], ServerPath], writer: str) -> None:
+        super().__init__(name, path)
+        self.writer = writer
+
+    def _subject(self, key: str) -> str:
+        return f"$KV.{self.name}.{key}.{self.writer}"
+
+    def _all_of(self, key: str) -> str:
+        return f"$KV.{self.name}.{key}.*"
+
+    def _record(self, subject: str, revision: int, data: bytes) -> Record:
+        key, _, writer = subject.removeprefix(f"$KV.{self.name}.").rpartition(".")
+        value = self._value(key, data)
+        if value is not None:
+            value = {name: one for name, one in value.items() if name != "by"}
+            if writer != key:
+                value |= {"ended": True, "by": writer}
+        return Record(key, revision, value)

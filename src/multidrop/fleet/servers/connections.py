@@ -13,10 +13,18 @@ from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
+from multidrop.fleet.errors import (
+    Denials,
+    FleetError,
+    NobodyThere,
+    NotAdmitted,
+    NotDelivered,
+    TooOld,
+    Unsure,
+    failure_to_connect,
+)
 from multidrop.fleet.leases.rules import PATHS
-from multidrop.fleet.lines.refusals import Denials, failure_to_connect
-from multidrop.fleet.samples.batch_client import BatchClient, DirectGet, DirectMessage, Request
+from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectMessage, Request
 from multidrop.fleet.servers.direct_gets import Spare, first_answer
 from multidrop.printable import masked
 

@@ -20,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from multidrop.fleet.errors import NoRight, Unsure
-from multidrop.fleet.samples.batch_client import DirectGet, DirectMessage, Request
-from multidrop.fleet.task_end import end_tasks
+from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request
+from multidrop.supervisor import end_tasks
 
 AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # without a message, before it is asked again; then it is given up
 SLOW = 3.0  # so often what answers take of late is waited, before a question is asked again,

@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop.fleet.servers.accounts import accounts
 from multidrop.fleet.servers.credentials import new_seed, public_key
-from multidrop.fleet.servers.rights import rights_of
+from multidrop.fleet.servers.rights import accounts, rights_of
 from multidrop.printable import masked
 
 CLUSTER = "multidrop"

@@ -3,16 +3,90 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from typing import Any, NamedTuple
 
-from multidrop.fleet.errors import FleetError
+from multidrop.fleet.errors import FleetError, Unsure
 from multidrop.fleet.lines.ownership import NEEDED
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import ask
-from multidrop.fleet.servers.cluster import Cluster, cluster_of
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.task_end import end_tasks
+from multidrop.fleet.servers.record_shapes import misshapen
+from multidrop.supervisor import end_tasks
+
+SILENT_NS = 2_000_000_000  # a follower answers its leader's heartbeat once a second
+_CLUSTER = {"leader": str, "replicas": list}  # left out where there is none
+_REPLICA = {"name": str, "current": bool, "offline": bool, "active": int}
+
+
+class Replica(NamedTuple):
+    """A server that follows a bucket's leader."""
+
+    name: str
+    is_current: bool
+    is_offline: bool
+    active_ns: int  # since the leader heard it; 0 for never
+
+    @property
+    def is_ready(self) -> bool:
+        """Say whether it could lead now."""
+        return self.is_current and not self.is_offline
+
+    @property
+    def is_silent(self) -> bool:
+        """Say whether it was not heard for long, or never; one that lags is heard."""
+        return not self.is_current and not 0 < self.active_ns < SILENT_NS
+
+
+class Cluster(NamedTuple):
+    """A bucket's leader, "" for none, and those that follow it."""
+
+    leader: str = ""
+    followers: tuple[Replica, ...] = ()
+
+    def home_of(self, place: int) -> str:
+        """Return the server that should lead the bucket at this place: they take turns, in order of name."""
+        servers = sorted([self.leader, *(follower.name for follower in self.followers)])
+        return servers[place % len(servers)]
+
+    @property
+    def has_silent(self) -> bool:
+        """Say whether one of them is silent."""
+        return any(follower.is_silent for follower in self.followers)
+
+    @property
+    def ready(self) -> list[str]:
+        """Return the followers that could lead now."""
+        return [follower.name for follower in self.followers if follower.is_ready]
+
+
+def cluster_of(info: Mapping[str, Any]) -> Cluster | None:
+    """Return the cluster in a stream's state; None where a server keeps it alone.
+
+    Raises Unsure for what is no cluster.
+    """
+    if "cluster" not in info:
+        return None
+    told = _believed(info["cluster"], _CLUSTER, leader="", replicas=[])
+    usual = {"current": False, "offline": False, "active": 0}
+    followers = (_believed(one, _REPLICA, **usual) for one in told["replicas"])
+    return Cluster(
+        told["leader"],
+        tuple(Replica(one["name"], one["current"], one["offline"], one["active"]) for one in followers),
+    )
+
+
+def _believed(told: Any, shape: Mapping[str, type], **usual: Any) -> dict[str, Any]:
+    """Return a table with what is left out of it, or null. Raises Unsure for another shape."""
+    found = told
+    if isinstance(told, dict):
+        found = {**usual, **{name: value for name, value in told.items() if value is not None}}
+    if mistake := misshapen(found, shape):
+        raise Unsure(f"what NATS answers of a bucket's servers is none of JetStream's: {mistake}")
+    return dict(found)
+
 
 SOON_S = 0.4  # at rest it takes some milliseconds
 
@@ -76,3 +150,75 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
     with suppress(FleetError):
         wanted = {"placement": {"preferred": server}}
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
+
+
+HAND_OVER_S = 3.0  # less than the shortest time between two requests for votes
+SILENT_FOR_S = 60.0  # a server that is silent for longer is not waited for
+HANDED_S = 1.0  # it takes 0.03 to 0.3 s
+LEADER_LOOK_S = 0.02
+
+
+class LeaseTerms:
+    """The times of the hand-overs, and since when a server is silent."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._silent_since: float | None = None
+        self._handed_at: dict[str, float] = {}  # by bucket
+
+    async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
+        """Hand over what is due, and return True where anything was.
+
+        It is done one bucket after the other: through us at most one waits for an election.
+        """
+        led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
+        silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
+        if len(led) == len(names.LEASES) and not silent:
+            self._silent_since = None
+        any_due = False
+        for bucket, cluster in silent.items():
+            if cluster.ready and self._is_due(bucket):
+                any_due = True
+                if not await _leads_now(path, bucket, cluster.ready[0]):
+                    break
+        return any_due
+
+    def _is_due(self, bucket: str) -> bool:
+        now = self._clock()
+        if self._silent_since is None:
+            self._silent_since = now
+        if (
+            now - self._silent_since > SILENT_FOR_S
+            or now - self._handed_at.get(bucket, -HAND_OVER_S) < HAND_OVER_S
+        ):
+            return False
+        self._handed_at[bucket] = now
+        return True
+
+
+async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
+    """Hand a bucket over, and return True once this server leads it."""
+    await hand_over(path, bucket, server)
+    with suppress(TimeoutError):
+        async with asyncio.timeout(HANDED_S):
+            while (await known_cluster(path, bucket)).leader != server:
+                await asyncio.sleep(LEADER_LOOK_S)
+            return True
+    return False
+
+
+KEEP_S = 0.4  # between looks: leaders tell after 2 s that a server is silent, which asks for votes after 4 s
+
+
+async def keep_leaders(
+    path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
+) -> None:
+    """Keep leaders for ever, whenever that is ours to do."""
+    terms = LeaseTerms(clock)
+    while True:
+        await asyncio.sleep(KEEP_S)
+        if is_ours():
+            best = path()
+            clusters = await led_clusters(best)
+            if not await terms.keep_ahead(best, clusters):
+                await bring_leaders_home(best, clusters)

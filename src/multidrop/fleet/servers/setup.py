@@ -11,12 +11,10 @@ from functools import partial
 from typing import Any
 
 from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
-from multidrop.fleet.leases.bucket import LeaseBucket
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
-from multidrop.fleet.servers.cluster import Cluster, cluster_of
+from multidrop.fleet.servers.buckets import NONE_YET, Bucket, LeaseBucket, ServerError, ask, bucket_settings
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.servers.leaders import bring_leaders_home, led_clusters
+from multidrop.fleet.servers.leaders import Cluster, bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
 ROUNDS = 40  # 2.9.10 fails in the first few of them

@@ -169,9 +169,8 @@ class Demo:
                 await watching
 
     async def _watch(self, over: asyncio.Event) -> None:
-        from multidrop.fleet.overview import FleetView
+        from multidrop.fleet.overview import FleetView, FleetWatch
         from multidrop.fleet.servers.connections import ServerPath
-        from multidrop.fleet.watching import FleetWatch
 
         path = ServerPath(self._urls.split(","))
         try:

@@ -15,9 +15,9 @@ require_module("nats")
 
 from multidrop.fleet.errors import Unsure  # noqa: E402
 from multidrop.fleet.leases.rules import USUAL  # noqa: E402
-from multidrop.fleet.lines import share_records  # noqa: E402
+from multidrop.fleet.lines import records as line_records  # noqa: E402
 from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value  # noqa: E402
-from multidrop.fleet.lines.share_records import ShareFollower, ShareRecords  # noqa: E402
+from multidrop.fleet.lines.records import ShareFollower, ShareRecords  # noqa: E402
 from multidrop.fleet.servers import (  # noqa: E402
     buckets,
     names,
@@ -98,11 +98,11 @@ def test_a_doubted_line_is_asked_for_again_and_again_though_it_has_left_the_shar
 ) -> None:
     """The write that nobody answered may still be stored, when the bucket has a leader again."""
     now = 1000.0
-    monkeypatch.setattr(share_records.time, "monotonic", lambda: now)
+    monkeypatch.setattr(line_records.time, "monotonic", lambda: now)
     trial = Trial()
     trial.follower.doubt(["line"])
     assert trial.looked() == ["line"]
-    now += share_records.DOUBT_S - 1
+    now += line_records.DOUBT_S - 1
     trial.bucket.store("line", ME)
     assert trial.looked() == ["line"]
     now += 2

@@ -17,15 +17,17 @@ require_module("nats")
 from nats.aio.client import Client  # noqa: E402
 
 from multidrop.fleet.errors import Unsure  # noqa: E402
-from multidrop.fleet.samples import batch_client  # noqa: E402
-from multidrop.fleet.samples.batch_client import (  # noqa: E402
+from multidrop.fleet.servers import (  # noqa: E402
+    batch_client,  # noqa: E402, RUF100
+    direct_gets,  # noqa: E402, RUF100
+)
+from multidrop.fleet.servers.batch_client import (  # noqa: E402
     BatchClient,
     DirectGet,
     DirectMessage,
     Request,
     stored_message,
 )
-from multidrop.fleet.servers import direct_gets  # noqa: E402
 from multidrop.fleet.servers.buckets import Bucket, Record  # noqa: E402
 from multidrop.fleet.servers.connections import ServerPath, connect, paths_of  # noqa: E402
 from multidrop.fleet.servers.setup import set_up  # noqa: E402

@@ -13,13 +13,19 @@ from peers import require_module
 require_module("nats")
 
 from multidrop.fleet.errors import Unsure  # noqa: E402
-from multidrop.fleet.leases.terms import EVERY_S, FOR_S, LeaseTerms  # noqa: E402
 from multidrop.fleet.servers import (  # noqa: E402
     leaders,
     names,
 )
-from multidrop.fleet.servers.leader_keeper import keep_leaders  # noqa: E402
-from multidrop.fleet.servers.leaders import SOON_S, bring_leaders_home, led_clusters  # noqa: E402
+from multidrop.fleet.servers.leaders import (  # noqa: E402
+    HAND_OVER_S,
+    SILENT_FOR_S,
+    SOON_S,
+    LeaseTerms,
+    bring_leaders_home,
+    keep_leaders,
+    led_clusters,
+)
 
 SERVERS = ("n1", "n2", "n3")
 PATH: Any = None
@@ -112,7 +118,7 @@ def test_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Serve
             assert servers.terms[bucket] > 1 + second // 4
             assert servers.leaders[bucket] in ("n1", "n2")
     assert servers.terms[names.LEASES[2]] == 1  # it has no leader that could hand it over
-    assert EVERY_S < ASKS_S
+    assert HAND_OVER_S < ASKS_S
 
 
 def test_a_bucket_whose_leader_was_silent_is_kept_ahead_once_it_has_another(servers: Servers) -> None:
@@ -126,7 +132,7 @@ def test_a_bucket_whose_leader_was_silent_is_kept_ahead_once_it_has_another(serv
 def test_a_server_that_is_silent_for_long_is_left_alone_until_it_was_back(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
-    servers.pass_s(round(FOR_S) + 5)
+    servers.pass_s(round(SILENT_FOR_S) + 5)
     before = dict(servers.terms)
     servers.pass_s(20)
     assert servers.terms == before

@@ -19,7 +19,7 @@ require_module("nats")
 
 from nats.aio.client import Client  # noqa: E402
 
-from multidrop.fleet.samples.sample_reader import StreamMessage, read_after  # noqa: E402
+from multidrop.fleet.samples.samples_stream import StreamMessage, read_after  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

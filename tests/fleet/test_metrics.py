@@ -16,8 +16,14 @@ from tables import table
 require_module("nats")
 
 from multidrop.exposition import expose_metrics  # noqa: E402
-from multidrop.fleet.gateway_metrics import families_of  # noqa: E402
-from multidrop.fleet.metrics_port import MOST_CLIENTS, MOST_HEAD, answer, listen, serving  # noqa: E402
+from multidrop.fleet.metrics import (  # noqa: E402
+    MOST_CLIENTS,
+    MOST_HEAD,
+    answer,
+    families_of,
+    listen,
+    serving,
+)
 
 OPEN = "application/openmetrics-text"
 STATE: dict[str, Any] = {
