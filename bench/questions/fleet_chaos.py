@@ -4,7 +4,7 @@ Two gateways append known samples and note what they were told to be on their di
 forward them; a hub keeps them in Parquet files and another in PostgreSQL. For some minutes each of these is
 killed (SIGKILL) at random moments, alone or together with others, and some stay away for seconds. Then all
 run on until they are done, and both sinks are compared with the notes. Ends with 1 where one sample of those
-is missing, or any is there twice.
+is missing, or any is taken.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ def test_a_family_in_python_is_not_sent_to_gateways(run: Run, nobody: str, tmp_p
     path = plant(tmp_path, model="own.py:Toy")
     path.write_text(path.read_text().replace('poll = ["output_current"]', ""))
     _, _, said = run("fleet", "init", path, "--nats", nobody)
-    assert "is a Python file, and gateways run none that comes over the network" in said
+    assert "is a Python file, and gateways run no code from the network" in said
 
 
 LISTS = {
@@ -157,13 +157,13 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
     [
         (["serve"], "are required: NAME; see `multidrop fleet serve --help`"),
         (["drain"], "are required: NAME; see `multidrop fleet drain --help`"),
-        (["serve", "gw.1"], "the gateway's name 'gw.1' may have letters"),
-        (["status", "--nats", "127.0.0.1"], "127.0.0.1 is no address of a NATS server"),
+        (["serve", "gw.1"], "the gateway's name 'gw.1' may have only letters"),
+        (["status", "--nats", "127.0.0.1"], "127.0.0.1 is not an address of a NATS server"),
         (["status", "--nats", ","], "',' names no NATS server; write nats://127.0.0.1:4222"),
         (["stop", "pump-1", "--nats", ","], "the stop was NOT sent: ',' names no NATS server"),
         (["coast", "pump-1", "--credentials", "/no/key"], "the coast was NOT sent: /no/key: No such file"),
         (["status", "--ca", "/no/ca.pem"], "/no/ca.pem: No such file or directory"),
-        (["drain", "gw 1"], "the gateway's name 'gw 1' may have letters"),
+        (["drain", "gw 1"], "the gateway's name 'gw 1' may have only letters"),
         (["serve", "gw-1", "--json"], "unrecognized arguments: --json"),
         (["dance"], "there is no action 'dance'; did you mean drain?"),
         (["status", "gw-1"], "unrecognized arguments: gw-1; see `multidrop fleet status --help`"),
@@ -210,7 +210,7 @@ def test_two_gateways_of_one_name_on_one_machine(run: Run, tmp_path: Path, nobod
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
         said = one_sentence(run("fleet", "serve", "gw-1", "--folder", tmp_path, "--nats", nobody))
-    assert "another gateway of this machine runs with" in said
+    assert "another gateway of this machine uses" in said
 
 
 @pytest.mark.long

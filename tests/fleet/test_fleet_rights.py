@@ -191,9 +191,9 @@ async def _ignore(_: Exception) -> None:
 @pytest.mark.parametrize(
     ("names", "sentence"),
     [
-        (["gw.1"], "the gateway's name 'gw.1' may have letters"),
-        (["gw-1", "gw-1"], "'gw-1' is there twice"),
-        (["hub"], "'hub' is there twice"),
+        (["gw.1"], "the gateway's name 'gw.1' may have only letters"),
+        (["gw-1", "gw-1"], "'gw-1' is taken"),
+        (["hub"], "'hub' is taken"),
     ],
 )
 def test_names_that_rights_cannot_be_given_to(names: list[str], sentence: str) -> None:
@@ -271,12 +271,12 @@ def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
     ("words", "sentence"),
     [
         ([], "are required: NAMES; see `multidrop fleet rights --help`"),
-        (["gw-1,gw.2"], "the gateway's name 'gw.2' may have letters"),
-        (["gw-1,operator"], "'operator' is there twice"),
+        (["gw-1,gw.2"], "the gateway's name 'gw.2' may have only letters"),
+        (["gw-1,operator"], "'operator' is taken"),
         (["gw-1", "--ca", "ca.pem"], "TLS needs all of --ca, --cert and --key: paths on the servers"),
         (["gw-1", "--nats", "tls://a:4222"], "tls://a:4222 needs all of --ca, --cert and --key"),
-        (["gw-1", "--nats", "nats://a:64000"], "nats://a:64000 is no address of a NATS server"),
-        (["gw-1", "--nats", "nats://a:port"], "nats://a:port is no address of a NATS server"),
+        (["gw-1", "--nats", "nats://a:64000"], "nats://a:64000 is not an address of a NATS server"),
+        (["gw-1", "--nats", "nats://a:port"], "nats://a:port is not an address of a NATS server"),
     ],
 )
 def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[str], sentence: str) -> None:

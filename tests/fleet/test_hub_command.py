@@ -170,7 +170,7 @@ def test_servers_of_the_environment(
     status, told = refused(capsys, "http://a:4222", "--parquet", str(tmp_path))
     assert (status, told) == (
         2,
-        "multidrop: http://a:4222 is no address of a NATS server; write nats://127.0.0.1:4222\n",
+        "multidrop: http://a:4222 is not an address of a NATS server; write nats://127.0.0.1:4222\n",
     )
 
 
@@ -180,7 +180,7 @@ def test_a_folder_of_something_else(
     (tmp_path / "report.txt").write_text("mine")
     assert refused(capsys, running.urls[0], "--parquet", str(tmp_path)) == (
         1,
-        f"multidrop: {tmp_path} is no folder of a hub: it holds 'report.txt'; name an empty one\n",
+        f"multidrop: {tmp_path} is not a hub's folder: it holds 'report.txt'; name an empty one\n",
     )
 
 
@@ -204,4 +204,4 @@ def test_no_stream(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         status, told = refused(capsys, one.urls[0], "--parquet", str(tmp_path / "hub"), "--once")
     assert status == 1
-    assert told.endswith("multidrop: there is no stream 'samples': make it by `multidrop fleet init`\n")
+    assert told.endswith("multidrop: there is no stream 'samples': create it with `multidrop fleet init`\n")

@@ -73,7 +73,7 @@ def test_what_a_gateway_says_is_scraped() -> None:
 
 def test_what_is_not_known_has_no_sample() -> None:
     spool = STATE["spool"] | {"behind": None, "lag_s": None}
-    found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "outside", "spool": spool})
+    found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "no lease", "spool": spool})
     missing = {"lease_margin_seconds", "session", "behind_messages", "behind_seconds"}
     assert missing & found.keys() == set()
     assert found["lines"] == 4
@@ -145,20 +145,20 @@ def test_any_bytes_have_an_answer(data: bytes) -> None:
 
 @table("address", ["0.0.0.0:9464", "192.0.2.1:9464", "plant.example:9464", "[::]:9464"])
 def test_no_address_that_others_reach(address: str) -> None:
-    with pytest.raises(ValueError, match="is open to other machines, and there are neither tokens nor TLS"):
+    with pytest.raises(ValueError, match="is open to other machines, without tokens or TLS"):
         listen(address)
 
 
 @table("address", ["9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999"])
 def test_what_is_no_address(address: str) -> None:
-    with pytest.raises(ValueError, match=r"is no address and port; write --metrics 127\.0\.0\.1:9464"):
+    with pytest.raises(ValueError, match=r"is not an address and port; write --metrics 127\.0\.0\.1:9464"):
         listen(address)
 
 
 def test_a_port_that_is_taken() -> None:
     with closing(listen("127.0.0.1:0")) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(OSError, match=f"--metrics 127.0.0.1:{port} cannot be had: "):
+        with pytest.raises(OSError, match=f"--metrics 127.0.0.1:{port} is not available: "):
             listen(f"127.0.0.1:{port}")
 
 

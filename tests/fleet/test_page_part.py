@@ -33,9 +33,9 @@ from multidrop.gateway.settings import read_settings  # noqa: E402
         ("nats = []", "nats = [] is not right; write nats = ["),
         (
             'nats = ["10.0.0.1"]',
-            "nats: '10.0.0.1' is no address of a NATS server; write nats = [\"nats://127",
+            "nats: '10.0.0.1' is not an address of a NATS server; write nats = [\"nats://127",
         ),
-        ("nats = [5]", "nats: 5 is no address of a NATS server"),
+        ("nats = [5]", "nats: 5 is not an address of a NATS server"),
         ('nats = "nats://a:4222"', "nats = 'nats://a:4222' is not right; write nats = ["),
         ("every = 5", "every"),
     ],
@@ -100,17 +100,17 @@ def test_it_is_not_well_once_the_newest_look_is_old() -> None:
         now[0] += seconds
         return part.health()
 
-    assert health_after(0) == "nothing of it was seen yet: no look has ended yet"
+    assert health_after(0) == "it was never read: the first read is in progress"
     view.failure = OSError("no server")
     asyncio.run(watch.look())
-    assert health_after(0) == "nothing of it was seen yet: no server"
+    assert health_after(0) == "it was never read: no server"
     view.failure = None
     asyncio.run(watch.look())
     assert health_after(5) == ""
-    assert health_after(1) == "it was seen 6 s ago: no look has ended yet"
+    assert health_after(1) == "it was read 6 s ago: the first read is in progress"
     view.failure = OSError("no server")
     asyncio.run(watch.look())
-    assert health_after(0) == "it was seen 6 s ago: no server"
+    assert health_after(0) == "it was read 6 s ago: no server"
     assert watch.told()["age_s"] == 6.0
 
 
@@ -204,7 +204,7 @@ def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path
     assert told == {
         "the fleet": (
             False,
-            "the stop was NOT sent: no server of the fleet was reached yet; use the hard-wired stop",
+            "the stop was NOT sent: no server of the fleet has answered yet; use the hard-wired stop",
         )
     }
 
@@ -213,7 +213,7 @@ def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path
 def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:
     [port] = free_ports(1)
     with served(tmp_path, f'[serve.fleet]\nnats = ["nats://127.0.0.1:{port}"]\n') as gateway:
-        wanted = f"nothing of it was seen yet: no NATS server is reached at nats://127.0.0.1:{port}"
+        wanted = f"it was never read: no NATS server is reached at nats://127.0.0.1:{port}"
         until(lambda: wanted == gateway.get("/health").json["parts"]["fleet"])
         assert gateway.get("/api/fleet").json["age_s"] is None
         assert gateway.frame()["drives"]  # the gateway's own lines go on

@@ -72,7 +72,7 @@ def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, 
     with cluster(tmp_path / "nats", number) as small:
         status, out, err = run("fleet", "init", "--nats", ",".join(small.urls))
     assert (status, out, err.count("\n")) == (1, "", 1)
-    assert "the servers of NATS have no room for so many samples: keep less by" in err
+    assert "the NATS servers have no room for so many samples: keep less by" in err
 
 
 @pytest.mark.long

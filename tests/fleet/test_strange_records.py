@@ -54,10 +54,10 @@ LINE = {"line": {"name": "line-1"}, "files": {}}
 PATIENCE_S = 120.0
 
 STRANGE: dict[str, tuple[str, str, bytes, str]] = {
-    "no JSON": ("lease_0", "gw-1", b"\xff{", "it is no JSON"),
-    "deep": ("plant", "line-1", b"[" * 500_000, "it is no JSON"),
-    "a number of 10,000 digits": ("own_0", "line-1", b"9" * 10_000, "it is no JSON"),
-    "a list": ("lease_0", "gw-1", b"[1]", "it is no table"),
+    "no JSON": ("lease_0", "gw-1", b"\xff{", "not JSON"),
+    "deep": ("plant", "line-1", b"[" * 500_000, "not JSON"),
+    "a number of 10,000 digits": ("own_0", "line-1", b"9" * 10_000, "not JSON"),
+    "a list": ("lease_0", "gw-1", b"[1]", "not a table"),
     "nothing in it": ("lease_0", "gw-1", b"{}", "it has no 'session'"),
     "a text for a number": (
         *("own_1", "line-1", json.dumps({**OWNER, "session": "1"}).encode()),
@@ -79,16 +79,16 @@ STRANGE: dict[str, tuple[str, str, bytes, str]] = {
         *("lease_1", "gw-1", json.dumps({**LEASE, "ended": None}).encode()),
         "its 'ended' is not true or false",
     ),
-    "a key that is no name": ("own_1", "a/../b", json.dumps(OWNER).encode(), "its key is no name"),
+    "a key that is no name": ("own_1", "a/../b", json.dumps(OWNER).encode(), "its key is not a valid name"),
     "another line": (
         "plant",
         "line-2",
         json.dumps(LINE).encode(),
-        "it describes another line than its key names",
+        "its line has another name than its key",
     ),
     "a file of numbers": (
         *("plant", "line-1", json.dumps({**LINE, "files": {"own.toml": 1}}).encode()),
-        "one of its files is no text",
+        "one of its files is not text",
     ),
     "huge": (
         *("lease_0", "gw-1", b" " * (SMALL + 1)),
@@ -156,7 +156,7 @@ def test_a_strange_record_is_told_of_once_and_others_are_read(
     with caplog.at_level(logging.WARNING):
         asyncio.run(_with_path(one, work))
     told = [record.getMessage() for record in caplog.records]
-    assert told == ["the record bad of the bucket own_2 is left out: it has no 'gateway'"]
+    assert told == ["ignored the record bad of the bucket own_2: it has no 'gateway'"]
 
 
 def test_the_servers_take_no_huge_record_and_no_header_that_removes_others(one: Cluster) -> None:
@@ -271,7 +271,7 @@ STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "spool
     ("answer", "mistake"),
     [
         (b"{", "it has no 'state'"),
-        (b"[[[]]]", "it is no table"),
+        (b"[[[]]]", "not a table"),
         (b"[" * 500_000, "it has no 'state'"),
         (json.dumps({**STATE, "lines": "1"}).encode(), "its 'lines' is not a whole number"),
         (json.dumps({**STATE, "margin_s": None}).encode(), "its 'margin_s' is not a number"),
@@ -284,7 +284,7 @@ def test_an_answer_that_is_no_state_is_one_sentence(one: Cluster, answer: bytes,
             await message.respond(answer)
 
         await path.subscribe("gateway.liar.*", lie)
-        with pytest.raises(FleetError, match=f"what liar answers is no state of a gateway: {mistake}"):
+        with pytest.raises(FleetError, match=f"the answer of liar is not a gateway's state: {mistake}"):
             await ask_gateway(path, "liar", "state")
 
     asyncio.run(_with_path(one, work))

@@ -173,7 +173,9 @@ class Fence:
                 _tell(master, signal.SIGUSR1)  # it says where each of its threads is
                 time.sleep(1.0)
                 requests = self.far.requests - asked
-                raise AssertionError(f"the master does not poll: {granted} renewals, {requests} requests")
+                raise AssertionError(
+                    f"the master polls no lines yet: {granted} renewals, {requests} requests"
+                )
         return True
 
     def _stop(self, master: int, chance: random.Random) -> Round:

@@ -1,4 +1,4 @@
-"""Fleet: several gateways share the lines of a plant by NATS JetStream, and each line has one master.
+"""Fleet: several gateways share the lines of a plant through NATS JetStream; each line has one master.
 
-Samples go this way: poller -> Spool -> Forwarder -> the stream `samples` -> Hub -> Parquet or PostgreSQL.
+Samples flow from the poller through Spool, Forwarder, the stream `samples` and Hub to Parquet or PostgreSQL.
 """

@@ -1,4 +1,4 @@
-"""Failures of a fleet's servers."""
+"""Errors of a fleet's servers, each in one sentence."""
 
 from __future__ import annotations
 
@@ -13,57 +13,57 @@ from multidrop.printable import masked
 
 
 class FleetError(OSError):
-    """Tell a user, in one sentence, why the fleet's servers cannot be used."""
+    """The fleet's servers cannot be used; the message says why in one sentence."""
 
 
 class TooOld(FleetError):
-    """A server that may give one lease to two gateways."""
+    """A server that may grant one lease to two gateways."""
 
 
 class NotAdmitted(FleetError):
-    """A server that does not believe us, or that we do not believe."""
+    """A server refused our credentials, or its certificate is not trusted."""
 
 
 class NoRight(FleetError):
-    """A request that these credentials do not allow, or whose answer they do not allow to hear."""
+    """These credentials do not allow a request, or reading its answer."""
 
 
 class NotDelivered(FleetError):
-    """A request that reached nobody, for certain."""
+    """A request that certainly reached no one."""
 
 
 class MayNotSend(NoRight, NotDelivered):
-    """A request that the server did not pass on, for want of rights."""
+    """A request that the server did not forward because of missing rights."""
 
 
 class NobodyThere(NotDelivered):
-    """A request of which the server says that nobody takes it."""
+    """A request that has no receiver, as the server reports."""
 
 
 class Unsure(FleetError):
-    """A request without an answer in time: it may have been carried out, or still be."""
+    """A request without a timely answer: it may have been carried out, or still be."""
 
 
 class Conflict(Exception):
-    """A record that has another revision than the one that was to be replaced."""
+    """A record has another revision than the one to be replaced."""
 
 
 MOST_DENIALS = 1000
-REFUSALS = (  # what a failure says, and what that means at this address
+REFUSALS = (  # part of a failure's text, and what it means
     (
         "authorization violation",
-        "{} admits nobody who says this, or nothing, of himself: see --credentials",
+        "{} refuses these credentials, or the lack of any: see --credentials",
     ),
     (
         "certificate_verify_failed",
-        "the certificate of {} cannot be believed ({why}); --ca names the one that it is signed by",
+        "the certificate of {} is not trusted ({why}); name its issuer with --ca",
     ),
     (
         "[ssl",
-        "{} does not begin with TLS, which these options demand: set `handshake_first: true` in its tls "
+        "{} does not start with TLS, which these options require: set `handshake_first: true` in its tls "
         "block, or name it with nats:// and no --ca",
     ),
-    ("empty response", "{} does not begin in the clear: name it with tls://, and --ca"),
+    ("empty response", "{} requires TLS: write tls:// and --ca"),
 )
 _DENIAL = re.compile(r"permissions violation for (publish|subscription) to \"([^\"]+)\"", re.IGNORECASE)
 
@@ -71,10 +71,10 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 def failure_to_connect(url: str, failure: BaseException) -> FleetError:
-    """Return the sentence for a connection that did not come about; it has no password."""
+    """Return the error for a failed connection, without the password in the URL."""
     url, text = masked(url), masked(str(failure).removeprefix("nats: "))
     if not text:
-        text = "it said nothing in time; one that begins with TLS is named with tls://"
+        text = "no answer in time; write tls:// if it requires TLS"
     for sign, sentence in REFUSALS:
         if sign in text.lower():
             why = text.partition("failed: ")[2].partition(" (_ssl")[0]
@@ -83,7 +83,7 @@ def failure_to_connect(url: str, failure: BaseException) -> FleetError:
 
 
 def _words(text: str) -> str:
-    """Return an error's text without numbers; of asyncio's calls, what the system says in words."""
+    """Return an error's text without numbers; for asyncio's connection errors, the system's words."""
     numbers = dict.fromkeys(re.findall(r"\[Errno (\d+)\] Connect call failed", text))
     if numbers:
         return ", ".join(os.strerror(int(number)) for number in numbers)
@@ -91,18 +91,18 @@ def _words(text: str) -> str:
 
 
 class Denials:
-    """The subjects that one connection may not use, as its server said; each is told once."""
+    """The subjects that one connection may not use, as its server reported; each is logged once."""
 
     def __init__(self) -> None:
-        self._said: Counter[tuple[str, str]] = Counter()  # how often, by kind and subject
-        self._raised = ""  # a subscription whose denial is raised, and so not told
+        self._said: Counter[tuple[str, str]] = Counter()  # count by kind and subject
+        self._raised = ""  # a subscription whose denial is raised instead of logged
 
     async def note(self, failure: Exception) -> None:
-        """Take what a server says of its own accord."""
+        """Take a message that a server sent by itself."""
         found = _DENIAL.search(str(failure))
         if not found:
             return
-        kind, subject = found[1].lower(), found[2].lower()  # the client gives them so
+        kind, subject = found[1].lower(), found[2].lower()  # nats-py lowers them
         if (kind, subject) not in self._said:
             if len(self._said) >= MOST_DENIALS:
                 return
@@ -115,10 +115,10 @@ class Denials:
         return self._said["publish", subject.lower()]
 
     def check_request(self, subject: str, inbox: str, before: int) -> None:
-        """Raise MayNotSend or NoRight where a request has no answer for want of rights.
+        """Raise MayNotSend or NoRight if missing rights explain a missing answer.
 
-        `before` is how often it was denied before it was sent. MayNotSend says that it reached nobody,
-        NoRight that nothing can be heard in this inbox.
+        `before` is how often the request was denied before it was sent. MayNotSend means that it reached no
+        one, NoRight that this inbox cannot be read.
         """
         if self.of_request(subject) > before:
             raise MayNotSend(_sentence("publish", subject))
@@ -128,7 +128,7 @@ class Denials:
 
     @contextmanager
     def raising(self, subject: str) -> Iterator[None]:
-        """Raise NoRight at the end where this was found not to be allowed to be listened to."""
+        """Raise NoRight at the end if subscribing to this subject was denied."""
         self._raised = subject.lower()
         try:
             yield

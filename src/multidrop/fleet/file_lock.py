@@ -1,4 +1,4 @@
-"""Locks on files that end with their process."""
+"""Locks on files, which end with their process."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from multidrop.fleet.errors import FleetError
 
 
 def lock(file: int) -> None:
-    """Lock an open file for this process alone. Raises BlockingIOError while another one has it."""
-    import fcntl  # which Windows lacks
+    """Lock an open file for this process. Raises BlockingIOError if another process has locked it."""
+    import fcntl  # missing on Windows
 
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
@@ -23,10 +23,10 @@ IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
 
 class LifeLock:
-    """A lock on a local file, held for life: who gets it knows that the one before has died.
+    """A lock on a local file, held until the process ends: its next holder knows that this one is dead.
 
-    The file has a random id of its own: containers may have the same machine's id and the same path.
-    Raises FleetError when another process of this machine holds it.
+    The file holds a random id, because containers may share a machine's id and the path. Raises FleetError if
+    another process of this machine holds the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -37,7 +37,7 @@ class LifeLock:
             lock(self._file.fileno())
         except OSError:
             self._file.close()
-            sentence = f"another gateway of this machine runs with {path}; end that one first"
+            sentence = f"another gateway of this machine uses {path}; stop that one first"
             raise FleetError(sentence) from None
         self._file.seek(0)
         self.id = self._file.read().decode("ascii", "replace").strip()
@@ -48,7 +48,7 @@ class LifeLock:
             os.fsync(self._file.fileno())
 
     def proves_death(self, value: Mapping[str, Any]) -> bool:
-        """Say whether a record is of a process that held this very lock, and so is dead."""
+        """Return True if a record is of a process that held exactly this lock, so it is dead."""
         mine = (str(self.path), self.id, machine_id())
         return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
 
@@ -57,10 +57,10 @@ class LifeLock:
 
 
 def machine_id() -> str:
-    """Return an id of this machine since it was started; "" where it has none, which proves nothing.
+    """Return an id of this machine's present boot; "" if unknown, which proves nothing.
 
-    Copies of a disk have the machine's own id in common, and the lock's file with its id too. Who finds a
-    record of another boot waits: after a real one the lease has run out anyway.
+    Copies of a disk share the machine's id and the lock file with its id. A gateway that finds a record of
+    another boot waits: after a reboot the lease has expired anyway.
     """
     with suppress(OSError):
         ids = [path.read_text("utf-8", "replace").strip() for path in IDS]

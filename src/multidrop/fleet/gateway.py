@@ -1,4 +1,4 @@
-"""FleetGateway: one process of a fleet. It polls the lines that are its own, and forwards what they say."""
+"""FleetGateway: one process of a fleet. It polls its own lines and forwards their samples."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int}
-FORWARD_S = 10.0  # for what is left at the end; the rest is forwarded after the next start
-IN_TROUBLE_S = 3.0  # the same, where something is wrong with the stream
-SYNC_S = 3.0  # for the disk, before that
+FORWARD_S = 10.0  # to forward the rest at the end; the next start continues
+IN_TROUBLE_S = 3.0  # the same, if the stream has a problem
+SYNC_S = 3.0  # for the disk, before forwarding
 ENDING_S = 0.05
-LOOK_S = 0.2  # between looks at the threads
+LOOK_S = 0.2  # between checks of the threads
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class FleetGateway:
-    """A gateway of this name; what it keeps is in `folder`: its lock, its spool and its logs.
+    """A gateway with this name; `folder` holds its lock, spool and logs.
 
-    Raises ValueError for a name that no subject can have, FleetError where another process runs with it.
+    Raises ValueError for an invalid name, FleetError if another process uses the folder.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class FleetGateway:
         self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(
             self.lines.poller,
-            may_command=lambda line: self.member.keeper.may_command(line),  # it is made below
+            may_command=lambda line: self.member.keeper.may_command(line),  # created below
             may_stop=lambda line: self.member.keeper.may_stop(line),
         )
         self.log = CommandLog(folder / "commands.jsonl")
@@ -89,10 +89,11 @@ class FleetGateway:
         self._end = asyncio.Event()
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Poll and forward until `end` is called; then let all lines go, and forward what is left.
+        """Poll and forward until `end` is called; then close all lines, and forward the rest.
 
-        Raises FleetError where no server is reached, or the fleet was not set up; Ended, after the same, if
-        a task or a thread that must go on has ended, or polling has failed: others take the lines over.
+        Raises FleetError if no server answers, or the fleet was not set up. Raises Ended, after an orderly
+        end, if a task or thread that must not end has ended, or polling has failed: others take the lines
+        over.
         """
         try:
             await open_all(self.paths)
@@ -115,10 +116,10 @@ class FleetGateway:
                 await self._until_the_end()
                 for name in ("look", "member"):
                     supervisor().let_go(name)
-                self.member.end()  # a part of it may have ended: then it is leaving already
+                self.member.end()  # no effect if it is already leaving
                 await asyncio.wait([member])
                 await end_tasks(looking)
-                with suppress(Ended, PollingFailed, asyncio.CancelledError):  # they are among the dead
+                with suppress(Ended, PollingFailed, asyncio.CancelledError):  # the supervisor reports them
                     member.result()
                 with suppress(PollingFailed):
                     await self.lines.close()
@@ -132,13 +133,13 @@ class FleetGateway:
         supervisor().check()
 
     async def _until_the_end(self) -> None:
-        """Wait until `end` is called, or something has ended that must go on."""
+        """Wait until `end` is called, or a task or thread that must not end has ended."""
         waits = [asyncio.ensure_future(one.wait()) for one in (self._end, supervisor().has_dead)]
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         await end_tasks(*waits)
 
     async def _look(self) -> None:
-        """Look for threads that have ended, and for a failure of polling, for ever."""
+        """Check for ended threads and failed polling, forever."""
         while True:
             supervisor().look()
             if failure := self.lines.poller.failure:
@@ -147,7 +148,7 @@ class FleetGateway:
             await asyncio.sleep(LOOK_S)
 
     def end(self) -> None:
-        """Let `run` come to its end. Call it in the loop."""
+        """Let `run` return. Call it in the loop."""
         self._end.set()
 
     async def _forward_the_rest(self, forwarding: asyncio.Task[None]) -> None:
@@ -170,20 +171,20 @@ class FleetGateway:
         self.log.close()
         self.lock.close()
 
-    # ---- what others ask ----
+    # ---- requests ----
 
     async def _answer(self, message: Msg) -> None:
-        """Answer a request about this gateway; without a session it may be about another of its name."""
+        """Answer a request about this gateway; without a session it may be for another of this name."""
         if not self.member.lease.session or not names.is_inbox(message.reply):
             return
         if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()
-            _log.warning("%s: asked to give all lines away", self.name)
-        with suppress(Exception):  # whoever asked may have gone
+            _log.warning("%s: draining: all lines go to other gateways", self.name)
+        with suppress(Exception):  # the requester may be gone
             await message.respond(json.dumps(self.state()).encode())
 
     def state(self) -> dict[str, Any]:
-        """Return what `multidrop fleet status` shows of this gateway."""
+        """Return the state that `multidrop fleet status` shows."""
         member, spool = self.member, self.spool.state()
         lost = {line: f"port lost: {why}" for line, why in member.keeper.lost.items()}
         failing = {line: f"polling fails: {why}" for line, why in self.lines.poller.line_failures.items()}
@@ -217,7 +218,7 @@ class FleetGateway:
 
 
 async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, Any]:
-    """Return a gateway's answer to "state" or "drain". Raises FleetError where it gives none."""
+    """Return a gateway's answer to "state" or "drain". Raises FleetError if there is none."""
     try:
         message = await path.request(names.gateway_subject(gateway, wanted))
     except NoRight:
@@ -231,5 +232,5 @@ async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, 
     except (ValueError, RecursionError):
         found = {}
     if mistake := misshapen(found, STATE) or misshapen(found["spool"], SPOOL):
-        raise FleetError(f"what {gateway} answers is no state of a gateway: {mistake}")
+        raise FleetError(f"the answer of {gateway} is not a gateway's state: {mistake}")
     return found

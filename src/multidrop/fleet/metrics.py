@@ -1,6 +1,8 @@
-"""Metrics of a fleet's gateway: what it says of itself, as families of samples. Pure.
+"""Metrics of a fleet's gateway: its state as OpenMetrics, and the port that serves it on this machine.
 
-What is not known, such as the margin of a lease where there is none, has no sample.
+An unknown figure, such as the margin without a lease, has no sample. Every client that can connect can read,
+so the port listens only on loopback addresses. It also checks the `Host` header: a web page whose name was
+redirected here reads nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from multidrop.fleet.leases.member import MemberState
 
 
 class _Figure(NamedTuple):
-    """A figure of a gateway's state, and where it stands there."""
+    """A figure of a gateway's state, and its place there."""
 
     name: str
     kind: str  # "gauge" or "counter"
@@ -29,40 +31,42 @@ class _Figure(NamedTuple):
 
 _FIGURES = (
     _Figure("lines", "gauge", "Lines that are polled.", ("lines",)),
-    _Figure("moves", "counter", "Lines that were claimed or given away.", ("moves",)),
+    _Figure("moves", "counter", "Lines that were claimed or released.", ("moves",)),
     _Figure("spool_bytes", "gauge", "Bytes of all messages on the disk.", ("spool", "bytes")),
-    _Figure("spool_waiting_rows", "gauge", "Rows in memory, not on the disk yet.", ("spool", "waiting")),
+    _Figure("spool_waiting_rows", "gauge", "Rows in memory, not yet on the disk.", ("spool", "waiting")),
     _Figure("spool_rows", "counter", "Rows that reached the disk.", ("spool", "rows")),
-    _Figure("spool_lost_rows", "counter", "Rows that did not, or went unsent.", ("spool", "lost")),
-    _Figure("sent_messages", "counter", "Messages that the stream took.", ("spool", "sent")),
-    _Figure("behind_messages", "gauge", "Messages that the stream lacks.", ("spool", "behind")),
-    _Figure("behind_seconds", "gauge", "Age of the oldest message that it lacks.", ("spool", "lag_s")),
+    _Figure(
+        "spool_lost_rows", "counter", "Rows that never reached it, or were removed unsent.", ("spool", "lost")
+    ),
+    _Figure("sent_messages", "counter", "Messages that the servers stored.", ("spool", "sent")),
+    _Figure("behind_messages", "gauge", "Messages that the servers lack.", ("spool", "behind")),
+    _Figure("behind_seconds", "gauge", "Age of the oldest message that they lack.", ("spool", "lag_s")),
 )
 _LINES = {
-    "lost": "Lines of its own that nobody polls, for their port is lost.",
-    "failing": "Lines on which polling raised an exception lately, and is tried again.",
-    "unopened": "Lines that others should take, for it cannot open their ports.",
+    "lost": "Lines of its own that are not polled because their port is lost.",
+    "failing": "Lines on which polling raised an exception and is retried.",
+    "unopened": "Lines that others should take because it cannot open their ports.",
 }
 _SUFFIXES = {"gauge": "", "counter": "_total"}
 _PREFIX = "multidrop_fleet_"
 
 
 def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily]:
-    """Yield all there is to be scraped, of what a gateway answers that is asked for its state."""
+    """Yield the metrics of a gateway's state."""
     about = {"gateway": state["gateway"], "version": version}
     yield MetricFamily(f"{_PREFIX}gateway", "info", "Name and version.", [("_info", about, 1.0)])
     label = f"{_PREFIX}gateway_state"
     states = [("", {label: one.value}, float(one.value == state["state"])) for one in MemberState]
     yield MetricFamily(label, "stateset", "State of the gateway.", states)
     if state["session"]:
-        margin, text = state["margin_s"], "Time for which the gateway may still send."
+        margin, text = state["margin_s"], "Time until the lease expires."
         yield _family("lease_margin_seconds", "gauge", text, margin)
         yield _family("session", "gauge", "Number of the session.", state["session"])
     servers = len(set(filter(None, state["paths"])))
-    yield _family("servers", "gauge", "Servers that its three connections are at.", servers)
-    yield _family("troubled_lines", "gauge", "Lines that cannot be taken.", len(state["troubles"]))
+    yield _family("servers", "gauge", "Servers that its three connections use.", servers)
+    yield _family("troubled_lines", "gauge", "Lines that cannot be opened, or fail.", len(state["troubles"]))
     for key, text in _LINES.items():
-        if key in state:  # no earlier version says so
+        if key in state:  # earlier versions do not report it
             yield _family(f"{key}_lines", "gauge", text, len(state[key]))
     for figure in _FIGURES:
         value: Any = state
@@ -89,15 +93,15 @@ Metrics = Callable[[], Iterable[MetricFamily]]
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port. Raises ValueError for what is none, or can be reached by other machines."""
+    """Return host and port. Raises ValueError if invalid, or if other machines can reach it."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
-        raise ValueError(f"--metrics {text!r} is no address and port; write --metrics {EXAMPLE}")
+        raise ValueError(f"--metrics {text!r} is not an address and port; write --metrics {EXAMPLE}")
     if not _is_loopback(host):
         raise ValueError(
-            f"--metrics {text} is open to other machines, and there are neither tokens nor TLS here: listen "
-            f"on {EXAMPLE}, and let a proxy with TLS pass requests on"
+            f"--metrics {text} is open to other machines, without tokens or TLS: listen "
+            f"on {EXAMPLE}, and put a proxy with TLS in front"
         )
     return host, int(port)
 
@@ -110,18 +114,18 @@ def _is_loopback(host: str) -> bool:
 
 
 def listen(text: str) -> socket.socket:
-    """Return a listening socket at HOST:PORT. Raises ValueError for another's, OSError for a taken one."""
+    """Return a listening socket at HOST:PORT. Raises ValueError for a bad address, OSError if it is taken."""
     address = parse_address(text)
     try:
         family, *_, where = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
         return socket.create_server(where[:2], family=family)
     except OSError as failure:
-        raise OSError(f"--metrics {text} cannot be had: {failure.strerror}") from failure
+        raise OSError(f"--metrics {text} is not available: {failure.strerror}") from failure
 
 
 @asynccontextmanager
 async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[None]:
-    """Answer while the context lasts."""
+    """Serve metrics while the context lasts."""
     clients: set[asyncio.StreamWriter] = set()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -132,7 +136,7 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
                     writer.write(_answer(await reader.readuntil(b"\r\n\r\n"), metrics))
                     await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # it has gone, takes too long, or says too much
+            pass  # gone, too slow, or too much data
         finally:
             clients.discard(writer)
             writer.close()
@@ -151,25 +155,25 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
 def _answer(head: bytes, metrics: Metrics) -> bytes:
     try:
         return answer(head, metrics)
-    except Exception:  # whoever scrapes sees it, and so does the log
-        _log.exception("metrics cannot be told")
-        return _response(500, "this gateway fails to tell its metrics; its log says why")
+    except Exception:  # reported to the client and in the log
+        _log.exception("metrics failed")
+        return _response(500, "the metrics failed; this gateway's log says why")
 
 
 def answer(head: bytes, metrics: Metrics) -> bytes:
-    """Return the whole answer to a request, whatever its bytes are."""
+    """Return the whole response to a request, whatever its bytes are."""
     lines = head.decode("latin-1").split("\r\n")
     fields = [line.partition(":") for line in lines[1:] if line]
     headers = {name.strip().lower(): value.strip() for name, _, value in fields}
     words = lines[0].split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/1."):
-        return _response(400, "this is no request of HTTP/1")
+        return _response(400, "not an HTTP/1 request")
     if not NAMES.fullmatch(headers.get("host", "")):
-        return _response(403, "this answers to localhost, 127.0.0.1 and [::1] alone")
+        return _response(403, "only localhost, 127.0.0.1 and [::1] are served")
     if words[0] != "GET":
-        return _response(405, "metrics are asked for by GET")
+        return _response(405, "use GET")
     if words[1].partition("?")[0] != "/metrics":
-        return _response(404, "there is /metrics here, and nothing else")
+        return _response(404, "only /metrics is served")
     kind, text = expose_metrics(metrics(), headers.get("accept", ""))
     return _response(200, text, kind)
 

@@ -1,4 +1,4 @@
-"""Overview: a fleet as its records have it, and as its gateways answer."""
+"""Overview: a fleet by its records and its gateways' answers, once or again and again."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from multidrop.fleet.servers.setup import check_buckets
 from multidrop.printable import masked
 
 MOVES_SHOWN = 20
-MISSED_MS = 30 * 24 * 3600 * 1000  # for which a gateway that did not come back is told as missing
-_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # of the spool in a gateway's answer
+MISSED_MS = 30 * 24 * 3600 * 1000  # how long a gateway that did not come back is reported
+_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # in the spool part of a gateway's answer
     "behind": (int, NoneType),
     "lag_s": (int, float, NoneType),
     "trouble": (str, NoneType),
@@ -30,7 +30,7 @@ _MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # of the spool in a gateway's 
 
 
 class FleetView:
-    """A fleet over one path; each `look` reads what has changed since, and asks every gateway."""
+    """A fleet over one path; each `look` reads the changes and asks every gateway."""
 
     def __init__(self, path: ServerPath) -> None:
         self._path = path
@@ -39,12 +39,12 @@ class FleetView:
         self._is_checked = False
 
     async def check(self) -> None:
-        """Raise FleetError where there is no fleet in these servers, or no quorum."""
+        """Raise FleetError if these servers have no fleet or no quorum."""
         await check_buckets(self._path)
         self._is_checked = True
 
     async def look(self) -> None:
-        """Read the records and ask the gateways. Raises FleetError where no server gives the records."""
+        """Read the records and ask the gateways. Raises FleetError if no server returns the records."""
         if not self._path.is_open:
             raise FleetError(f"no NATS server is reached at {', '.join(self._path.urls)}")
         if not self._is_checked:
@@ -54,7 +54,7 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # of another version than this
+            with suppress(KeyError, TypeError, ValueError):  # of another version
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
@@ -65,12 +65,11 @@ class FleetView:
         return state if is_shown(state) else None
 
     def fleet(self) -> dict[str, Any]:
-        """Return gateways with a session that nobody ended, those that are missing, lines with their masters,
-        and the last moves.
+        """Return living and missing gateways, lines with their masters, and the last moves.
 
-        A gateway that died a moment ago is still there, until another one has ended its session; `says` is
-        None where it does not answer, and `unseen_s` tells for how long (s) this view saw no renewal. It is
-        missing afterwards, with the time (`seen_ms`, UTC) of its last renewal, until it runs again.
+        A gateway that just died is still listed, until another one has ended its session. Its `says` is None
+        if it does not answer, and `unseen_s` is how long (s) no renewal was seen. Then it is missing, with
+        the time of its last renewal (`seen_ms`, UTC), until it runs again.
         """
         sessions = self._records.observer.sessions()
         lines = self._lines(sessions)
@@ -98,7 +97,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # by owner: there are thousands of lines
+        held: dict[tuple[str, int], bool] = {}  # by owner, because there are thousands of lines
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)
@@ -121,27 +120,27 @@ def _ms(found: object) -> int | None:
 
 
 def is_shown(state: Mapping[str, Any]) -> bool:
-    """Say whether a gateway's answer has all else that is shown: another version's may lack some."""
+    """Return True if a gateway's answer has all fields that are shown: another version's may lack some."""
     spool = state["spool"]
     return isinstance(state.get("trouble"), str) and all(
         name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()
     )
 
 
-EVERY_S = 1.0  # between looks
+EVERY_S = 1.0  # between reads
 
 
 class FleetWatch:
-    """The newest look at a fleet that came to its end, its age, and why there is no newer one."""
+    """The newest complete view of a fleet, its age, and why there is no newer one."""
 
     def __init__(self, view: FleetView, clock: Callable[[], float] = time.monotonic) -> None:
         self._view = view
         self._clock = clock
         self._looked: float | None = None
-        self.trouble: str | None = None  # with the newest look
+        self.trouble: str | None = None  # of the newest read
 
     async def look(self) -> None:
-        """Look anew; where that fails, what was seen before is kept, and grows old."""
+        """Read again. If that fails, the last view stays and grows old."""
         begun = self._clock()
         try:
             await self._view.look()
@@ -151,17 +150,17 @@ class FleetWatch:
             self._looked, self.trouble = begun, None
 
     async def run(self) -> None:
-        """Look for ever, once a second."""
+        """Read once a second, forever."""
         while True:
             await self.look()
             await asyncio.sleep(EVERY_S)
 
     @property
     def age_s(self) -> float | None:
-        """Return how old the newest look is; None before there is one."""
+        """Return how old the newest view is; None if there is none yet."""
         return None if self._looked is None else round(self._clock() - self._looked, 3)
 
     def told(self) -> dict[str, Any]:
-        """Return what `fleet watch --json` prints and the gateway's page shows."""
+        """Return the content that `fleet watch --json` prints and the gateway's page shows."""
         about = {"at_ms": time.time_ns() // 1_000_000, "age_s": self.age_s, "trouble": self.trouble}
         return {**about, **self._view.fleet()}

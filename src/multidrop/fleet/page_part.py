@@ -1,6 +1,6 @@
-"""The part `fleet` of `multidrop serve`: looks at a fleet for the page, and stops it with a commander's key.
+"""The part `fleet` of `multidrop serve`: shows a fleet on the page, and stops it with a commander's key.
 
-`multidrop.gateway` finds it by its name, as its own parts.
+`multidrop.gateway` finds it by its name, like its own parts.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
 EXAMPLE = "nats://127.0.0.1:4222"
-OLD_S = 5.0  # an older look is not well
-AGAIN_S = 1.0  # between two tries to reach the servers as a commander
+OLD_S = 5.0  # an older view is unhealthy
+AGAIN_S = 1.0  # between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
 
 
@@ -29,7 +29,7 @@ LOG = "fleet-commands.jsonl"
 class FleetSettings:
     """The table `[serve.fleet]`: the servers of the fleet, and files as for `fleet watch`.
 
-    `commander` is the file of a commander's key: with it the page stops the whole fleet.
+    `commander` is the file of a commander's key: with it the page can stop the whole fleet.
     """
 
     nats: tuple[str, ...] = (EXAMPLE,)
@@ -39,7 +39,7 @@ class FleetSettings:
 
     def __post_init__(self) -> None:
         wrong = [
-            f'nats: {url!r} is no address of a NATS server; write nats = ["{EXAMPLE}"]'
+            f'nats: {url!r} is not an address of a NATS server; write nats = ["{EXAMPLE}"]'
             for url in self.nats
             if not isinstance(url, str) or not url.startswith(("nats://", "tls://"))
         ]
@@ -51,9 +51,9 @@ Settings = FleetSettings
 
 
 class FleetPart:
-    """A part that looks at a fleet once a second.
+    """A part that reads a fleet once a second.
 
-    `command` returns a commander of the fleet that is not connected yet; None: nobody may stop it from here.
+    `command` returns a new commander that is not connected; None if this page may not stop the fleet.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class FleetPart:
         self._watch = watch
         self._command = command
         self._commands: FleetCommands | None = None  # while it is connected
-        self._why = "no server of the fleet was reached yet"
+        self._why = "no server of the fleet has answered yet"
 
     @property
     def can_stop(self) -> bool:
@@ -71,7 +71,7 @@ class FleetPart:
         return self._command is not None
 
     def take(self, batch: object) -> None:
-        """Ignore them: they are of the gateway's own lines, and not of the fleet's."""
+        """Ignore the batch: it is from the gateway's own lines, not from the fleet."""
 
     async def run(self) -> None:
         works = [self._path.keep(), self._watch.run()]
@@ -86,7 +86,7 @@ class FleetPart:
             await end_tasks(*tasks)
 
     async def _keep_commander(self, command: Callable[[], FleetCommands]) -> None:
-        """Stay connected as a commander, so that a stop waits for no connection."""
+        """Stay connected as a commander, so that a stop does not wait for a connection."""
         while True:
             try:
                 async with command() as self._commands:
@@ -98,7 +98,7 @@ class FleetPart:
             await asyncio.sleep(AGAIN_S)
 
     async def stop(self, by: str) -> Mapping[str, tuple[bool, str]]:
-        """Stop all drives of the fleet; return by drive if it is stopped, and what is known of it."""
+        """Stop all drives of the fleet; return for each drive whether it is stopped, and a sentence."""
         try:
             if self._commands is None:
                 raise ConnectionError(f"the stop was NOT sent: {self._why}; use the hard-wired stop")
@@ -114,12 +114,12 @@ class FleetPart:
         await self._path.close()
 
     def health(self) -> str:
-        """Return why the fleet is not seen now; "" is well."""
+        """Return why the fleet's state is unknown; "" if it is known."""
         age = self._watch.age_s
         if age is not None and age <= OLD_S:
             return ""
-        seen = "nothing of it was seen yet" if age is None else f"it was seen {age:.0f} s ago"
-        return f"{seen}: {self._watch.trouble or 'no look has ended yet'}"
+        seen = "it was never read" if age is None else f"it was read {age:.0f} s ago"
+        return f"{seen}: {self._watch.trouble or 'the first read is in progress'}"
 
     def told(self) -> dict[str, Any]:
         """Return the fleet for the page, with its age."""
@@ -127,15 +127,15 @@ class FleetPart:
 
 
 class HasFolder(Protocol):
-    """The gateway, as this part sees it."""
+    """The gateway, as this part uses it."""
 
-    folder: Path  # to which files' names are relative
+    folder: Path  # base of relative file names
 
 
 def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
-    """Return the part. Nothing is connected before it runs.
+    """Return the part. It connects when it runs.
 
-    Raises ImportError without NATS' client, OSError or ValueError for files that are none.
+    Raises ImportError without the NATS client, OSError or ValueError for invalid files.
     """
     from multidrop.fleet.commands.fleet_commands import FleetCommands
     from multidrop.fleet.overview import FleetView, FleetWatch

@@ -361,7 +361,7 @@ def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
             trial.clock.pass_s(0.5)
             await renew(first)
             assert not await second.try_to_begin()
-        assert "a gateway called a is registered on" in second.trouble
+        assert "a gateway called a runs on" in second.trouble
         assert not await second.try_to_begin()
         trial.clock.pass_s(USUAL.lease / SECOND - 0.01)
         assert not await second.try_to_begin()
@@ -443,7 +443,7 @@ def test_who_holds_the_lock_file_knows_that_the_one_before_is_dead(
         trial = Trial()
         lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
-        with pytest.raises(FleetError, match="another gateway of this machine runs with"):
+        with pytest.raises(FleetError, match="another gateway of this machine uses"):
             LifeLock(tmp_path / "a.lock")
         lock.close()  # as the kernel does for a process that is killed
         with closing(LifeLock(tmp_path / "a.lock")) as lock:
@@ -961,6 +961,6 @@ def test_without_two_paths_no_session_begins() -> None:
         trial.buckets[1].is_down = trial.buckets[2].is_down = True
         lease = trial.lease()
         assert not await lease.try_to_begin()
-        assert lease.trouble == "1 of 3 lease buckets answer, 2 are needed"
+        assert lease.trouble == "1 of 3 lease records can be read, 2 are needed"
 
     asyncio.run(main())

@@ -424,7 +424,7 @@ def test_without_servers_all_fall_silent_and_nobody_is_killed(
                 assert [one.events[-1] for one in masterships] == ["end", "end"]
                 members = running.members.values()
                 await until(lambda: not any(member.lease.is_valid for member in members), "the leases' end")
-                assert {member.state for member in members} == {MemberState.OUTSIDE}
+                assert {member.state for member in members} == {MemberState.NO_LEASE}
             await until(running.all_are_polled, "they come back")
             await until(lambda: {member.state for member in members} == {MemberState.WORKING}, "work")
             for name in ("a", "b"):

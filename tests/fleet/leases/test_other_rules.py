@@ -17,7 +17,7 @@ from multidrop.fleet.leases.member import OtherRules  # noqa: E402
 from multidrop.fleet.leases.observer import Observer  # noqa: E402
 from multidrop.fleet.leases.rules import RULES, USUAL  # noqa: E402
 
-SENTENCE = "another version of multidrop runs in this fleet: no line is taken until {} is stopped"
+SENTENCE = "incompatible version of multidrop in this fleet: no line is taken until {} is stopped"
 
 
 class Story:

@@ -594,9 +594,9 @@ def test_a_line_that_cannot_be_taken_is_told_once_for_each_reason_and_when_it_is
 
     asyncio.run(main())
     assert [message for message in caplog.messages if "line hall" in message] == [
-        "line hall is not taken, and tried again and again: nothing listens there",
-        "line hall is not taken, and tried again and again: no route to host",
-        "line hall is taken now",
+        "line hall cannot be opened; retrying: nothing listens there",
+        "line hall cannot be opened; retrying: no route to host",
+        "line hall is open now",
     ]
 
 

@@ -1,4 +1,4 @@
-"""Moves: who had a line before is told where it was seen, and nowhere else."""
+"""Moves: who had a line before is told where it was read, and nowhere else."""
 
 from __future__ import annotations
 

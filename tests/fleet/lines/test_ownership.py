@@ -220,7 +220,7 @@ def test_of_two_owners_the_newer_one_is_told() -> None:
 
 @table("name", ["", "hall.1", "hall 1", "hall*", ">", "Größe", "a/b", "x\n"])
 def test_names_that_cannot_be_in_a_subject(name: str) -> None:
-    with pytest.raises(ValueError, match="may have letters, digits, _ and - alone"):
+    with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
         names.checked_name("line", name)
 
 

@@ -233,7 +233,7 @@ def test_what_is_missing_or_doubled_is_told_and_counted(
         "a.x: message 5 came again behind 5 and is left out",
         "a.x: message 4 came again behind 5 and is left out",
     ]
-    assert told[4].startswith("a.x: message 6 is left out: 10 bytes are no message of samples")
+    assert told[4].startswith("a.x: message 6 is left out: 10 bytes are not a message of samples")
     assert told[5:] == [
         "a.x: its spool has lost 70 rows since it began",
         "message 10 of the stream, by c.x, has no number and is left out",
@@ -263,7 +263,7 @@ def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
             sink = Memory()
             sink.commits.append(Commit("", 1, 5, {}, [], 0))
             with pytest.raises(
-                NotThisHubs, match="the stream ends at message 1, and 5 are kept: it lost some"
+                NotThisHubs, match="the stream ends at message 1, and 5 are stored: it lost some"
             ):
                 await SampleHub(client, sink).run()
 
@@ -373,14 +373,14 @@ def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> Non
     sink.write(commit_of())
     assert sink.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
-        NotThisHubs, match="of a stream that was made at then, and this one was made at now: name"
+        NotThisHubs, match="of a stream created at then, and this one was created at now: name"
     ):
         sink.begin("now")
     with pytest.raises(NotThisHubs, match=f"another hub writes into {tmp_path}"):
         ParquetSink(tmp_path)
     sink.close()
     (tmp_path / "rows.00000001.arrows").write_bytes(b"")
-    with pytest.raises(NotThisHubs, match=r"is no folder of a hub: it holds 'rows.00000001.arrows'"):
+    with pytest.raises(NotThisHubs, match=r"is not a hub's folder: it holds 'rows.00000001.arrows'"):
         ParquetSink(tmp_path)
 
 
@@ -472,14 +472,14 @@ def test_samples_have_their_units(empty: Postgres, before: str) -> None:
 def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
     assert one.begin("then") == KeptPlace(0, {})
-    with pytest.raises(SinkError, match="another hub writes into this database; this one waits for its end"):
+    with pytest.raises(SinkError, match="another hub writes into this database; waiting until it ends"):
         other.begin("then")
     one.write(commit_of())
     assert one.begin("then") == KeptPlace(1, {"a.x": 1})  # as after a failure
     one.close()
     assert other.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
-        NotThisHubs, match="made at then, and this one was made at now: name another database"
+        NotThisHubs, match="made at then, and this one was created at now: name another database"
     ):
         other.begin("now")
     other.close()
@@ -492,7 +492,7 @@ def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postg
     sink.begin("then")
     empty.ask("update multidrop.hub set place = 7 returning place")
     for first in (1, 7, 9):  # behind it, and where messages would be passed over
-        with pytest.raises(SinkError, match="another hub writes into this database: end one of them"):
+        with pytest.raises(SinkError, match="another hub writes into this database: stop one of them"):
             sink.write(commit_of(first=first, last=first))
     sink.close()
     assert empty.ask("select count(*) from multidrop.exchanges") == [(0,)]

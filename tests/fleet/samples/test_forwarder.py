@@ -255,7 +255,7 @@ def test_a_folder_that_was_set_back_is_told_and_sends_nothing(
 
     asyncio.run(live())
     told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
-    ends = ": its folder was copied or set back; move it away, and a new log begins"
+    ends = ": its folder was copied or set back; move it away to start a new log"
     assert len(told) == 3
     assert all(sentence.endswith(ends) for sentence in told)
     assert "the spool has no such message" in told[0]
@@ -328,7 +328,7 @@ def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
         async with client_of(running) as client:
             await samples_stream._ask(client, "STREAM.DELETE.samples", {})
             for asked in (about(client), last_of(client, "samples.a.b")):
-                with pytest.raises(StreamError, match="there is no stream 'samples': make it by"):
+                with pytest.raises(StreamError, match="there is no stream 'samples': create it with"):
                     await asked
             with pytest.raises(StreamError, match="there is no stream 'samples', or it has no leader now"):
                 await read_after(client, 0, 10, 1000)
@@ -359,7 +359,7 @@ def test_rights_that_do_not_suffice(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         url = servers.urls[0]
 
         async def live() -> None:
-            with pytest.raises(StreamError, match="admits nobody who says this, or nothing, of himself"):
+            with pytest.raises(StreamError, match="refuses these credentials, or nothing, of himself"):
                 await connect([url], user="gateway-2", password="wrong")
             client = await connect([url], user="gateway-2", password="x")
             await create_stream(client, replicas=1)

@@ -123,7 +123,7 @@ def test_damaged_bytes_end_in_a_sentence() -> None:
         with suppress(MessageError):  # and no other error
             assert unpack(bytes(damaged)).schema == whole.schema
     for length in range(0, len(message.data) - 8, 7):
-        with pytest.raises(MessageError, match=f"^{length} bytes are no message of samples"):
+        with pytest.raises(MessageError, match=f"^{length} bytes are not a message of samples"):
             unpack(message.data[:length])
     with pytest.raises(MessageError):
         unpack(b"no Arrow at all")
@@ -181,7 +181,7 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
 )
 def test_rows_that_no_store_takes_are_no_message(column: str, rows: pa.Array, said: str) -> None:
     """A hub that could not keep one message would never come to those behind it, of all gateways."""
-    with pytest.raises(MessageError, match=f"bytes are no message of samples: {said}"):
+    with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
 
 
@@ -262,7 +262,7 @@ def test_columns_that_would_grow_by_a_cast_are_no_message(
     columns = alike(rows)
     data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
     before = most_allocated()
-    with pytest.raises(MessageError, match=f"its {column} is of another type"):
+    with pytest.raises(MessageError, match=f"its {column} has another type"):
         unpack(data)
     assert most_allocated() - before < 8 << 20
 
@@ -273,7 +273,7 @@ def test_rows_that_take_no_bytes_are_counted_first(most_allocated: Callable[[], 
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, schema) as writer:
         writer.write_batch(rows)
-    with pytest.raises(MessageError, match="its time is of another type"):
+    with pytest.raises(MessageError, match="its time has another type"):
         unpack(sink.getvalue())
     assert most_allocated() < 1 << 20
 
@@ -281,7 +281,7 @@ def test_rows_that_take_no_bytes_are_counted_first(most_allocated: Callable[[], 
 def test_an_older_version_of_the_format_is_no_message() -> None:
     """It has another way to say that buffers are compressed."""
     options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
-    with pytest.raises(MessageError, match="it is in another version of the format"):
+    with pytest.raises(MessageError, match="another version of the format"):
         unpack(written(options))
 
 

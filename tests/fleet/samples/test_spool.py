@@ -286,7 +286,7 @@ def test_a_full_disk_is_told_and_holds_nobody_up(
     told = [record.getMessage() for record in caplog.records]
     assert [told[0].partition(": ")[0], told[-1]] == [
         f"the spool {folder} takes nothing",
-        f"the spool {folder} takes rows again; 5000 were lost so far",
+        f"the spool {folder} is written again; 5000 were lost so far",
     ]
 
 
@@ -358,13 +358,13 @@ def test_a_disk_that_stands_still_holds_nobody_up(spool: Spool, monkeypatch: pyt
 
 
 def test_two_processes_do_not_write_one_spool(spool: Spool, folder: Path) -> None:
-    with pytest.raises(SpoolError, match=f"the spool {folder} is being written by another process"):
+    with pytest.raises(SpoolError, match=f"the spool {folder} is in use by another process"):
         Spool(folder, GATEWAY)
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "report.txt").write_text("mine")
-    with pytest.raises(SpoolError, match=r"is no spool: it holds 'report.txt' and no spool.json"):
+    with pytest.raises(SpoolError, match=r"is not a spool: it holds 'report.txt' and no spool.json"):
         Spool(tmp_path, GATEWAY)
     assert {path.name for path in tmp_path.iterdir()} == {"report.txt", ".spool.lock"}
 
@@ -400,7 +400,7 @@ def test_a_folder_that_cannot_be_written() -> None:
 
 @pytest.mark.parametrize("name", ["", "a.b", "a b", "*", ">", "ä", "a/b"])
 def test_a_name_that_no_subject_may_have(folder: Path, name: str) -> None:
-    with pytest.raises(ValueError, match="may have letters, digits, _ and - alone"):
+    with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
         Spool(folder, name)
 
 

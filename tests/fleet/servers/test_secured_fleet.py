@@ -113,7 +113,7 @@ NOT_THEIRS = [
     ("hub", ["fleet", "status"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_lease_0"),
     ("viewer", ["fleet", "drain", "gw-a"], NO_RIGHT + "publish to gateway.gw-a.drain"),
     ("gw-a", ["fleet", "serve", "gw-b"], NO_RIGHT + "listen to gateway.gw-b.*"),
-    ("viewer", ["hub", "--parquet", "{folder}", "--once"], "the rights of this connection do not suffice"),
+    ("viewer", ["hub", "--parquet", "{folder}", "--once"], "this connection lacks rights"),
 ]
 
 
@@ -198,12 +198,12 @@ def unknown_key(servers: SecuredCluster, folder: Path) -> list[str]:
 
 
 MISTAKES: dict[str, tuple[Callable[[SecuredCluster, Path], list[str]], int, str]] = {
-    "another authority": (other_ca, 1, "cannot be believed (unable to get local issuer certificate)"),
+    "another authority": (other_ca, 1, "is not trusted (unable to get local issuer certificate)"),
     "no such key": (no_key, 2, "none.key: No such file or directory"),
-    "a damaged key": (damaged_key, 2, "hub.key is damaged: it is no key that `fleet rights` wrote"),
+    "a damaged key": (damaged_key, 2, "hub.key is damaged: not a key of `fleet rights`"),
     "something else": (strange_key, 2, "hub.key has no credentials: name a key of `fleet rights`"),
     "no certificate": (strange_ca, 2, "ca.pem has no certificate: it must be a PEM file"),
-    "an unknown key": (unknown_key, 1, "admits nobody who says this, or nothing, of himself"),
+    "an unknown key": (unknown_key, 1, "refuses these credentials, or nothing, of himself"),
 }
 
 
@@ -244,9 +244,9 @@ def test_nothing_is_said_to_a_server_that_does_not_begin_with_tls(
         key, ca = str(servers.key("viewer")), str(servers.tls.ca)
         status, _, err = run("fleet", "status", "--nats", url, "--credentials", key, "--ca", ca)
         assert status == 1
-        assert "does not begin with TLS, which these options demand" in err
+        assert "does not start with TLS, which these options demand" in err
         status, _, err = run("fleet", "status", "--nats", plain.urls[0], "--ca", ca)
-        assert "does not begin with TLS, which these options demand" in err
+        assert "does not start with TLS, which these options demand" in err
 
 
 @pytest.mark.long
@@ -326,7 +326,7 @@ def test_a_key_that_is_taken_away_is_told_of_and_its_lines_go_on(tmp_path: Path)
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
         fleet.servers.give_rights_to(["gw-b"])
-        until(lambda: "admits nobody who says this" in fleet.log("gw-a"), "the sentence")
+        until(lambda: "refuses these credentials" in fleet.log("gw-a"), "the sentence")
         until(lambda: "no line is polled" in fleet.log("gw-a"), "silence")
         fleet.wait_for_polling()
         assert fleet.running["gw-a"].poll() is None  # and tries again
@@ -382,8 +382,8 @@ def test_a_gateway_in_wrong_hands_makes_lines_silent_and_no_more(tmp_path: Path)
             await path.close()
 
         asyncio.run(asyncio.wait_for(end_all(), PATIENCE_S))
-        assert "was ended by another" in fleet.log("gw-a")
-        assert "was ended by another" in fleet.log("gw-b")
+        assert "another gateway ended" in fleet.log("gw-a")
+        assert "another gateway ended" in fleet.log("gw-b")
         fleet.wait_for_polling()
         assert fleet.hall.overlaps() == 0
 
@@ -422,7 +422,7 @@ def test_two_gateways_of_one_name_on_two_machines(tmp_path: Path) -> None:
     with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
         fleet.wait_for_polling()
         fleet.start("gw-a", "second")
-        sentence = "gw-a does not poll: a gateway called gw-a is registered on"
+        sentence = "gw-a polls no lines yet: a gateway called gw-a runs on"
         until(lambda: sentence in fleet.log("second"), "the sentence")
         assert fleet.status()["gateways"]["gw-a"]["session"] == 1
         fleet.running["gw-a"].kill()

@@ -37,7 +37,7 @@ def nats_urls(given: str | None) -> list[str]:
     found = [url.strip() for url in text.split(",") if url.strip()]
     for url in found:
         if not url.startswith(("nats://", "tls://")):
-            raise ValueError(f"{masked(url)} is no address of a NATS server; write {URLS}")
+            raise ValueError(f"{masked(url)} is not an address of a NATS server; write {URLS}")
     if not found:
         raise ValueError(f"{masked(text)!r} names no NATS server; write {URLS}")
     return found

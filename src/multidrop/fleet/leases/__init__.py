@@ -1,1 +1,1 @@
-"""Sessions of gateways: leases on NATS, and the rules by which they end."""
+"""Leases: a gateway's right to poll, and the rules by which it ends."""

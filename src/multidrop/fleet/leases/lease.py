@@ -1,4 +1,4 @@
-"""Lease: a gateway's own session, renewed on three paths, and until when the gateway may send."""
+"""Lease: a gateway's own session, renewed on three paths, and the deadline of its right to send."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AGAIN_S = 0.1  # after a renewal that failed
 
 
 def boottime_ns() -> int:
-    """Return CLOCK_BOOTTIME: it runs on while the machine sleeps, and nobody sets it."""
+    """Return CLOCK_BOOTTIME in ns: it also counts while the machine sleeps, and no one can set it."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
@@ -33,17 +33,17 @@ class MayPoll(Protocol):
     """The engine's right to send; `multidrop.core.Mastership` is one."""
 
     def extend(self, until_ns: int) -> object:
-        """Let the engine send until then, and put the kernel's timer off.
+        """Let the engine send until then, and postpone the kernel's timer.
 
-        Raises ValueError for a time that is past: then nothing has changed.
+        Raises ValueError, and changes nothing, if that time is in the past.
         """
 
     def end(self) -> object:
-        """Send nothing more, and call the timer off."""
+        """Stop sending, and cancel the timer."""
 
 
 class Held(NamedTuple):
-    """Our record on one path: its revision, and when the renewal that made it was about to be sent (ns)."""
+    """Our record on one path: its revision, and the time right before its renewal was sent (ns)."""
 
     revision: int
     sent: int
@@ -52,8 +52,8 @@ class Held(NamedTuple):
 class Lease:
     """The session of one gateway.
 
-    `until` is the time (CLOCK_BOOTTIME, ns) until which it may send. `note` returns what else stands in the
-    record, for others to see.
+    `until` is the deadline for sending (CLOCK_BOOTTIME, ns). `note` returns further fields of the record, for
+    other gateways and people.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Lease:
         self.terms = terms
         self.session = 0  # 0: none
         self.until = 0
-        self.trouble = ""  # why there is no session
+        self.trouble = ""  # why the session cannot start
         self.began_ms = 0  # UTC
         self.held: list[Held | None] = [None] * len(buckets)
         self._buckets = buckets
@@ -81,10 +81,10 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
-        self._newest = 0  # session of this process: no number is used twice, whatever others write
-        self._ended: set[int] = set()  # paths that others have ended in this session, for good
+        self._newest = 0  # session of this process: no number is used twice, even if a record is forged
+        self._ended: set[int] = set()  # paths that others have ended: they stay ended for this session
 
-    # ---- what others ask ----
+    # ---- state ----
 
     @property
     def is_valid(self) -> bool:
@@ -92,48 +92,48 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return for how long (s) it may still send; negative: since when it may not."""
+        """Return how long it may still send (s); negative after the deadline."""
         return (self.until - self.clock()) / SECOND
 
     @property
     def best(self) -> int:
-        """Return the path that was renewed last: what is asked there is newest."""
+        """Return the number of the path that was renewed last: its answers are the newest."""
         return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
 
     @property
     def is_over(self) -> bool:
-        """Say whether too few paths are left to this session, ever."""
+        """Return True if too few paths are left for this session to send again."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property
     def is_weak(self) -> bool:
-        """Say whether others have ended one of its paths for good: one more, and it is over."""
+        """Return True if others have ended one of its paths: the loss of another path ends the session."""
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
-        """Say whether all paths answer, so that a session that began now would have each of them."""
+        """Return True if all paths answer, so that a new session would have all of them."""
         records = await asyncio.gather(*(self._read(path) for path in range(len(self._buckets))))
         return None not in records
 
-    # ---- a session begins ----
+    # ---- start ----
 
     async def begin(self) -> None:
-        """Begin a session, as soon as every one before it is over."""
+        """Start a session as soon as every earlier one is over."""
         told = ""
         while not await self.try_to_begin():
             if self.trouble != told:
-                _log.warning("%s does not poll: %s", self.name, self.trouble)
+                _log.warning("%s polls no lines yet: %s", self.name, self.trouble)
             told = self.trouble
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:
-        """Take the records that may be taken. Return False where it must be tried again."""
+        """Take the records that are free. Return False if too few are, and the call must be repeated."""
         paths = range(len(self._buckets))
         records = await asyncio.gather(*(self._read(path) for path in paths))
         known = {path: record for path, record in enumerate(records) if record is not None}
         if len(known) < self.terms.needed:
             self.trouble = (
-                f"{len(known)} of {len(paths)} lease buckets answer, {self.terms.needed} are needed"
+                f"{len(known)} of {len(paths)} lease records can be read, {self.terms.needed} are needed"
             )
             return False
         free = {path: record for path, record in known.items() if self._is_free(path, record)}
@@ -147,7 +147,7 @@ class Lease:
         await asyncio.gather(*(self._take(path, record) for path, record in free.items()))
         if self.is_over:
             await self.end()
-            self.trouble = f"another gateway called {self.name} began at the same time"
+            self.trouble = f"another gateway called {self.name} started at the same time"
             return False
         self.trouble = ""
         self._extend()
@@ -160,7 +160,7 @@ class Lease:
             return None
 
     def _is_free(self, path: int, record: Record) -> bool:
-        """Say whether the session in this record is over, or its end may be written at this revision."""
+        """Return True if the session in this record is over, or may be ended at this revision."""
         value = record.value
         if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
@@ -173,7 +173,7 @@ class Lease:
     def _rival(self, known: Mapping[int, Record]) -> str:
         others = [record.value for record in known.values() if record.value]
         host = others[0].get("host", "?") if others else "?"
-        return f"a gateway called {self.name} is registered on {host}; waiting until its lease has run out"
+        return f"a gateway called {self.name} runs on {host}; waiting until its lease expires"
 
     async def _take(self, path: int, record: Record) -> None:
         sent, nonce = self.clock(), self._nonce
@@ -181,7 +181,7 @@ class Lease:
             revision = await self._buckets[path].put(self.name, self._value(), record.revision)
         except (Conflict, FleetError):
             return
-        if nonce == self._nonce:  # else the answer is to a session before
+        if nonce == self._nonce:  # else it answers an earlier session
             self.held[path] = Held(revision, sent)
 
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
@@ -199,13 +199,13 @@ class Lease:
             "pid": os.getpid(),
         }
 
-    # ---- and goes on ----
+    # ---- renewal ----
 
     async def renew(self, path: int) -> None:
-        """Renew one path, for ever; one task for each, so that none waits for another.
+        """Renew one path forever. Each path has its own task, so none waits for another.
 
-        What failed is tried again soon: a bucket may get a leader at any moment, and two of them may be all
-        that the lines wait for.
+        A failed renewal is repeated soon: the bucket may get a leader at any moment, and two renewed paths
+        are enough to poll.
         """
         while True:
             begun, before = self.clock(), self.held[path]
@@ -216,7 +216,7 @@ class Lease:
             await asyncio.sleep(max(rest, AGAIN_S))
 
     async def renew_once(self, path: int) -> None:
-        """Renew one path. What is counted is the moment before the request was sent."""
+        """Renew one path. The lease counts from the moment before the request was sent."""
         held, nonce, sent = self.held[path], self._nonce, self.clock()
         if held is None:
             if path not in self._ended:
@@ -230,31 +230,33 @@ class Lease:
             if isinstance(failure, Unsure):
                 await self._look_again(path, nonce, held)
         else:
-            if nonce == self._nonce:  # else the answer is to a session before
+            if nonce == self._nonce:  # else it answers an earlier session
                 self.held[path] = Held(revision, sent)
                 self._extend()
 
     async def _look_again(self, path: int, nonce: str, held: Held) -> None:
-        """Learn what became of a renewal: it may have been stored without our knowing."""
+        """Read the record after a renewal whose outcome is unknown."""
         record = await self._read(path)
         if record is None or nonce != self._nonce:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, held.sent)  # an older time than it could be
+            self.held[path] = Held(record.revision, held.sent)  # the older, safe time
         elif record.revision > held.revision:
             self._lose(path)
 
     def _lose(self, path: int) -> None:
         self.held[path] = None
         self._ended.add(path)
-        _log.warning("%s: path %d of session %d was ended by another", self.name, path, self.session)
+        _log.warning(
+            "%s: another gateway ended lease record %d of 3 (session %d)", self.name, path + 1, self.session
+        )
 
     async def _take_late(self, path: int) -> None:
-        """Take a path that could not be had when the session began.
+        """Take a path that was not available when the session started.
 
-        What stands there is over by the other paths, once we hold them. While we only try to, another gateway
-        of this name may live by it.
+        Any record there is of a session that our other paths have ended. Before we hold them, another gateway
+        of this name may still depend on it.
         """
         nonce = self._nonce
         record = await self._read(path)
@@ -272,19 +274,19 @@ class Lease:
     def _extend(self) -> None:
         until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
         if until > self.until and lease_rules.may_send(self.clock(), until):
-            with suppress(ValueError):  # we stood still since that look at the clock
+            with suppress(ValueError):  # this process was suspended since the clock was read
                 self._mastership.extend(until)
                 self.until = until
 
-    # ---- and ends ----
+    # ---- end ----
 
     async def end(self) -> None:
-        """Write the end of this session, so that nobody has to wait for it; nothing may be sent any more."""
+        """Write the end of this session, so that no one has to wait for it. Sending stops first."""
         self._mastership.end()
         self.until = 0
         held, value = self.held, self._value(ended=True)
         self.session, self.held, self._ended = 0, [None] * len(held), set()
-        self._nonce = ""  # answers to renewals that are under way are not counted
+        self._nonce = ""  # ignore answers to renewals in flight
         self._watched = [None] * len(held)
 
         async def write(path: int, revision: int) -> None:
@@ -295,14 +297,14 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return a number that no session before was above, also where somebody has written nonsense."""
+    """Return a number that is at least that of every earlier session, also for an invalid record."""
     return int(record.value["session"]) if record.value else record.revision
 
 
 async def put_end(bucket: Bucket, end: Record) -> None:
-    """Replace our own record by this end of its session. Raises Conflict and FleetError as `put` does.
+    """Replace our own record by the end of its session. Raises Conflict and FleetError as `put` does.
 
-    A renewal whose answer nobody waited for any more may have been stored meanwhile. It is replaced too.
+    A renewal that was cancelled may have been stored in the meantime. Replace that one too.
     """
     try:
         await bucket.put(end.key, end.value, end.revision)

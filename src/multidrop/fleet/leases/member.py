@@ -1,15 +1,15 @@
 """Member: the state machine of one gateway of a fleet.
 
-    OUTSIDE   no session, or a lease that ran out. No line is polled. Ends with one on two of three paths.
-    SETTLING  3 s from then on: lines of dead gateways and lines that others give away are taken, but none
-              that nobody had, so that in a cold start each gateway takes its own share.
-    WORKING   every line that the balance gives us is claimed, and polled from then on.
-    DRAINING  every line is given away and none is claimed.
+    NO_LEASE  no session, or its lease expired: no line is polled. Ends when two of three paths are renewed.
+    STARTING  the first 3 s: lines of dead gateways and released lines are taken, but no line that never had
+              a master, so that in a cold start each gateway takes its own share.
+    WORKING   every line of its share is claimed and polled.
+    DRAINING  every line is released and none is claimed.
 
-When the last line is closed, as in every state before the lease runs out, the kernel's timer is called off.
-(The engine sends nothing after the deadline, closed or not. Closing takes back what the system was given and
-could not send; so a process that stands still before that must die.) A session that is renewed before anybody
-has ended it goes on.
+When the last line is closed before the lease expires, the kernel's timer is cancelled. (The engine sends
+nothing after the deadline, whether ports are open or closed. Closing discards unsent bytes in the system's
+buffers, so a process that is suspended before that must be killed.) A session that is renewed before another
+gateway has ended it continues.
 """
 
 from __future__ import annotations
@@ -42,11 +42,14 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 _log = logging.getLogger("multidrop.fleet")
 
 WEAK_LOOK_S = 1.0
-WEAK_NS = 10 * SECOND  # for which it goes on first, from when its gateway has settled
+WEAK_NS = 10 * SECOND  # how long it continues after its gateway has settled
 
 
 class WeakSession:
-    """Watches our own session; `is_too_weak` while it is to be given up."""
+    """Gives our own session up when others have ended one of its paths: `is_too_weak` is then True.
+
+    Otherwise the next server that fails would end it.
+    """
 
     def __init__(self, lease: Lease, observer: Observer, path: Callable[[], ServerPath]) -> None:
         self.is_too_weak = False
@@ -55,10 +58,10 @@ class WeakSession:
         self._path = path
 
     async def watch(self, settled_at: Callable[[], int]) -> None:
-        """Look at it for ever.
+        """Check the session forever.
 
-        Its lines are others' for a moment, so one gateway at a time gives up, once all paths answer and lines
-        can be claimed.
+        Its lines have no master for a moment, so one gateway at a time gives up, once all paths answer and
+        lines can be claimed.
         """
         while True:
             await asyncio.sleep(WEAK_LOOK_S)
@@ -69,11 +72,14 @@ class WeakSession:
                 self.is_too_weak = await have_leaders(self._path()) and await lease.could_be_whole()
 
 
-UNSAID = 1  # the rules of who says none
+FIRST_RULES = 1  # of a gateway whose record names no version
 
 
 class OtherRules:
-    """The other `gateways` that live by other rules than ours, by what their sessions say."""
+    """Detects gateways with incompatible ownership rules; while one is alive, no line is claimed.
+
+    So no line has two masters while a fleet is updated: new gateways wait until the old ones are stopped.
+    """
 
     def __init__(self, me: str, observer: Observer) -> None:
         self.gateways: frozenset[str] = frozenset()
@@ -81,42 +87,46 @@ class OtherRules:
         self._observer = observer
 
     def look(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Note who there is of those with a session.
+        """Update the set of incompatible gateways from these sessions.
 
-        One that is renewed no more does not count, though nobody may have ended it yet.
+        A gateway that no longer renews its lease does not count, even if its session was not ended yet.
         """
-        others = {name for name, value in present.items() if value.get("rules", UNSAID) != RULES}
+        others = {name for name, value in present.items() if value.get("rules", FIRST_RULES) != RULES}
         found = frozenset(others - {self._me} - self._observer.dead(others).keys())
         if found != self.gateways:
             self.gateways = found
-            _log.warning("%s", self.trouble or "no gateway with other rules is left")
+            _log.warning("%s", self.trouble or "no gateway of an incompatible version is left")
 
     @property
     def trouble(self) -> str:
-        """Return the sentence about them; "" where there are none."""
+        """Return a sentence about them; "" if there are none."""
         if not self.gateways:
             return ""
         names = ", ".join(sorted(self.gateways))
-        return f"another version of multidrop runs in this fleet: no line is taken until {names} is stopped"
+        return f"incompatible version of multidrop in this fleet: no line is taken until {names} is stopped"
 
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.05  # between steps; at once where records have changed
-LEAST_STEP_S = 0.01  # between any two
-TIDY_NS = SECOND // 2  # between looks at all lines of the share, where nothing is known to have changed
+STEP_S = 0.05  # between steps; less if records change
+LEAST_STEP_S = 0.01  # at least
+TIDY_NS = SECOND // 2  # between checks of all lines of the share without a known change
 SETTLE_S = 3.0
-SOUND_S = 1.0  # of our lease, to end others': where less is left the servers may fail all of us alike
+SOUND_S = (
+    1.0  # left of our own lease, to end others': with less, the servers may be failing all gateways alike
+)
 
 
 class MemberState(StrEnum):
-    OUTSIDE = "outside"
-    SETTLING = "settling"
+    """The state of a gateway, as `fleet status` shows it."""
+
+    NO_LEASE = "no lease"
+    STARTING = "starting"
     WORKING = "working"
     DRAINING = "draining"
 
 
 class Member:
-    """One gateway: its lease, its share of the lines, and what it does about the other gateways."""
+    """One gateway: its lease, its share of the lines, and its view of the other gateways."""
 
     def __init__(
         self,
@@ -155,20 +165,20 @@ class Member:
         self._stepped: tuple[Any, ...] = ()
         self._over = asyncio.Event()
 
-    # ---- what others ask ----
+    # ---- state ----
 
     @property
     def state(self) -> MemberState:
         if not self.lease.is_valid:
-            return MemberState.OUTSIDE
+            return MemberState.NO_LEASE
         if self.is_draining:
             return MemberState.DRAINING
-        return MemberState.WORKING if self._is_settled else MemberState.SETTLING
+        return MemberState.WORKING if self._is_settled else MemberState.STARTING
 
     @property
     def trouble(self) -> str:
-        """Return what is not well with the lease, or hinders it; "" for nothing."""
-        weak = "others have ended one path of its lease; a new session begins soon"
+        """Return why the lease is missing or at risk; "" if it is fine."""
+        weak = "another gateway ended one of its three lease records; a new lease starts soon"
         return self._other_rules.trouble or self.lease.trouble or (weak if self.lease.is_weak else "")
 
     @property
@@ -178,7 +188,7 @@ class Member:
 
     @property
     def wanted(self) -> Mapping[str, str]:
-        """Return each line's gateway, by the balance."""
+        """Return the gateway that each line is assigned to."""
         return self._shares.wanted
 
     @property
@@ -199,7 +209,7 @@ class Member:
         self._woken.set()
 
     def drain(self) -> None:
-        """Give all lines away, and take none from now on."""
+        """Release all lines, and take none from now on."""
         self.is_draining = self._is_dirty = True
 
     def _is_mine(self, record: Record) -> bool:
@@ -210,16 +220,16 @@ class Member:
             "draining": self.is_draining,
             "lines": len(self.polled),
             "unopened": sorted(self.unopened.named()),
-            "at_ms": time.time_ns() // 1_000_000,  # UTC, for people alone
+            "at_ms": time.time_ns() // 1_000_000,  # UTC, only for display
             "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
 
-    # ---- life ----
+    # ---- run ----
 
     async def run(self) -> None:
-        """Live until `end` is called, or this is cancelled; then give all lines away and end the session.
+        """Work until `end` is called or this is cancelled; then release all lines and end the session.
 
-        Raises Ended, after the same, if a part of this has ended by itself.
+        Raises Ended, after the same, if one of its tasks has ended by itself.
         """
         works = {f"{self.name}: {name}": work for name, work in self._works().items()}
         tasks = {name: supervisor().keep(name, work) for name, work in works.items()}
@@ -238,11 +248,11 @@ class Member:
             raise Ended(f"{task.get_name()} has ended: {supervisor().dead[task.get_name()]}") from failure
 
     def end(self) -> None:
-        """Let `run` come to its end; called again, it disturbs nothing."""
+        """Let `run` return; further calls have no effect."""
         self._over.set()
 
     def _works(self) -> dict[str, Coroutine[Any, Any, None]]:
-        """Return what must go on, by name."""
+        """Return the tasks that must not end, by name."""
         records = {f"records {at}": work for at, work in enumerate(self.records.works(), 1)}
         return {
             **{f"path {at}": path.keep() for at, path in enumerate(self.paths, 1)},
@@ -257,7 +267,7 @@ class Member:
         }
 
     async def _leave(self) -> None:
-        """Let all lines go, and end the session: others take over at once."""
+        """Release all lines, and end the session: others take over at once."""
         await self.keeper.let_all_go()
         await self.lease.end()
 
@@ -269,10 +279,10 @@ class Member:
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
                 self._shares.begin_anew()
                 self._is_dirty = True
-                _log.info("%s: session %d began", self.name, self.lease.session)
+                _log.info("%s: the lease began (session %d)", self.name, self.lease.session)
             elif self.lease.is_over or self._weak.is_too_weak:
-                what = "is over" if self.lease.is_over else "lost a path; a new one begins"
-                _log.warning("%s: session %d %s", self.name, self.lease.session, what)
+                what = "is over" if self.lease.is_over else "lost one of three records; a new one starts"
+                _log.warning("%s: the lease %s (session %d)", self.name, what, self.lease.session)
                 await self._leave()
                 self._is_dirty, self._weak.is_too_weak = True, False
             self._woken.clear()
@@ -282,9 +292,9 @@ class Member:
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _prepare(self) -> None:
-        """Wait until all was read: a large plant takes seconds, in which no lease could be renewed.
+        """Wait until all records were read; for a large plant that takes longer than a lease.
 
-        Wait for the end of gateways with other rules too.
+        Also wait until incompatible gateways have ended.
         """
         while True:
             self._see(self.records.observer.sessions())
@@ -293,7 +303,7 @@ class Member:
             await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
-        """Close the lines before the lease has run out; only then is the kernel's timer called off."""
+        """Close the lines before the lease expires; only then cancel the kernel's timer."""
         is_armed = was_late = False
         while True:
             if self.keeper.may_poll:
@@ -305,17 +315,17 @@ class Member:
                 if self.keeper.is_silent:
                     is_armed, was_late = False, True
                     self.mastership.end()
-                    _log.warning("%s: the lease was not renewed in time; no line is polled", self.name)
+                    _log.warning("%s: the lease was not renewed in time; all lines are closed", self.name)
             await asyncio.sleep(GUARD_LOOK_S)
 
     def _keeps_leaders(self) -> bool:
-        """Say whether leaders are ours to keep: one gateway does it, the first by name."""
+        """Return True if this gateway looks after the buckets' leaders: the first one by name does."""
         return self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name
 
     # ---- one step ----
 
     async def step(self) -> None:
-        """Do what is due now. Only the ending of dead gateways waits for a server."""
+        """Do the work that is due. Only the ending of dead gateways waits for a server."""
         observer = self.records.observer
         present = observer.sessions()
         if not self.lease.is_valid:
@@ -335,7 +345,7 @@ class Member:
             self.keeper.reconcile()
 
     def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
-        """Return the other gateways that take lines; since when they are the same is noted."""
+        """Return the other gateways that take lines, and note when that set last changed."""
         self._other_rules.look(present)
         self.keeper.may_claim = not self._other_rules.gateways
         others = {name for name, value in present.items() if not value["draining"]}
@@ -344,7 +354,7 @@ class Member:
         return others
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Make the shares anew where gateways or lines came or went."""
+        """Assign the lines again if gateways or lines came or went."""
         sharing = self._see(present)
         if not self.is_draining and self.lease.session:
             sharing.add(self.name)
@@ -361,9 +371,9 @@ class Member:
     def _unopened(
         self, present: Mapping[str, Mapping[str, Any]], sharing: Iterable[str], lines: Iterable[str]
     ) -> tuple[tuple[str, frozenset[str]], ...]:
-        """Return the lines that each gateway could not open; none of versions that do not say so.
+        """Return the lines that each gateway could not open; none of versions that do not report any.
 
-        Those would not take what is given away for them.
+        Such a version would not take the lines handed over to it.
         """
         told = {name: value.get("unopened") for name, value in present.items()}
         told[self.name] = list(self.unopened.named())

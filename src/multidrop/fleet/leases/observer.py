@@ -1,8 +1,9 @@
-"""Observer: watches the sessions of all gateways, and ends those that nobody renews.
+"""Observer: watches the sessions of all gateways, and ends those that are no longer renewed.
 
-An end that a gateway wrote of its own session counts at once. One that another gateway wrote counts when the
-last renewal that we read is a lease old by our own clock too: nobody's haste or wrong clock makes a second
-master. Malice could, by an end right behind a renewal that followed a long silence and that we never read.
+An end written by the gateway itself counts at once. An end written by another gateway counts only when the
+last renewal that this process read is older than a lease by its own clock: a hasty gateway or a wrong clock
+cannot create a second master. A malicious gateway could, by an end right after a renewal that followed a long
+silence and that was never read here.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from multidrop.fleet.leases.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.supervisor import end_tasks
 
-BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for who only looks: every end counts at once
+BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for viewers: every end counts at once
 
-LOOK_S = 0.1  # between looks at a path: the silence of a dead gateway's lines is longer by it
-ENDING_S = 0.1  # for the answers, when a session is ended; later ones are read
+LOOK_S = 0.1  # between reads of a path: it adds to the silence of a dead gateway's lines
+ENDING_S = 0.1  # for answers when a session is ended; later ones are read as records
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class Observer:
-    """The lease records on all paths, as this machine saw them change."""
+    """The lease records on all paths, and when this machine saw them change."""
 
     def __init__(
         self, me: str, buckets: Sequence[Bucket], terms: Terms, clock: Callable[[], int] = boottime_ns
@@ -37,25 +38,25 @@ class Observer:
         self.me = me
         self.terms = terms
         self.paths = [Follower(bucket) for bucket in buckets]
-        self.ended = 0  # sessions that this one ended
+        self.ended = 0  # sessions that this gateway ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
-        self._looked = [0] * len(self.paths)  # when the newest look that had an answer began
-        self._over: dict[str, int] = {}  # each gateway's newest session that is over for certain
+        self._looked = [0] * len(self.paths)  # when the newest answered read started
+        self._over: dict[str, int] = {}  # each gateway's newest session that is certainly over
         self._clock = clock
 
     def begin_anew(self) -> None:
-        """Count from now on: while we were cut off we saw nothing of the others.
+        """Restart all waiting times: while this gateway was cut off it saw no renewals.
 
-        What was over before that stays over: nobody renews it.
+        A session that was over before stays over, because it cannot be renewed.
         """
         now = self._clock()
         for seen in self._watched:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
 
     async def look(self, path: int) -> bool:
-        """Read what changed on a path. Raises FleetError where it is not reached.
+        """Read the changes on a path. Raises FleetError if it cannot be reached.
 
-        Return True where a session has ended, or may be ended now.
+        Return True if a session has ended, or may be ended now.
         """
         begun = self._clock()
         found = await self.paths[path].look()
@@ -65,7 +66,7 @@ class Observer:
         return any(record.value and record.value["ended"] for record in found) or bool(self.dead())
 
     async def rest(self, path: int) -> None:
-        """Wait until the next look: until a record may be stale, if that comes first."""
+        """Wait for the next read: earlier if a record may become stale."""
         begins = self._clock() - self.terms.lease
         due = ((one.since - begins) / lease_rules.SECOND for one in self._watched[path].values())
         await asyncio.sleep(min([LOOK_S, *(left for left in due if left > 0)]))
@@ -73,7 +74,7 @@ class Observer:
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
         before = watched.get(record.key)
-        if before is not None and is_ended_by_another(record):  # it was not renewed: its time runs on
+        if before is not None and is_ended_by_another(record):  # not a renewal: the waiting time continues
             watched[record.key] = before._replace(revision=record.revision)
         else:
             watched[record.key] = lease_rules.watch(before, record.revision, self._clock())
@@ -82,7 +83,7 @@ class Observer:
         return [follower.records.get(gateway) for follower in self.paths]
 
     def is_over(self, gateway: str, session: int) -> bool:
-        """Say whether this session was ended on as many paths as it takes."""
+        """Return True if this session was ended on enough paths."""
         if session <= self._over.get(gateway, 0):
             return True
         now = self._clock()
@@ -90,7 +91,7 @@ class Observer:
         return lease_rules.is_over(sum(ended), self.terms)
 
     def sessions(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway that has a session that is not over, with its newest record."""
+        """Return each gateway whose session is not over, with its newest record."""
         found = {}
         now = self._clock()
         for name in sorted({name for follower in self.paths for name in follower.records}):
@@ -106,7 +107,7 @@ class Observer:
         return found
 
     def missing(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway whose newest session others have ended, with its record: it did not leave."""
+        """Return each gateway that others have ended and that did not leave by itself, with its record."""
         present = self.sessions()
         found = {}
         for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
@@ -119,7 +120,7 @@ class Observer:
         return found
 
     def weak(self) -> list[str]:
-        """Return the gateways whose session others have ended on a path, and which go on by the rest."""
+        """Return the gateways whose session lost one path to others and continues on the rest."""
         return [
             name
             for name, value in self.sessions().items()
@@ -130,7 +131,7 @@ class Observer:
         ]
 
     def _of(self, gateway: str) -> list[tuple[int, Record]]:
-        """Return the records of a gateway, with their paths, but for those that are removed or strange."""
+        """Return the valid records of a gateway, with their paths."""
         records = enumerate(self.records(gateway))
         return [(path, record) for path, record in records if record and record.value is not None]
 
@@ -141,7 +142,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return for how long (s) no renewal was seen on two of the paths, as many as must be renewed."""
+        """Return how long (s) no renewal was seen on the two paths that a lease needs."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0
@@ -149,10 +150,10 @@ class Observer:
     # ---- dead gateways ----
 
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
-        """Return who may be ended, with the very records that were watched for so long, by path.
+        """Return the gateways that may be ended, with the watched records by path.
 
-        What was not looked at since may have been renewed: a server that stands still answers nobody.
-        `present` are the names in `sessions`, where the caller has just asked for them.
+        A record that was not read again since may have been renewed: a suspended server answers no one.
+        `present` are the names in `sessions`, if the caller already has them.
         """
         found = {}
         for name in self.sessions() if present is None else present:
@@ -166,7 +167,7 @@ class Observer:
                 and not record.value["ended"]
                 and self._is_stale(path, record, self._looked[path])
             }
-            if lease_rules.is_over(len(stale), self.terms):  # fewer: it lives, and would only be weakened
+            if lease_rules.is_over(len(stale), self.terms):  # fewer: it is alive, and would only be weakened
                 found[name] = stale
         return found
 
@@ -179,9 +180,9 @@ class Observer:
         )
 
     async def end_the_dead(self, present: Iterable[str] | None = None) -> bool:
-        """End the sessions that nobody renews: each record at the revision that was judged, or not at all.
+        """End the sessions that are no longer renewed, each record only at the revision that was judged.
 
-        Return True where one was ended.
+        Return True if one was ended.
         """
         before = self.ended
         self._keep_what_is_over()
@@ -189,20 +190,20 @@ class Observer:
             session = max(record.value["session"] for record in records.values())
             if await self._end_enough(records):
                 self.ended += 1
-                _log.warning("session %d of %s has run out; ended by %s", session, name, self.me)
+                _log.warning("the lease of %s (session %d) expired; %s ended it", name, session, self.me)
         return self.ended > before
 
     def _keep_what_is_over(self) -> None:
-        """Keep which sessions are over, as they were judged without a gap in what we saw."""
+        """Remember which sessions are over while this process saw everything without a gap."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):
                 self._over[name] = max(session, self._over.get(name, 0))
 
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
-        """End them all at once, and wait for as many answers as it takes: a path may have no leader.
+        """End these records at once, and wait for as many answers as needed: a path may have no leader.
 
-        Return True where any has ended. Another gateway may have ended the others: the next look tells.
+        Return True if any was ended. Another gateway may have ended the others; the next read shows it.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []
@@ -213,13 +214,13 @@ class Observer:
                 if len(answers) >= self.terms.ended:
                     break
         except TimeoutError:
-            pass  # the others are judged anew, with what was seen meanwhile
+            pass  # the rest is judged again with newer records
         finally:
-            await end_tasks(*ends)  # what was sent may still be stored, and is read then
+            await end_tasks(*ends)  # a request in flight may still be stored, and is read later
         return any(answers)
 
     async def _end(self, path: int, record: Record) -> bool:
-        """End a record, unless it has changed. Raises FleetError where nobody says whether it was."""
+        """End a record unless it has changed. Raises FleetError if the outcome is unknown."""
         value = {**record.value, "ended": True, "by": self.me}
         try:
             revision = await self.paths[path].bucket.put(record.key, value, record.revision)
@@ -232,5 +233,5 @@ class Observer:
 
 
 def is_ended_by_another(record: Record) -> bool:
-    """Say whether somebody else than the gateway itself has written the end of its session."""
+    """Return True if another gateway wrote the end of this session."""
     return bool(record.value and record.value["ended"] and record.value.get("by", record.key) != record.key)

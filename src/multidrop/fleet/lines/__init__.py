@@ -1,1 +1,1 @@
-"""Which gateway polls which line: ownership, shares and hand-over."""
+"""Lines: which gateway polls which line, and how a line changes its master."""

@@ -1,4 +1,4 @@
-"""Fleet lines: those that a gateway has taken, in one Poller that sends only while it is their master."""
+"""Fleet lines: the lines that a gateway has taken, in one Poller that sends only while it is their master."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ THREADS = 32  # at most, at once
 
 
 class FleetLines:
-    """Takes lines into a poller and lets them go; both in threads, for both wait for ports."""
+    """Takes lines into a poller and releases them, in threads: both wait for ports."""
 
     def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
         self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
@@ -31,10 +31,10 @@ class FleetLines:
         self._free = asyncio.Semaphore(THREADS)
 
     async def take(self, line: str, description: Any) -> None:
-        """Open the line and poll it; if that raises, it is not polled, and its port is closed.
+        """Open the line and poll it. If that raises, the line is not polled and its port is closed.
 
-        Raises LineError where its port is not there, ValueError for a mistake in its description, and what
-        a user's own class raises.
+        Raises LineError if its port does not exist, ValueError for a mistake in its description, and anything
+        that a user's own class raises.
         """
         await self._in_thread(self._take, Record(line, 0, description))
 
@@ -46,24 +46,24 @@ class FleetLines:
     def _take(self, record: Record) -> None:
         line = line_of(record, self._folder)
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
-        if not any(one.drive.name in polled for one in line.drives):  # else `add_line` refuses it
+        if not any(one.drive.name in polled for one in line.drives):  # otherwise `add_line` refuses it
             self._units.note(line, time.monotonic_ns())  # before the first of its rows
         before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)
-        except BaseException:  # amid the work: another gateway may be its master before long
+        except BaseException:  # half done: another gateway may soon be its master
             if self.poller.buses.get(line.name) is not before:
                 self.poller.remove_line(line.name)
             raise
 
     async def let_go(self, line: str) -> None:
-        """Poll the line no more, and close its port."""
+        """Stop polling the line, and close its port."""
         await self._in_thread(self._let_go, line)
 
     def _let_go(self, line: str) -> None:
         try:
             self.poller.remove_line(line)
-        except PollingFailed:  # of all lines: what is left is to close the port
+        except PollingFailed:  # on all lines: only the port is left to close
             self.poller.bus(line).close()
 
     def bus(self, line: str) -> Bus:
@@ -79,5 +79,5 @@ class FleetLines:
         return PortLoss(bus.why_lost, silent_ns)
 
     async def close(self) -> None:
-        """Stop polling; the last rows are handed out. Raises PollingFailed if polling had failed."""
+        """Stop polling and deliver the last rows. Raises PollingFailed if polling had failed."""
         await self._in_thread(self.poller.close)

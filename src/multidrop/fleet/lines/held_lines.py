@@ -1,4 +1,4 @@
-"""Held lines: those that a gateway polls and so takes commands for, and what their lists allow."""
+"""Held lines: the lines that accept commands here, and the commands that each allows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PolledBuses(Protocol):
 
 
 class HeldLine:
-    """A line while it is held. Taken again, it is another HeldLine with another number."""
+    """A line while this gateway polls it. Each time it is taken it gets a new number."""
 
     _numbers = count(1)
 
@@ -34,7 +34,7 @@ class HeldLine:
         return {drive.name: drive for drive in self.bus.drives}
 
     def drive(self, name: str) -> Drive:
-        """Return the drive of this name. Raises ValueError."""
+        """Return the drive of this name. Raises ValueError if the line has none."""
         drives = self.drives
         if name not in drives:
             raise ValueError(f"line {self.name} has no drive {name!r}; it has {', '.join(drives) or 'none'}")
@@ -42,10 +42,11 @@ class HeldLine:
 
 
 class HeldLines:
-    """The lines that are open to commands.
+    """The lines that accept commands.
 
-    `may_stop` says whether we are a line's master now, and `may_command` whether no frame of the master
-    before can come any more either. A stop that meets such a frame is repeated; a command would be lost.
+    `may_stop` returns True while this gateway is the line's master. `may_command` returns True once no frame
+    of the master before can arrive: a stop that collides with such a frame is repeated, a command would be
+    lost.
     """
 
     def __init__(
@@ -57,16 +58,16 @@ class HeldLines:
         self._held: dict[str, HeldLine] = {}
 
     def open(self, line: str, description: Mapping[str, Any]) -> None:
-        """Take commands for a line that is polled from now on."""
+        """Accept commands for a line that is polled from now on."""
         self._held[line] = HeldLine(line, self._buses.bus(line), lists_of(description))
 
     def leave(self, line: str) -> None:
-        """Take stops alone from now on, until it is shut."""
+        """Accept only stops from now on."""
         if held := self._held.get(line):
             held.is_leaving = True
 
     def shut(self, line: str) -> None:
-        """Take none any more."""
+        """Accept nothing from now on."""
         self._held.pop(line, None)
 
     def for_command(self, line: str) -> HeldLine | None:
@@ -80,7 +81,7 @@ class HeldLines:
 
 
 def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:
-    """Return the lists of a line's record; empty ones, which allow nothing, where it is none."""
+    """Return the permission lists of a line's record; an invalid list is empty and allows nothing."""
     may = description.get("may")
     given = may if isinstance(may, dict) else {}
     return {key: _entries(given.get(key)) for key in LISTS}

@@ -1,7 +1,7 @@
-"""Line keeper: the work on a gateway's lines, one thing at a time on each: claim, poll, let go, give away.
+"""Line keeper: claims, polls, closes and releases a gateway's lines, one task at a time for each line.
 
-A line is polled only while our present session has enough votes by its records, and while the lease is valid.
-Half a second before it runs out all lines are let go.
+A line is polled only while its records name our present session and the lease is valid. Half a second before
+the lease expires all lines are closed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from multidrop.fleet.lines.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")
 
-SILENT_S = 0.5  # before the lease runs out: time for closing; the timer leaves guard / 2 more
-TAKE_AGAIN_S = 2.0  # after a line that could not be taken
-WRITTEN_AT_ONCE = 64  # records; more would keep the renewal of the lease waiting
+SILENT_S = 0.5  # before the lease expires: time for closing; the timer adds guard / 2
+TAKE_AGAIN_S = 2.0  # after a line could not be opened
+WRITTEN_AT_ONCE = 64  # records; more would delay renewals of the lease
 LINES_AT_ONCE = 32
 
 
@@ -33,11 +33,11 @@ class Lines(Protocol):
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it.
 
-        If that raises, nothing of the line is left open, and it is tried again.
+        If that raises, nothing of the line stays open, and it is tried again.
         """
 
     async def let_go(self, line: str) -> None:
-        """Poll the line no more, and close it: when this returns nothing of ours is sent on it."""
+        """Stop polling the line and close it: after this nothing is sent on it."""
 
 
 class PortLoss(NamedTuple):
@@ -56,17 +56,17 @@ def no_loss(line: str) -> PortLoss | None:
 
 
 class TakenLine(NamedTuple):
-    """A line that is polled: the revision of its description, and since when (CLOCK_BOOTTIME, ns)."""
+    """A polled line: the revision of its description, and since when it is polled (CLOCK_BOOTTIME, ns)."""
 
     revision: int
     since: int
 
 
 class LineKeeper:
-    """The lines that one gateway polls, and what is under way on each of them.
+    """The lines that one gateway polls, and the task in progress on each of them.
 
-    `on_change` is called when the next step is due. `port_loss` says how the port of a polled line is lost,
-    None if it is open.
+    `on_change` is called when the next step is due. `port_loss` returns how the port of a polled line is
+    lost, or None if it is open.
     """
 
     def __init__(
@@ -81,10 +81,10 @@ class LineKeeper:
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
-        self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
-        self.lost: dict[str, str] = {}  # lines that nobody polls now, for their port is not there, and why
-        self.releasing: set[str] = set()  # ours, and to be given away
-        self.may_claim = True  # beside gateways with other rules nothing is
+        self.troubles: dict[str, str] = {}  # why lines could not be opened
+        self.lost: dict[str, str] = {}  # why lines are not polled: their ports are lost
+        self.releasing: set[str] = set()  # ours, to be released
+        self.may_claim = True  # False beside an incompatible version
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
@@ -92,7 +92,7 @@ class LineKeeper:
         self._unopened = unopened or UnopenedLines(lambda: lease.clock())
         self._port_loss = port_loss
         self._is_leaving = False
-        self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
+        self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is being opened, closed or claimed
         self._tasks: set[asyncio.Task[None]] = set()
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
@@ -101,39 +101,39 @@ class LineKeeper:
 
     @property
     def may_poll(self) -> bool:
-        """Say whether lines may be taken and kept: the lease leaves time to close them before it ends."""
+        """Return True if the lease leaves time to close lines before it expires."""
         return bool(self._lease.session) and self._lease.left_s > SILENT_S and not self._is_leaving
 
     @property
     def is_silent(self) -> bool:
-        """Say whether no line is open, or about to be."""
+        """Return True if no line is open or being opened."""
         return not self.polled and not self._at_work
 
     @property
     def moves(self) -> int:
-        """Return how many lines were claimed and given away."""
+        """Return how many lines were claimed and released."""
         return self._owners.moves
 
     def is_mine(self, line: str) -> bool:
-        """Say whether the line is ours by its records, and was not given away."""
+        """Return True if the line's records name us and it was not released."""
         return self._owners.is_mine(line)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return what is to be written for a line to be ours; None where nothing can be now."""
+        """Return the records to write for the line to become ours; None if that is not possible now."""
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
-        """Say whether this is the line's master now: a stop waits for no guard, here or in the engine."""
+        """Return True if this gateway is the line's master now. A stop waits for no guard."""
         return self._lease.is_valid and self.is_mine(line) and line in self.polled
 
     def may_command(self, line: str) -> bool:
-        """Say whether this is the line's master now, and the guard of the one before is over."""
+        """Return True if this gateway is the line's master, and the guard after the last master is over."""
         if not self.may_stop(line):
             return False
         return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
-        """Wait for a line that cannot be let go, and raise its error: the process must end."""
+        """Wait for a line that cannot be closed, and raise its error: the process must end."""
         await self._has_failed.wait()
         assert self._failure is not None
         raise self._failure
@@ -141,15 +141,15 @@ class LineKeeper:
     # ---- all lines ----
 
     def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Claim lines where any may be, each at the revisions of its records that were judged."""
+        """Claim lines, each at the revisions that were judged."""
         free = claims.keys() - self._at_work.keys() if self.may_claim else ()
         for lines in _some_at_once(free):
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
 
     def reconcile(self) -> None:
-        """Let go of what is not ours any more, take what is, and give away what was let go.
+        """Close lines that are no longer ours, open those that are, and release those that are closed.
 
-        Where a line is to stay after all, and nobody knows whether it was given away, it is claimed anew.
+        If a line is to stay after all, but its release may have been stored, claim it again.
         """
         valid = self.may_poll
         kept = {
@@ -176,11 +176,11 @@ class LineKeeper:
             self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
 
     def _look_at_ports(self) -> None:
-        """Note which ports of polled lines are lost: after a while others should take the lines."""
+        """Note which ports of polled lines are lost: after a while other gateways should take these lines."""
         for line in self.polled.keys() - self._at_work.keys():
             if loss := self._port_loss(line):
                 if loss.why and line not in self.lost:
-                    _log.warning("line %s is not polled, for its port is lost: %s", line, loss.why)
+                    _log.warning("line %s is not polled: its port is lost: %s", line, loss.why)
                 if loss.why:
                     self.lost[line] = loss.why
                 self._unopened.lost(line, loss.silent_ns)
@@ -197,7 +197,7 @@ class LineKeeper:
         self._unopened.gone(line)
 
     async def let_all_go(self) -> None:
-        """Let go of all lines, whatever is under way. Raises the error of a line that could not be."""
+        """Close all lines, whatever is in progress. Raises the error of a line that could not be closed."""
         self._is_leaving = True
         try:
             while not self.is_silent:
@@ -212,19 +212,19 @@ class LineKeeper:
 
     def _start(self, lines: Sequence[str], work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
-        self._tasks.add(task)  # lines may be taken, and begin another one, before it is done
+        self._tasks.add(task)  # the loop keeps no reference to it
         self._at_work |= dict.fromkeys(lines, task)
         task.add_done_callback(lambda done: self._done(lines, done))
 
     def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         for line in lines:
-            if self._at_work.get(line) is task:  # else the next work on it has begun
+            if self._at_work.get(line) is task:  # otherwise the next task on it has started
                 del self._at_work[line]
         self._on_change()
         failure = None if task.cancelled() else task.exception()
         if failure and not self._failure:
-            self._failure = failure  # a line that is not closed for certain
+            self._failure = failure  # this line may not be closed
             self._has_failed.set()
 
     def _take_new(self, line: str) -> None:
@@ -238,23 +238,21 @@ class LineKeeper:
                 return
             try:
                 await self.lines.take(line, record.value)
-            except Exception as failure:  # such as of a user's own class: it is this line's alone
+            except Exception as failure:  # such as in a user's own class: it concerns this line only
                 is_foreseen = isinstance(failure, (OSError, ValueError))
                 why = str(failure) if is_foreseen else f"{type(failure).__name__}: {failure}"
-                told, self.troubles[line] = self.troubles.get(line), why
+                reported, self.troubles[line] = self.troubles.get(line), why
                 if isinstance(failure, OSError):
                     self.lost[line] = str(failure)
                     self._unopened.failed(line)
                 self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
                 asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
-                if told != why:
+                if reported != why:
                     cause = None if is_foreseen else failure
-                    _log.warning(
-                        "line %s is not taken, and tried again and again: %s", line, why, exc_info=cause
-                    )
+                    _log.warning("line %s cannot be opened; retrying: %s", line, why, exc_info=cause)
             else:
                 if line in self.troubles:
-                    _log.warning("line %s is taken now", line)
+                    _log.warning("line %s is open now", line)
                     self._forget_trouble(line)
                 self.lost.pop(line, None)
                 self._unopened.opened(line)
@@ -271,7 +269,7 @@ class LineKeeper:
 
 
 def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
-    """Return lines as many at a time as are written at once."""
+    """Yield the lines in batches of the size that is written at once."""
     left = iter(lines)
     while some := list(islice(left, WRITTEN_AT_ONCE)):
         yield some

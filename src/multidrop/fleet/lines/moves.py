@@ -1,4 +1,4 @@
-"""Moves: the newest changes of mastership, as the records of lines told them. Pure."""
+"""Moves: the latest changes of masters, from the records of lines. Pure."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any, NamedTuple
 from multidrop.fleet.lines.ownership import NOBODY
 
 MOST = 100
-TOLD = 20  # by a gateway that is asked for its state
+TOLD = 20  # in a gateway's answer about its state
 
 
 class Move(NamedTuple):
-    """A line that went from one gateway to another; "" is nobody, None a master that was not seen."""
+    """A line that went from one gateway to another; "" is none, None is an unknown one."""
 
     line: str
-    turn: int  # of the line's records: the same move has the same one, whoever saw it
-    at_ms: int  # UTC, by the clock of the gateway that wrote it: for people alone
+    turn: int  # number of the change: the same for every observer of a move
+    at_ms: int  # UTC, by the clock of the gateway that wrote it: only for display
     before: str | None
     after: str
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as a gateway tells it and `--json` prints it."""
+        """Return it as gateways send it and `--json` prints it."""
         return {
             "line": self.line,
             "turn": self.turn,
@@ -32,27 +32,27 @@ class Move(NamedTuple):
         }
 
 
-def move_of(told: Any) -> Move:
-    """Return the move that another gateway told. Raises KeyError, TypeError or ValueError for none."""
-    before = told["from"]
+def move_of(sent: Any) -> Move:
+    """Parse a move that another gateway sent. Raises KeyError, TypeError or ValueError for an invalid one."""
+    before = sent["from"]
     return Move(
-        str(told["line"]),
-        int(told["turn"]),
-        int(told["at_ms"]),
+        str(sent["line"]),
+        int(sent["turn"]),
+        int(sent["at_ms"]),
         None if before is None else str(before),
-        str(told["to"]),
+        str(sent["to"]),
     )
 
 
 class Moves:
-    """The newest moves; a line that was given away and then taken has moved once."""
+    """The latest moves. A line that was released and then taken has moved once."""
 
     def __init__(self, most: int = MOST) -> None:
         self._most = most
         self._moves: dict[tuple[str, int], Move] = {}
 
     def add(self, moves: Iterable[Move]) -> None:
-        """Add moves. Where two are the same move, the one that knows more is kept."""
+        """Add moves. Of two reports of the same move, keep the more complete one."""
         for move in moves:
             key = (move.line, move.turn)
             known = self._moves.get(key)
@@ -63,9 +63,10 @@ class Moves:
             self._moves = {(move.line, move.turn): move for move in kept}
 
     def newest(self, number: int) -> list[Move]:
-        """Return so many moves at most, the newest first.
+        """Return at most this many moves, newest first.
 
-        Who gives a line away does not see who takes it, and that one may not know whose it was: one move.
+        The releasing gateway does not see who takes the line, and the taking one may not know whose it was:
+        the two reports are joined into one move.
         """
         moves = dict(self._moves)
         for (line, turn), move in self._moves.items():

@@ -1,7 +1,7 @@
-"""Owner records: which lines are ours, and what is written to claim them and to give them away.
+"""Owner records: which lines are ours, and the records to write to claim and release them.
 
-What is given away is not ours any more from the moment before it is sent: it may be stored, at any time,
-though nobody answered. It is ours again once newer records say so.
+A line stops being ours right before its release is sent: the release may be stored at any later time, even
+without an answer. The line is ours again once newer records say so.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ from multidrop.supervisor import end_tasks
 
 WRITERS = 2  # batches at a time in each bucket
 LAG_NS = SECOND  # two renewals
-SPARE_S = 0.15  # after one bucket has answered, before records are written in the spare one
+SPARE_S = 0.15  # after one bucket has answered, before the spare one is used
 
 
 class OwnerRecords:
-    """The records of lines as far as they name us, in our present session.
+    """The records of lines that name our present session.
 
-    Nothing is written while `may_write` says no; `on_mine` is called with each line that has become ours.
+    Nothing is written unless `may_write()` returns True. `on_mine` is called with each line that becomes
+    ours.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class OwnerRecords:
         self._records = records
         self._may_write = may_write
         self._on_mine = on_mine
-        self._offered: dict[tuple[str, str], int] = {}  # by line and bucket, the revision given away last
+        self._offered: dict[tuple[str, str], int] = {}  # by line and bucket, the revision released last
         self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
 
     @property
@@ -60,7 +61,7 @@ class OwnerRecords:
         return self._lease.name, self._lease.session
 
     def is_mine(self, line: str) -> bool:
-        """Say whether we have enough votes by records that were not given away at their very revisions."""
+        """Return True if we have enough votes, without records that we have released."""
         me, votes = self._me, 0
         for bucket, record in self._records.of(line).items():
             if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
@@ -68,7 +69,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets in which the line was given away, and nobody knows whether that was stored."""
+        """Return the buckets in which the line was released without a known outcome."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -82,25 +83,25 @@ class OwnerRecords:
         }
 
     def owned(self) -> set[str]:
-        """Return the lines of which one record at least names us."""
+        """Return the lines that at least one record names us for."""
         return self._records.owned_by(*self._me)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return what is to be written for a line to be ours; None where nothing can be."""
+        """Return the records to write for the line to become ours; None if that is not possible."""
         is_over = self._records.observer.is_over
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the bucket, if any, that may have no leader: its home's lease lags behind the two others."""
+        """Return the bucket that may have no leader, if any: the lease of its home server lags behind."""
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the first records of claims, and spare ones where a bucket takes much longer than another.
+        """Write the first records of claims, and spare ones if one bucket takes much longer than another.
 
-        Where a claim was refused, answers that decide nothing any more are not waited for, and those of a
-        bucket that may have no leader never for long: it is to be tried again, by newer records.
+        After a refused claim, do not wait for answers that no longer matter, nor long for a bucket that may
+        have no leader: the claim is repeated soon with newer records.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -126,7 +127,7 @@ class OwnerRecords:
         late = await self._decide(claims, (late - vain).union(spare.values()), refused)
         if refused:
             late, vain = set(), late | vain
-        await end_tasks(*vain)  # what was sent may still be stored, and is read then
+        await end_tasks(*vain)  # a request in flight may still be stored, and is read later
         await asyncio.gather(*late)
 
     async def _decide(
@@ -136,7 +137,7 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is ours or refused, and add the refused; return the writes not answered."""
+        """Wait until each line is ours or refused; add the refused, and return unanswered writes."""
         late = set(writes)
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
@@ -146,9 +147,10 @@ class OwnerRecords:
         return late
 
     async def give_away(self, lines: Sequence[str]) -> None:
-        """Name nobody in each record of these lines that names us.
+        """Release these lines: write that each record naming us names no one.
 
-        All of them are given away before one is sent: an answer to a late claim makes none ours meanwhile.
+        All lines stop being ours before the first write is sent, so the answer to a late claim cannot make
+        one ours.
         """
         now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
         given: list[tuple[str, Record]] = []
@@ -162,7 +164,7 @@ class OwnerRecords:
         self.moves += sum(not self._naming_us(line) for line in lines)
 
     def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
-        """Begin to replace records, each in this bucket; a bucket's task returns the lines refused there."""
+        """Start to replace records, each in its bucket. Each bucket's task returns the refused lines."""
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)
@@ -171,7 +173,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace records: the server decides, by the revision of each. Lines that are ours now are taken."""
+        """Replace records; the server decides by the revision of each. Open the lines that become ours."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

@@ -1,14 +1,14 @@
-"""Ownership: the records that say whose a line is, and who may write them when. Pure.
+"""Ownership: the records that name a line's master, and who may write them when. Pure.
 
-A line has a record in each of three buckets, with one vote each, and its master is the session with two: so
-a bucket without a leader holds nobody up. A record that names a session which is not over is replaced by that
-session alone, at the revision that it knows; so no two sessions ever have two votes.
+A line has one record in each of three buckets, with one vote each. Its master is the session with two votes,
+so no line waits for a bucket without a leader. A record that names a living session is replaced only by that
+session, at the revision that it knows. So no two sessions ever have two votes.
 
-The first record of all that a line gets has two votes, and saves a large fleet's cold start a second. It is
-written in the line's first bucket, where the server stores one such alone; and nothing is written in the
-others by who has not seen it.
+The very first record of a line has two votes, which saves a large fleet's cold start a second. It is written
+in the line's first bucket, where the server stores only one first record. A gateway that has not read it
+writes nothing in the other buckets.
 
-Records are written only when a line changes hands. Once the session that one names is over, it is void.
+Records are written only when a line changes hands. A record becomes void when its session is over.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ NOBODY = ""
 NEEDED = 2  # votes
 
 Owner = tuple[str, int]  # a gateway and its session
-LineRecords = Mapping[str, Record | None]  # by bucket, in the order in which they are written; None: not read
+LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: not read
 
 
 class Claim(NamedTuple):
-    """The records of a line that are to name us: the revision of each, by bucket.
+    """The records to write for a line to become ours: the revision of each, by bucket.
 
-    `spare` has those that are written where one of the `first` is not answered. Each gets so many `votes`.
+    The `spare` ones are written if one of the `first` gets no answer. Each record has this many `votes`.
     """
 
     first: dict[str, int]
@@ -38,41 +38,41 @@ class Claim(NamedTuple):
 
 
 class Step(NamedTuple):
-    """The lines that a gateway is to claim, and those that it is to give away."""
+    """The lines that a gateway should claim, and those that it should release."""
 
     claims: dict[str, Claim]  # by line
     releases: set[str]
 
 
 def owner_of(record: Record | None) -> Owner:
-    """Return gateway and session that a record names; a free line's has neither."""
+    """Return the gateway and session that a record names; NOBODY and 0 for a free line."""
     if record is None or not record.value:
         return NOBODY, 0
     return record.value["gateway"], record.value["session"]
 
 
 def owner_value(owner: Owner, turn: int, now_ms: int, votes: int = 1) -> dict[str, Any]:
-    """Return a line's record.
+    """Return the content of a line's record.
 
-    `turn` counts how often the line was claimed and given away; it and `now_ms` (UTC) are for people alone.
+    `turn` counts how often the line was claimed and released. It and `now_ms` (UTC) are only for display.
     """
     return {"gateway": owner[0], "session": owner[1], "votes": votes, "turn": turn, "since": now_ms}
 
 
 def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
-    """Return how many votes an owner has by these records."""
+    """Return how many votes an owner has in these records."""
     return sum(record.value["votes"] for record in records if record and owner_of(record) == owner)
 
 
 def owner_by(records: LineRecords) -> Record | None:
-    """Return the newest record of an owner with enough votes, who may be nobody; None where nobody has."""
-    told = [record for record in records.values() if record and record.value]
-    decided = [record for record in told if votes_of(owner_of(record), told) >= NEEDED]
+    """Return the newest record of an owner with enough votes, or of a free line, or None."""
+    known = [record for record in records.values() if record and record.value]
+    decided = [record for record in known if votes_of(owner_of(record), known) >= NEEDED]
     return max(decided, key=lambda record: record.value["turn"], default=None)
 
 
 def turn_of(records: LineRecords) -> int:
-    """Return the newest turn of these; 0 where nobody ever had the line."""
+    """Return the newest turn of these records; 0 if the line never had a master."""
     turn = 0
     for record in records.values():
         if record and record.value and record.value["turn"] > turn:
@@ -87,14 +87,14 @@ def claim_of(
     doubted: Collection[str] = (),
     leaderless: Collection[str] = (),
 ) -> Claim | None:
-    """Return which records to write for us to have enough votes; None where that cannot be, or is so.
+    """Return the records to write for us to have enough votes; None if we have them or cannot get them.
 
-    `doubted` are the buckets where ours was given away, and nobody knows whether that was stored; those that
-    are `leaderless`, perhaps, are written last.
+    In the `doubted` buckets we released the line without a known outcome. Buckets that may be `leaderless`
+    are written last.
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None  # it may have two votes
+        return None  # the unread record may have two votes
     if first.revision == NONE_YET:
         return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}
@@ -106,7 +106,7 @@ def claim_of(
         elif record and (owner == me or owner[0] == NOBODY or is_over(*owner)):
             free[bucket] = record.revision
         elif record and record.value["votes"] >= NEEDED:
-            return None  # its master lives, and needs no other
+            return None  # a living master has both votes
     if not 0 < needed <= len(free):
         return None
     wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}
@@ -124,10 +124,10 @@ def decide(
     is_settled: bool,
     is_draining: bool,
 ) -> Step:
-    """Return which lines to claim and which to give away.
+    """Return which lines to claim and which to release.
 
-    `me` is our name and session, `wanted` the gateway of each line by the balance. A line that nobody ever
-    had is claimed only when we are settled: else the first gateway of a cold start would take all of them.
+    `me` is our name and session, `wanted` the gateway assigned to each line. A line that never had a master
+    is claimed only once we are settled. Otherwise the first gateway of a cold start would take all of them.
     """
     step = Step({}, set())
     for line in lines:

@@ -1,7 +1,7 @@
-"""Share records: what a gateway reads of its fleet; of the masters of lines, those of its own share alone.
+"""Records that a gateway or viewer reads about its fleet: sessions, masters of lines, the plant.
 
-A large fleet has thousands of lines. A gateway asks only about those that it should have and has not: nobody
-takes the others from it while its session lasts. So at rest it asks nothing about masters at all.
+A large fleet has thousands of lines. A gateway reads only the masters of the lines that it should have and
+does not: no one takes its other lines while its session lasts. So an idle gateway reads no masters at all.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _UNREAD: LineRecords = {}
 class FleetRecords:
     """The records of all buckets, as far as they were read.
 
-    `on_change` is called when lines or their masters have changed, or a session has come to its end, or may.
+    `on_change` is called when lines or masters have changed, or when a session has ended or may be ended.
     """
 
     def __init__(
@@ -41,8 +41,8 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # by line
-        self._owned: dict[Owner, set[str]] = {}  # the lines of which one record at least names this session
-        self._masters: dict[str, tuple[str, int]] = {}  # of each line, with the turn by which it has it
+        self._owned: dict[Owner, set[str]] = {}  # the lines that at least one record names this session for
+        self._masters: dict[str, tuple[str, int]] = {}  # of each line, with its turn
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
@@ -56,19 +56,19 @@ class FleetRecords:
         }
 
     def _owner_follower(self, bucket: Bucket, on_take: OnTake) -> Follower:
-        """Return what follows a bucket of lines' masters: here all of them."""
+        """Return the follower of one bucket of masters; here it follows all lines."""
         return Follower(bucket, on_take)
 
     def of(self, line: str) -> LineRecords:
-        """Return the records of a line's master; none at all where none was read."""
+        """Return the records of a line's master; an empty mapping if none was read."""
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return a record with the line's master, who may be nobody; None where nobody has enough votes."""
+        """Return a record that names the line's master or no one; None if no one has enough votes."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
-        """Return the lines of the plant, by name; the same tuple while none came or went."""
+        """Return the plant's lines in order of name; the same tuple until one comes or goes."""
         return self._lines
 
     def is_in_plant(self, line: str) -> bool:
@@ -76,18 +76,18 @@ class FleetRecords:
         return bool(record and record.value and "line" in record.value)
 
     def owned_by(self, gateway: str, session: int) -> set[str]:
-        """Return the lines of which one record at least names this session."""
+        """Return the lines that at least one record names this session for."""
         return set(self._owned.get((gateway, session), ()))
 
     async def look(self) -> None:
-        """Read once what has changed in each bucket. Raises FleetError where that fails."""
+        """Read the changes in each bucket once. Raises FleetError if that fails."""
         done = await asyncio.gather(*map(self._look, self._looks), return_exceptions=True)
         for failure in done:
             if failure is not None:
                 raise failure
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
-        """Return a coroutine for each bucket, which reads it for ever: none waits for another."""
+        """Return one coroutine for each bucket, which reads it forever: none waits for another."""
         rests = {name: follower.rest for name, follower in {**self.owners, names.PLANT: self.plant}.items()}
         rests |= {name: partial(self.observer.rest, at) for at, name in enumerate(names.LEASES)}
         return [self._follow(name, rests[name]) for name in self._looks]
@@ -107,7 +107,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         try:
             return bool(await self.plant.look())
-        finally:  # what was read before a failure is not read again
+        finally:  # records read before a failure are not read again
             if self._has_plant_changed:
                 self._has_plant_changed = False
                 self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
@@ -129,7 +129,7 @@ class FleetRecords:
             self._note_move(line)
 
     def _note_move(self, line: str) -> None:
-        """Note who has the line now, if that has changed, and who had it before, if no turn was missed."""
+        """Note the line's master if it has changed, and its former master if no turn was missed."""
         record = self.owner(line)
         if not record:
             return
@@ -138,7 +138,7 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            if known != master:  # else it was claimed anew, for nobody knew whether it was given away
+            if known != master:  # otherwise it claimed the line again after an uncertain release
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
@@ -147,9 +147,9 @@ DOUBT_S = 30.0  # longer than the election of a bucket's leader, which may still
 
 
 class ShareFollower(Follower):
-    """The records of a share's lines in one bucket; revision 0 stands for a line that nobody ever had.
+    """The records of a share's lines in one bucket; revision 0 stands for a line that never had a master.
 
-    `is_mine` says whether a record names us and our present session, `has` whether we have a line.
+    `is_mine` returns True for a record of our present session, `has` for a line that we poll.
     """
 
     def __init__(
@@ -159,8 +159,8 @@ class ShareFollower(Follower):
         self._is_mine = is_mine
         self._has = has
         self._share: frozenset[str] = frozenset()
-        self._asked: frozenset[str] | None = frozenset()  # lines of it that may change; None: not known
-        self._doubted: dict[str, float] = {}  # lines whose writing failed or was not answered, since when
+        self._asked: frozenset[str] | None = frozenset()  # its lines that may change; None: to be found
+        self._doubted: dict[str, float] = {}  # since when writes of these lines have no answer
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
@@ -170,16 +170,16 @@ class ShareFollower(Follower):
         self._is_urgent.set()
 
     def doubt(self, lines: Iterable[str]) -> None:
-        """Ask what became of lines that were to be handed over: again and again, for it may take a while."""
+        """Read these lines again for a while: a write of theirs had no clear answer."""
         self._doubted |= dict.fromkeys(lines, time.monotonic())
         self._is_urgent.set()
 
     def look_anew(self) -> None:
-        """Find anew which lines may change: a record of one of them has, in this bucket or another."""
+        """Find again which lines may change, because a record in this or another bucket has changed."""
         self._asked = None
 
     async def look(self) -> list[Record]:
-        """Ask for what is not known of the share, or may change, and return what did."""
+        """Read the unknown and changeable lines of the share, and return the changed records."""
         self._is_urgent.clear()
         asked = self._to_ask()
         changed: list[Record] = []
@@ -198,14 +198,14 @@ class ShareFollower(Follower):
         return sorted(self._doubted.keys() | self._asked)
 
     def _may_change(self, line: str) -> bool:
-        """Say whether a record is unknown, or another gateway's. Claiming a free one tells what it is."""
+        """Return True if the record is unknown or names another gateway; a claim settles a free line."""
         record = self.records.get(line)
         if record is None:
             return True
         return owner_of(record)[0] != NOBODY and not self._is_mine(record) and not self._has(line)
 
     async def rest(self) -> None:
-        """Wait until the next look."""
+        """Wait for the next read."""
         with suppress(TimeoutError):
             await asyncio.wait_for(self._is_urgent.wait(), FOLLOW_S)
 
@@ -245,5 +245,5 @@ class ShareRecords(FleetRecords):
             share.want(wanted)
 
     def doubt(self, bucket: str, lines: Iterable[str]) -> None:
-        """Ask what became of lines of this bucket that were to be handed over."""
+        """Read these lines of this bucket again for a while."""
         self._shares[bucket].doubt(lines)

@@ -1,9 +1,9 @@
-"""Releases: which lines may be let go for another gateway now: those that it can claim at once.
+"""Releases: which lines may be closed for another gateway now, so that it can claim them at once.
 
-A line is closed before it is given away, and is nobody's until that is stored and the other one has claimed
-it. While too few buckets have a leader nothing is stored, so it is better polled where it is. So it is while
-a server is silent: one that is cut off asks for votes in newer terms, and once it is heard again leaders may
-lose their office for seconds, between giving away and claiming.
+A line is closed before it is released, and has no master until the release is stored and the other gateway
+has claimed it. While too few buckets have a leader, nothing is stored, so the line is better polled here. The
+same holds while a server is silent: when a server that was cut off returns, it may unseat leaders for
+seconds, between release and claim.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import known_cluster
 
-LOOK_S = 0.05  # between looks while lines are to be released
-WAIT_S = 60.0  # for a silent server; one that is silent for longer is not waited for
+LOOK_S = 0.05  # between checks while lines are to be released
+WAIT_S = 60.0  # for a silent server; one that is silent for longer is ignored
 
 
 class Releases:
-    """The lines that should be others', and how the servers of all buckets were a moment ago.
+    """The lines that should go to others, and the latest state of the servers.
 
-    `on_change` is called when more or fewer of them may be let go.
+    `on_change` is called when more or fewer lines may be closed.
     """
 
     def __init__(
@@ -37,13 +37,15 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        self._led: dict[str, float | None] = {}  # buckets with a leader; since when a server of it is silent
+        self._led: dict[
+            str, float | None
+        ] = {}  # buckets with a leader; since when one of their servers is silent
 
     def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
-        """Return those of these lines that may be let go now; the others are waited for.
+        """Return the lines that may be closed now; the others must wait.
 
-        Two records must be free to be written then, and the first one: it may have two votes. `wait_s` says
-        for how long a silent server holds lines up.
+        Two records must be writable, and the first one of the line, which may have two votes. `wait_s` limits
+        the wait for a silent server.
         """
         self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
@@ -53,13 +55,13 @@ class Releases:
         return {line for line in lines if names.owner_buckets(line)[0] in ready}
 
     async def watch(self) -> None:
-        """Look at the buckets while lines are to be released, for ever."""
+        """Check the buckets forever while lines are to be released."""
         while True:
             await self.look()
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
-        """Ask for the servers once; nothing is asked where no line is to be released."""
+        """Check the servers once; does nothing if no line is to be released."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}

@@ -1,7 +1,7 @@
-"""Balance: which gateway each line belongs to, by rendezvous hashing with a bound. Pure.
+"""Shares: which gateway each line is assigned to, by rendezvous hashing with a bound.
 
-Each line goes to the gateway with the highest weight for this pair that is not full yet; full is 110 % of the
-mean. So a gateway that comes or goes moves its own share of the lines and few others.
+Each line goes to the gateway with the highest weight for this pair that is not full; full is 110 % of the
+mean. So a gateway that comes or goes moves its own share and few other lines.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import pyarrow.compute as pc
 from multidrop.fleet.leases.rules import SECOND
 
 BOUND = 110  # percent of the mean
-NUMBER_BITS = 16  # the low bits of a weight: its gateway's number
+NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number
 
 
 def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
-    """Return the gateway of each line; empty where there is no gateway.
+    """Return the gateway of each line; empty if there is no gateway.
 
-    20 gateways and 10,000 lines take 20 ms, so call it outside of an event loop.
+    20 gateways and 10,000 lines take 20 ms, so do not call it in an event loop.
     """
     if not gateways:
         return {}
@@ -45,9 +45,10 @@ def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
 
 
 def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]) -> dict[str, str]:
-    """Return each line's gateway, where `unopened` says which lines each of these gateways cannot open.
+    """Return each line's gateway after moving lines away from gateways that cannot open them.
 
-    A line that all of them cannot open stays where it is. Gateways that are not named are given nothing.
+    `unopened` has such lines by gateway. A line that none of them can open stays where it is. Gateways that
+    are not listed get nothing.
     """
     found = dict(wanted)
     for line in {line for lines in unopened.values() for line in lines} & wanted.keys():
@@ -58,14 +59,16 @@ def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]
 
 
 def _words(values: Iterable[int]) -> pa.UInt64Array:
-    """Return an array of these; `pa.array` imports pandas where there is one, which takes far longer."""
+    """Return an array of these; `pa.array` would import pandas if installed, which takes far longer."""
     words = array("Q", values)
     return pa.Array.from_buffers(pa.uint64(), len(words), [None, pa.py_buffer(words)])
 
 
 _NUMBER = (1 << NUMBER_BITS) - 1
 _WEIGHT = _words([(1 << 64) - 1 - _NUMBER])[0]
-_MIXER = _words([0x9E3779B97F4A7C15])[0]  # odd: a product's upper bits depend on all bits of the other number
+_MIXER = _words([0x9E3779B97F4A7C15])[
+    0
+]  # odd: the upper bits of a product depend on all bits of the other factor
 
 
 def _weigh(hashes: pa.UInt64Array, gateway: str, number: int) -> pa.UInt64Array:
@@ -79,19 +82,19 @@ def _hash(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
-QUIET_NS = SECOND // 2  # without a gateway that comes or goes, before shares are made anew while we settle
+QUIET_NS = SECOND // 2  # without a change of gateways, before lines are assigned while we settle
 
 
 class Sharers(NamedTuple):
-    """Those among whom lines are shared out, the lines, and which of them may be handed over."""
+    """The gateways that share the lines, the lines, and the lines that some gateways could not open."""
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
-    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # lines that these gateways could not open
+    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # by gateway
 
 
 class Shares:
-    """The gateway of each line by the balance, for the sharers that were there last."""
+    """The gateway assigned to each line, for the latest set of sharers."""
 
     def __init__(self) -> None:
         self.wanted: dict[str, str] = {}  # each line's gateway
@@ -101,19 +104,19 @@ class Shares:
         self._seen_at = 0
 
     def begin_anew(self) -> None:
-        """Make them the next time, whatever was made: a session begins."""
+        """Force a new assignment: a new session started."""
         self._made = None
 
     def see(self, others: frozenset[str], now: int) -> None:
-        """Note the other gateways that are there."""
+        """Note the other gateways that are present."""
         if others != self._others:
             self._others, self._seen_at = others, now
 
     async def make(self, sharers: Sharers, now: int, *, is_settled: bool) -> bool:
-        """Share the lines out, where that was not done; return True where it was now.
+        """Assign the lines to gateways if anything changed; return True if they were assigned now.
 
-        It is done in a thread, for it takes long. Until we are settled more gateways may be about to come, as
-        in a cold start, and are waited for: else the first one would read the records of all lines.
+        The work is done in a thread because it takes long. Until we are settled, wait for further gateways,
+        as in a cold start. Otherwise the first gateway would read the records of all lines.
         """
         is_early = not is_settled and now - self._seen_at < QUIET_NS
         if sharers == self._made or is_early:
@@ -125,5 +128,5 @@ class Shares:
         return True
 
     def of(self, gateway: str) -> set[str]:
-        """Return the lines that this gateway should have."""
+        """Return the lines assigned to this gateway."""
         return {line for line, name in self.wanted.items() if name == gateway}

@@ -1,9 +1,9 @@
-"""Unopened lines: those whose port this gateway could not open, so that others may try. Pure.
+"""Unopened lines: lines whose port this gateway cannot open, so that others may try. Pure.
 
-A gateway that is cut off from a line, and not from NATS, names it in its lease after some failures. The line
-then goes to a gateway that has not named it. It comes back by trials, one line at a time and ever more
-rarely: during a failed trial nobody polls the line. A line that all gateways have named is polled by nobody
-anyway, so trials of it do not become rarer.
+A gateway that is cut off from a line, but not from the servers, reports the line in its lease after some
+failures. The line then goes to a gateway that has not reported it. It comes back by trials, one line at a
+time and less and less often, because the line is not polled during a failed trial. Trials of a line that all
+gateways have reported do not become rarer, because no one polls it anyway.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from collections.abc import Callable
 
 from multidrop.fleet.leases.rules import SECOND
 
-OPENINGS = 3  # that failed, before a line is named
-LOST_NS = 6 * SECOND  # from the last reply on a line whose port is lost, before it is named
+OPENINGS = 3  # failed ones, before a line is reported
+LOST_NS = 6 * SECOND  # from the last reply on a line whose port is lost, before the line is reported
 REPLY_NS = 3 * SECOND  # an older reply says nothing about when the port was lost
-FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # before a trial
-TRIAL_NS = 60 * SECOND  # after which a line that did not come back is tried no more
-MOST_BYTES = 8_000  # of names in a lease's record
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # until a trial
+TRIAL_NS = 60 * SECOND  # after which the trial of a line that did not come back ends
+MOST_BYTES = 8_000  # of line names in a lease record
 
 
 class UnopenedLines:
-    """The lines that others should take, by the openings that failed; times are of `clock`, in ns.
+    """The lines that others should take. Times are of `clock`, in ns.
 
-    No more are named than fit into a lease's record: the others are tried here again and again.
+    No more lines are reported than fit into a lease record; the others are retried here.
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
-        self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have named
+        self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have reported
         self.home: frozenset[str] | None = None  # lines that the balance gives this gateway; None: unknown
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
-        self._named: dict[str, None] = {}  # in the order in which they are tried
+        self._named: dict[str, None] = {}  # reported, in order of trial
         self._wait_ns = FIRST_WAIT_NS
         self._trial_at = 0
         self._tried = ""
@@ -47,8 +47,9 @@ class UnopenedLines:
     def lost(self, line: str, silent_ns: int | None = None) -> None:
         """Note that the port of a polled line is lost. The newest reply on the line is `silent_ns` old.
 
-        The time counts from that reply: a network that drops everything lets no write fail for a second, and
-        lets an attempt to connect hang for several. None, or an old reply: it counts from the first call.
+        The time counts from that reply, because a network that drops everything delays both the failure of a
+        write and that of a connection attempt by seconds. If `silent_ns` is None or large, it counts from the
+        first call.
         """
         now = self._clock()
         since = now - silent_ns if silent_ns is not None and silent_ns <= REPLY_NS else now
@@ -60,18 +61,18 @@ class UnopenedLines:
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
         self._named.pop(line, None)
-        if line == self._tried:  # the way to the lines is there again: the others are tried without a wait
+        if line == self._tried:  # the network is back: try the others at once
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                del self._named[other]  # it stays where it is: a trial would bring no proof
+                del self._named[other]  # not of this gateway's share: a trial would not bring it back
 
     def gone(self, line: str) -> None:
-        """Note that the line is another gateway's: what counted towards naming it is over."""
+        """Note that the line is no longer ours: forget its failures."""
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
 
     def named(self) -> frozenset[str]:
-        """Return the lines that others should take; ask often, for trials begin here."""
+        """Return the lines that others should take. Call it often: it also starts trials."""
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:
             self._tried = ""

@@ -1,8 +1,9 @@
-"""Forwarder: a spool's messages into the stream, in order, each once.
+"""Forwarder: sends a spool's messages into the stream, in order, each once.
 
-One message is under way at a time, and says which place the last of its subject must have: the stream takes
-it there or not at all. After any doubt (start, time-out, refusal) the stream is asked for the last of the
-subject, and it goes on behind that. There is no offset file, and no window of time that duplicates outlive.
+One message is in flight at a time. It names the position that the last message of its subject must have, and
+the stream takes it there or not at all. After any doubt (start, timeout, refusal) ask the stream for the last
+message, and continue after it. There is no offset file, and no time window after which duplicates could
+appear.
 """
 
 from __future__ import annotations
@@ -30,26 +31,26 @@ from multidrop.fleet.samples.samples_stream import (
 )
 from multidrop.fleet.samples.spool import Spool, StoredMessage
 
-AGAIN_S = 0.25  # between attempts at a stream that failed
-LOOKING_S = 1.0  # for a message that nobody announced
+AGAIN_S = 0.25  # between attempts after a failure
+LOOKING_S = 1.0  # between checks for an unannounced message
 SET_BACK = (
-    "the stream has message {} of the log {}, and the spool has {}: its folder was copied or set back; "
-    "move it away, and a new log begins"
+    "the servers have message {} of the log {}, and the spool has {}: its folder was copied or set back; "
+    "move it away to start a new log"
 )
 
 _log = logging.getLogger("multidrop.fleet.samples.forwarder")
 
 
 class ForwarderState(NamedTuple):
-    """Messages that were sent since the start, the last sequence in the stream, and what is wrong now."""
+    """Messages sent since the start, the last sequence in the stream, and the present problem."""
 
     sent: int
-    last: int | None  # None: the stream was not asked yet
+    last: int | None  # None: not asked yet
     trouble: str | None
 
 
 class NotOurLog(Exception):
-    """The stream has another message under a number of this log: the folder was copied, or set back."""
+    """The stream has a different message under a number of this log: the folder was copied, or set back."""
 
 
 class Forwarder:
@@ -67,25 +68,25 @@ class Forwarder:
         return ForwarderState(self._sent, self._last, self._trouble)
 
     def lag_s(self) -> float | None:
-        """Return the age (s, by the system's clock) of the oldest message that the stream has not got.
+        """Return the age (s, by the system's clock) of the oldest message that the stream lacks.
 
-        0 where it has all; None where it was not asked yet, or the message is gone.
+        Return 0 if it lacks none, None if it was not asked yet or the message was removed.
         """
         if self._last is None:
             return None
         stored = self._spool.following(self._last)
         if stored is None:
             return 0.0
-        with suppress(OSError):  # removed just now
+        with suppress(OSError):  # just removed
             return max(0.0, time.time() - stored.path.stat().st_mtime)
         return None
 
     async def run(self) -> None:
-        """Forward until cancelled; whatever goes wrong is told once, and tried again."""
+        """Forward until cancelled. Each failure is logged once and retried."""
         loop = asyncio.get_running_loop()
 
         def announce() -> None:
-            with suppress(RuntimeError):  # the loop is over
+            with suppress(RuntimeError):  # the loop is closed
                 loop.call_soon_threadsafe(self._news.set)
 
         self._spool.on_message = announce
@@ -94,12 +95,12 @@ class Forwarder:
                 await self._forward()
             except (StreamError, NotOurLog, OSError) as failure:
                 self._note(str(failure))
-            except Exception as failure:  # a mistake of ours, or a want of memory
+            except Exception as failure:  # a bug here, or no memory
                 self._note(f"{type(failure).__name__}: {failure}", failure)
             await asyncio.sleep(AGAIN_S)
 
     async def _forward(self) -> None:
-        """Ask where the stream is, and send what is behind that, until there is a doubt."""
+        """Ask for the stream's position, and send the messages after it until there is a doubt."""
         place, sequence = await self._ask()
         while True:
             self._news.clear()
@@ -111,11 +112,11 @@ class Forwarder:
                 end_if_cancelled()
                 continue
             data = await asyncio.to_thread(_read, stored.path)
-            if data is None:  # removed meanwhile: the spool is full
+            if data is None:  # just removed: the spool is full
                 continue
             found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
             end_if_cancelled()
-            if found is None:  # an earlier attempt of ours came through
+            if found is None:  # an earlier attempt of ours succeeded
                 return
             place, sequence = found, stored.sequence
             self._sent += 1
@@ -123,10 +124,10 @@ class Forwarder:
             self._note(None)
 
     async def _ask(self) -> tuple[int, int]:
-        """Return the place and the sequence of the last message that the stream has of this log."""
+        """Return position and sequence of the last message of this log in the stream."""
         last = await last_of(self._client, self._subject)
         end_if_cancelled()
-        if last is None or last.sequence == 0:  # the stream keeps no message for ever, and others' are none
+        if last is None or last.sequence == 0:  # the stream drops old messages, and ignores forged ones
             sequence = self._last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence

@@ -1,7 +1,7 @@
-"""Hub: reads the stream into a sink, which keeps the last message's place in the same commit as the rows.
+"""Hub: reads the stream into a sink, which stores the last message's position in the same commit as the rows.
 
-There is no consumer, and nothing is acknowledged to NATS: after any doubt the sink says where it is, and the
-stream is read on from there.
+There is no consumer and no acknowledgement to NATS. After any doubt ask the sink for its position, and read
+the stream from there.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 class SourceCheck:
-    """The last sequence of each log; alarms are logged as errors and counted."""
+    """Checks that no message of a log is missing or repeated; alarms are logged as errors and counted."""
 
     def __init__(self, last: Mapping[str, int]) -> None:
         self.last = dict(last)  # by "gateway.log id"
         self.alarms = 0
         self.missing = 0  # messages
-        self.doubled = 0  # messages that were left out
-        self._lost: dict[str, int] = {}  # rows, by what each gateway says of itself
+        self.doubled = 0  # repeated messages, ignored
+        self._lost: dict[str, int] = {}  # rows, as each gateway reports
 
     def take(self, message: StreamMessage) -> bool:
-        """Return True for a message that is to be kept; one that was there already is left out."""
+        """Return True if the message is new and must be kept."""
         name = f"{message.gateway}.{message.log}"
         if message.sequence == 0:
-            self.alarm(f"message {message.place} of the stream, by {name}, has no number and is left out")
+            self.alarm(f"message {message.place} of the stream, by {name}, has no number and is ignored")
             return False
         before = self.last.get(name, 0)
         if message.sequence <= before:
             self.doubled += 1
-            self.alarm(f"{name}: message {message.sequence} came again behind {before} and is left out")
+            self.alarm(f"{name}: message {message.sequence} came again after {before} and is ignored")
             return False
         if message.sequence > before + 1:
             self.missing += message.sequence - before - 1
             self.alarm(f"{name}: messages {before + 1} to {message.sequence - 1} are missing")
         if message.lost > self._lost.get(name, 0):
-            self.alarm(f"{name}: its spool has lost {message.lost} rows since it began")
+            self.alarm(f"{name}: its spool has lost {message.lost} rows since its start")
         self._lost[name] = message.lost
         self.last[name] = message.sequence
         return True
 
     def alarm(self, sentence: str) -> None:
-        """Log and count something that must never happen."""
+        """Log and count an event that must never happen."""
         self.alarms += 1
         _log.error("%s", sentence)
 
@@ -65,55 +65,55 @@ class SourceCheck:
 MOST_READ = 64  # messages in one answer
 MOST_READ_BYTES = 8 << 20
 MOST_ROWS = 1_000_000  # of one commit: 50 MB
-MOST_BYTES = 256 << 20  # of one commit, as they came and as rows; those of one answer come on top
-LOOKING_S = 0.2  # between questions to a stream that has nothing new
+MOST_BYTES = 256 << 20  # of one commit: messages and rows; one answer may exceed it
+LOOKING_S = 0.2  # between reads if there is nothing new
 AGAIN_S = 1.0  # after a failure
-BEHIND_S = 5.0  # for a server that answers, and has not yet all that its leader has
+BEHIND_S = 5.0  # for a server that still lacks messages that its leader has
 
 T = TypeVar("T")
 
 
 class SinkError(OSError):
-    """A sink that cannot be written now, or is not this hub's. One sentence."""
+    """A sink that cannot be written now, or belongs to another hub. One sentence."""
 
 
 class NotThisHubs(SinkError):
-    """A sink of another stream, or of another hub: trying again is of no use."""
+    """A sink of another stream or of another hub: a retry is useless."""
 
 
 class KeptPlace(NamedTuple):
-    """The place of the last message that a sink has, and the last sequence of each log."""
+    """The position of the last stored message, and the last sequence of each log."""
 
     place: int
     sources: Mapping[str, int]
 
 
 class Commit(NamedTuple):
-    """Rows that a sink takes with their place, or not at all."""
+    """Rows to store together with their position, or not at all."""
 
-    stream: str  # its identity
-    first: int  # places in the stream
+    stream: str  # identity of the stream
+    first: int  # positions in the stream
     last: int
     sources: Mapping[str, int]
-    tables: Sequence[Any]  # pyarrow.Table of message.ROWS: none, or some, without rows or with
+    tables: Sequence[Any]  # pyarrow.Table of message.ROWS; may be empty
     rows: int
 
 
 class SampleSink(Protocol):
-    """A store of rows. Methods run on a thread that waits; they raise SinkError."""
+    """A store of rows. Its methods run in a thread and raise SinkError."""
 
     def begin(self, stream: str) -> KeptPlace:
-        """Return what is kept of this stream: at the start, and after each failure."""
+        """Return the stored position of this stream; called at the start and after each failure."""
 
     def write(self, commit: Commit) -> None:
-        """Keep all of it, or nothing."""
+        """Store all of it, or nothing."""
 
     def close(self) -> None:
-        """Let go of what is open."""
+        """Release open resources."""
 
 
 async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
-    """Return act(*arguments), called on a thread. A cancelled caller waits for it too, to close a sink."""
+    """Return act(*arguments), called in a thread. A cancelled caller waits for it too."""
     done = asyncio.ensure_future(asyncio.to_thread(act, *arguments))
     try:
         return await asyncio.shield(done)
@@ -123,19 +123,19 @@ async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
 
 
 class HubState(NamedTuple):
-    """Places in the stream, counts since the start, and what is wrong now, or None."""
+    """Positions in the stream, counts since the start, and the present problem or None."""
 
-    place: int  # of the last message that is kept
-    behind: int  # messages in the stream that are not
+    place: int  # of the last stored message
+    behind: int  # messages in the stream that are not stored
     rows: int
     alarms: int
     missing: int  # messages
-    doubled: int  # messages that were left out
+    doubled: int  # repeated messages, ignored
     trouble: str | None
 
 
 class SampleHub:
-    """Reads a stream into a sink: a commit each `every` s or million rows."""
+    """Reads a stream into a sink, with one commit each `every` seconds or million rows."""
 
     def __init__(self, client: BatchClient, sink: SampleSink, *, every: float = 10.0) -> None:
         self._client, self._sink, self._every = client, sink, every
@@ -149,9 +149,9 @@ class SampleHub:
         return HubState(self._place, max(0, self._end - self._place), *counts, self._trouble)
 
     async def run(self, *, once: bool = False) -> None:
-        """Read until cancelled, or until all is kept that the stream has now.
+        """Read until cancelled, or with `once` until all present messages are stored.
 
-        A stream or a sink that fails is told, and tried again each second. Raises NotThisHubs.
+        A failure of the stream or sink is logged and retried each second. Raises NotThisHubs.
         """
         while True:
             try:
@@ -174,7 +174,7 @@ class SampleHub:
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
-        self._end = found.last if found.first <= found.last else kept.place  # else it was emptied
+        self._end = found.last if found.first <= found.last else kept.place  # otherwise it was emptied
         self._sources.last = dict(kept.sources)
         self._check_end(found)
         if found.first > kept.place + 1 and found.last > kept.place:
@@ -184,12 +184,12 @@ class SampleHub:
     def _check_end(self, found: StreamAbout) -> None:
         if found.last < self._place:
             raise NotThisHubs(
-                f"the stream ends at message {found.last}, and {self._place} are kept: it lost some; "
-                "begin a new folder or database"
+                f"the stream ends at message {found.last}, and {self._place} are stored: it lost some; "
+                "use a new folder or database"
             )
 
     async def _commit(self, once: bool) -> bool:
-        """Gather messages and keep them; True where all is kept that the stream had when it was asked for."""
+        """Collect messages and store them; True if nothing is left of what the stream had when asked."""
         messages: list[StreamMessage] = []
         tables: list[Any] = []
         rows, size, ends = 0, 0, None
@@ -204,7 +204,7 @@ class SampleHub:
                     is_end = True
                     break
                 if once and not messages and time.monotonic() > patient_until:
-                    raise StreamError(f"messages {place + 1} to {self._end} of the stream are not given now")
+                    raise StreamError(f"messages {place + 1} to {self._end} of the stream cannot be read now")
                 await asyncio.sleep(LOOKING_S)
                 if not messages:
                     self._check_end(await about(self._client))
@@ -227,7 +227,7 @@ class SampleHub:
         return is_end
 
     def _tables(self, messages: Sequence[StreamMessage]) -> list[Any]:
-        """Return the rows of the messages that are to be kept."""
+        """Return the rows of the messages to store."""
         found = []
         for message in messages:
             if self._sources.take(message):
@@ -235,12 +235,12 @@ class SampleHub:
                     found.append(unpack(message.data))
                 except MessageError as error:
                     name = f"{message.gateway}.{message.log}"
-                    self._sources.alarm(f"{name}: message {message.sequence} is left out: {error}")
+                    self._sources.alarm(f"{name}: message {message.sequence} is ignored: {error}")
         return found
 
     def _note(self, trouble: str | None) -> None:
         if trouble and trouble != self._trouble:
-            _log.error("nothing is kept: %s", trouble)
+            _log.error("samples are not stored: %s", trouble)
         if self._trouble and not trouble:
-            _log.warning("samples are kept again, behind message %d", self._place)
+            _log.warning("samples are stored again, after message %d", self._place)
         self._trouble = trouble

@@ -9,19 +9,23 @@
 | `register`       | dictionary of utf8              | the register's name                                   |
 | `value`          | float64, null for a miss        | in `unit`                                             |
 | `status`         | dictionary of utf8              | `ok`, or why there is no value                        |
-| `unit`           | dictionary of utf8, or null     | see below; null where nobody knows it                 |
+| `unit`           | dictionary of utf8, or null     | see below; null if unknown                            |
 
-Rows are ordered by register, and for one register as they were polled: values that are alike lie side by
-side, and a time that ten registers share costs little more than one. Buffers are compressed by zstd-1;
-dictionaries hold the names of these rows alone. An uncertainty is rounded up to whole microseconds: the bound
-stays true, and its last ten bits are noise.
+Rows are ordered by register, and by time within a register. So similar values are adjacent, and a time that
+ten registers share costs little more than one. Buffers are compressed with zstd-1; dictionaries hold only the
+names in these rows. An uncertainty is rounded up to whole microseconds: the bound stays true, and its last
+ten bits are noise.
 
-A unit is that of the description under which the row was polled: "" for a number without one, "raw count" for
-one whose step is not known, "names of yd1000" where numbers stand for this family's names. Older messages
-have no such column.
+The unit comes from the description under which the row was polled: "" for a number without a unit, "raw
+count" if the step is unknown, "names of yd1000" if numbers stand for this family's names. Older messages have
+no such column.
 
-Whoever has a gateway's key may send other bytes as a message: none is unpacked that says of itself that it is
-larger than 4 MiB then, or that has columns of other types, which may grow when they are cast.
+Any holder of a gateway's key may send other bytes as a message. A message that declares an unpacked size
+above 4 MiB is rejected before it is unpacked, and so are columns of other types, which may grow in a cast.
+
+A compressed buffer starts with its unpacked size, and pyarrow allocates that much before it checks the rest.
+So the sizes are read first, from the flatbuffers described in Message.fbs of Arrow's format. A table there
+starts with the distance back to a list of its fields' offsets; 0 is a missing field.
 """
 
 from __future__ import annotations
@@ -38,16 +42,16 @@ import pyarrow.compute as pc
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.polling import BatchColumns
 
-LATEST = 4  # MetadataVersion.V5: older ones have other ways to say that buffers are compressed
+LATEST = 4  # MetadataVersion.V5: older ones mark compressed buffers differently
 MOST_MESSAGES = 100  # of a stream: the schema, dictionaries and rows
 _DICTIONARY, _RECORD_BATCH = 2, 3  # MessageHeader
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
-_BUFFER = Struct("<qq")  # its place in the body, and its length there
-_NOT_COMPRESSED = -1  # declared of one that would not get smaller
+_BUFFER = Struct("<qq")  # offset in the body, and length
+_NOT_COMPRESSED = -1  # marks a buffer that compression would not shrink
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
-    """Return the size of all buffers together. Raises ValueError or pa.ArrowException for what has none."""
+    """Return the total size of all buffers. Raises ValueError or pa.ArrowException for an invalid stream."""
     size = 0
     for number, message in enumerate(pa.ipc.MessageReader.open_stream(data)):
         if number == MOST_MESSAGES:
@@ -55,14 +59,14 @@ def unpacked_size(data: bytes | memoryview) -> int:
         try:
             size += _size(memoryview(message.metadata), memoryview(message.body or b""))
         except struct_error:
-            raise ValueError("it ends within what it says of itself") from None
+            raise ValueError("it is truncated") from None
     return size
 
 
 def _size(metadata: memoryview, body: memoryview) -> int:
     message = _Table(metadata, _U32.unpack_from(metadata)[0])
     if message.number(0, _U16) != LATEST:
-        raise ValueError("it is in another version of the format")
+        raise ValueError("another version of the format")
     kind = message.number(1, _I8)
     rows = message.table(2)
     if kind == _DICTIONARY and rows:
@@ -91,7 +95,7 @@ class _Table:
         self._length: int = _U16.unpack_from(data, self._fields)[0]
 
     def _field(self, number: int) -> int:
-        """Return the place of a field, 0 for one that is not there."""
+        """Return the offset of a field, 0 if it is missing."""
         entry = 4 + 2 * number
         offset = _U16.unpack_from(self._data, self._fields + entry)[0] if entry < self._length else 0
         return self._place + offset if offset else 0
@@ -105,7 +109,7 @@ class _Table:
         return _Table(self._data, place + _U32.unpack_from(self._data, place)[0]) if place else None
 
     def pairs(self, number: int) -> Any:
-        """Return a list of pairs of numbers."""
+        """Return a vector of pairs of numbers."""
         place = self._field(number)
         if not place:
             return ()
@@ -118,13 +122,13 @@ class _Table:
 MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
 MOST_ROWS = 1 << 16
 MOST_UNPACKED = 4 << 20  # bytes: 2.4 MB of rows, and names
-MOST_NAME = 1000  # bytes of a name, a status or a unit; PostgreSQL has an index of names
-MOST_SAID = 300  # characters of what is wrong with a message
+MOST_NAME = 1000  # bytes of a name, status or unit; PostgreSQL indexes names
+MOST_SAID = 300  # characters of an error about a message
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-NAMED = pa.dictionary(pa.int32(), pa.utf8())  # of many messages together: more names than one has
+NAMED = pa.dictionary(pa.int32(), pa.utf8())  # for many messages together
 TIMES = pa.timestamp("ns", "UTC")
-ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
+ROWS = pa.schema(  # as `unpack` returns them, and as in recordings
     [
         pa.field("time", TIMES, nullable=False),
         pa.field("monotonic_ns", pa.int64(), nullable=False),
@@ -136,7 +140,7 @@ ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
         pa.field("unit", NAMED),
     ]
 )
-_TYPES: Mapping[str, Sequence[Any]] = {  # of what a message may have; names are dictionaries of utf8
+_TYPES: Mapping[str, Sequence[Any]] = {  # of a message's columns; names are dictionaries of utf8
     "time": [TIMES],
     "clock_ns": [pa.int64()],
     "uncertainty_us": [pa.int32(), pa.int64()],
@@ -147,7 +151,7 @@ _KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(),
 
 
 class MessageError(ValueError):
-    """Bytes that are no message."""
+    """Bytes that are not a message."""
 
 
 class Packed(NamedTuple):
@@ -158,7 +162,7 @@ class Packed(NamedTuple):
 
 
 class RowBuffer:
-    """Rows of many batches of one poller, copied: its memory is free again at once."""
+    """Copies of the rows of many batches of one poller, so the batches' memory can be reused."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -166,7 +170,7 @@ class RowBuffer:
         self._columns = {name: bytearray() for name in _KINDS}
 
     def add(self, columns: BatchColumns) -> bool:
-        """Copy the rows; False for those of another poller, whose codes stand for other names."""
+        """Copy the rows; False if they are of another poller, whose codes have other meanings."""
         names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
         if any(not _continues(names[of], known) for of, known in self._names.items()):
             return False
@@ -202,7 +206,7 @@ class RowBuffer:
 def _units(
     column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: PolledUnits
 ) -> tuple[Any, Sequence[str]]:
-    """Return the code of each row's unit, and the units."""
+    """Return each row's unit code, and the units."""
     table = units.table(names["drive"], names["register"])
     registers = pa.scalar(len(names["register"]), pa.uint32())
     series = pc.add(pc.multiply(column["drive"].cast(pa.uint32()), registers), column["register"])
@@ -235,25 +239,25 @@ def unpack(data: bytes | memoryview) -> Any:
         _check(rows)
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:
         first = (str(error) or type(error).__name__).splitlines()[0][:MOST_SAID]
-        raise MessageError(f"{len(data)} bytes are no message of samples: {first}") from error
+        raise MessageError(f"{len(data)} bytes are not a message of samples: {first}") from error
     return rows
 
 
 def _table(data: bytes | memoryview) -> Any:
-    """Return what is in a stream of ours. Raises ValueError before anything is unpacked that is none."""
+    """Read a stream of ours. Raises ValueError for any other before it is unpacked."""
     size = unpacked_size(data)
     if size > MOST_UNPACKED:
-        raise ValueError(f"it is {size} bytes when unpacked, and {MOST_UNPACKED} are the most")
+        raise ValueError(f"{size} bytes unpacked; the limit is {MOST_UNPACKED}")
     with pa.ipc.open_stream(data) as reader:
         for field in reader.schema:
             if not _is_ours(field):
-                raise ValueError(f"its {field.name} is of another type")
+                raise ValueError(f"its {field.name} has another type")
         batches = []
         rows = 0
         for batch in reader:
             rows += len(batch)
             if rows > MOST_ROWS:
-                raise ValueError(f"it has {rows} rows, and {MOST_ROWS} are the most")
+                raise ValueError(f"{rows} rows; the limit is {MOST_ROWS}")
             batches.append(batch)
         return pa.Table.from_batches(batches, reader.schema)
 
@@ -265,7 +269,7 @@ def _is_ours(field: Any) -> bool:
 
 
 def _check(rows: Any) -> None:
-    """Raise ValueError for rows that no sink takes: all that is behind such a message would never be kept."""
+    """Raise ValueError for rows that no sink accepts: such a message would block all later ones."""
     for field, column in zip(rows.schema, rows.columns, strict=True):
         if not field.nullable and column.null_count:
             raise ValueError(f"its {field.name} is missing in some rows")

@@ -1,13 +1,13 @@
 """Samples as Parquet files, which are a history: `History(folder)` and DuckDB read them.
 
-| in the folder                           | what it holds                                             |
+| in the folder                           | content                                                   |
 |-----------------------------------------|-----------------------------------------------------------|
 | `rows/FIRST-LAST.BEGIN-END.parquet`     | all rows of these messages of the stream, by drive, time  |
 | `tens/FIRST-LAST.BEGIN-END.parquet`     | of these messages, ten seconds of a register in each row  |
-| `.hub.lock`                             | held by the process that writes here                      |
+| `.hub.lock`                             | locked by the process that writes here                    |
 
-A file has its name once it is whole and on the disk: that is the commit, of its rows and of LAST. The newest
-file says what each source's last message was, and must stay. BEGIN and END are UTC and enclose all times.
+A file gets its name once it is complete and on the disk: that commits its rows and LAST. The newest file
+holds the last message of each source, and must stay. BEGIN and END are UTC and enclose all times.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from multidrop.fleet.file_lock import lock
 from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
 from multidrop.fleet.samples.message import ROWS
 
-KEY = "multidrop"  # of the files' metadata, as of all recordings
+KEY = "multidrop"  # of the files' metadata, as in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"
-WRITTEN = {  # names are dictionaries already, and plain texts for who reads them
+WRITTEN = {  # names are dictionary-encoded, and plain texts for readers
     "compression": "zstd",
     "compression_level": 1,
     "store_schema": False,
@@ -47,7 +47,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class ParquetSink:
-    """Writes each commit as a file. Raises SinkError for a folder that cannot be written, or is another's."""
+    """Writes each commit as a file. Raises SinkError if the folder cannot be written or is another hub's."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
@@ -68,7 +68,7 @@ class ParquetSink:
         if others:
             self.close()
             raise NotThisHubs(
-                f"{self.folder} is no folder of a hub: it holds {others[0]!r}; name an empty one"
+                f"{self.folder} is not a hub's folder: it holds {others[0]!r}; name an empty one"
             )
 
     def close(self) -> None:
@@ -77,7 +77,7 @@ class ParquetSink:
             self._lock = -1
 
     def begin(self, stream: str) -> KeptPlace:
-        """Return what the newest file says."""
+        """Return the position in the newest file."""
         try:
             for part in self._rows.glob(".*.writing"):
                 part.unlink()
@@ -92,8 +92,8 @@ class ParquetSink:
             raise NotThisHubs(f"{path} was not written by a hub: name an empty folder")
         if found.get("stream") != stream:
             raise NotThisHubs(
-                f"{self.folder} holds samples of a stream that was made at {found.get('stream')}, "
-                f"and this one was made at {stream}: name another folder"
+                f"{self.folder} holds samples of a stream created at {found.get('stream')}, "
+                f"and this one was created at {stream}: name another folder"
             )
         return KeptPlace(last, {str(name): int(number) for name, number in found["sources"].items()})
 
@@ -102,7 +102,7 @@ class ParquetSink:
         return [(int(match[2]), path) for match, path in found if match]
 
     def write(self, commit: Commit) -> None:
-        """Write the rows into a file, which has its name once all of it is on the disk."""
+        """Write the rows into a file, which gets its name once it is on the disk."""
         table = _joined(commit)
         path = self._rows / _name(commit, table)
         part = path.with_name(f".{path.name}.writing")
@@ -129,7 +129,7 @@ def _joined(commit: Commit) -> Any:
     drives = table.column("drive").chunk(0)
     ranks = pc.rank(drives.dictionary).cast(pa.int32()).take(drives.indices)
     by_time = pc.array_sort_indices(table.column("time").chunk(0).cast(pa.int64()))
-    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # the second is stable
+    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # the second sort is stable
 
 
 def _about(commit: Commit) -> dict[str, Any]:
@@ -168,17 +168,20 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
-    """Merge the files of hours that are over, and make tens for plots, until cancelled. Needs duckdb."""
+    """Merge the files of past hours, and create tens for plots, until cancelled. Needs duckdb.
+
+    The work is done by a child process of low priority, which may be killed at any time.
+    """
     if importlib.util.find_spec("duckdb") is None:
-        _log.warning("files are not merged: that needs duckdb, pip install 'multidrop[history]'")
+        _log.warning("files are not merged: install duckdb with pip install 'multidrop[history]'")
         await asyncio.Event().wait()
     words = ["-m", "multidrop.history.compact", str(folder), "--below", "0", "--merge-rows"]
     while True:
         await asyncio.sleep(every)
         try:
             await _compact(words)
-        except Exception as failure:  # such as of a system without a process left: it is tried again
-            _log.error("files are not merged now", exc_info=failure)
+        except Exception as failure:  # such as no process left: retry
+            _log.error("merging files failed; retrying", exc_info=failure)
 
 
 async def _compact(words: Sequence[str]) -> None:
@@ -197,4 +200,4 @@ async def _compact(words: Sequence[str]) -> None:
         raise
     if child.returncode:
         last = said.decode("utf-8", "replace").strip().splitlines()[-1:]
-        _log.error("compaction ended with %d: %s", child.returncode, *(last or ["no word"]))
+        _log.error("compaction ended with %d: %s", child.returncode, *(last or ["no message"]))

@@ -1,4 +1,4 @@
-"""Polled units: what the values of a gateway's rows are, by the description that they were polled under."""
+"""Polled units: the units of a gateway's rows, by the description under which they were polled."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from multidrop import Drive, PlantLine, Register
 
-RAW = "raw count"  # as a history calls it
+RAW = "raw count"  # as in a history
 
 
 class Change(NamedTuple):
@@ -22,15 +22,15 @@ class Change(NamedTuple):
 
 
 class UnitTable(NamedTuple):
-    """Codes of units by series, which are numbered drive * len(registers) + register."""
+    """Unit codes by series; series are numbered drive * len(registers) + register."""
 
-    newest: Any  # pa.Array; null where nobody knows it
-    changes: Sequence[Change]  # the last ones first
+    newest: Any  # pa.Array; null if unknown
+    changes: Sequence[Change]  # latest first
     texts: Sequence[str]  # by code
 
 
 class PolledUnits:
-    """The unit of each register, since when. Any thread may note a line or ask."""
+    """The unit of each register, and since when. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -38,7 +38,7 @@ class PolledUnits:
         self._made: tuple[Sequence[str], Sequence[str], UnitTable] | None = None
 
     def note(self, line: PlantLine, since_ns: int) -> None:
-        """Note that rows of this line which are asked from now on are of these units."""
+        """Note the units of rows of this line that are requested from now on."""
         with self._lock:
             for polled in line.drives:
                 for poll in polled.polls:
@@ -49,10 +49,10 @@ class PolledUnits:
             self._made = None
 
     def table(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
-        """Return the units of these drives' registers; made anew where lines or names have changed.
+        """Return the units of these drives' registers. The table is rebuilt after changes of lines or names.
 
-        Messages have nearly as many series as rows, so that a look at each series would cost more than all
-        else that is done with a row.
+        Messages have nearly as many series as rows, so a lookup per series would cost more than all other
+        work on a row.
         """
         with self._lock:
             if self._made is None or self._made[:2] != (drives, registers):
@@ -76,7 +76,7 @@ class PolledUnits:
 
 
 def unit_of(drive: Drive, register: Register[Any]) -> str:
-    """Return a unit; "" is a number without one, and "names of yd1000" are that family's names."""
+    """Return a unit; "" is a number without one, "names of yd1000" are that family's names."""
     if register.values:
         return f"names of {drive.model or type(drive).__name__}"
     return RAW if register.step is None else register.unit

@@ -1,17 +1,20 @@
-"""Samples in PostgreSQL: a row an exchange, with an array of its values.
+"""Samples in PostgreSQL: one row per exchange, with an array of its values.
 
-| table or view             | what it holds                                                             |
+| table or view             | content                                                                   |
 |---------------------------|---------------------------------------------------------------------------|
 | `multidrop.samples`       | view: time, time_ns, uncertainty_us, drive, register, value, status, unit |
-| `multidrop.exchanges`     | a row an exchange: its values, and `misses`, null where all is ok         |
-| `multidrop.families`        | id and name                                                               |
+| `multidrop.exchanges`     | one row per exchange: its values, and `misses`, null if all are ok        |
+| `multidrop.families`      | id and name                                                               |
 | `multidrop.register_sets` | id, names and units, in the order of the values                           |
-| `multidrop.hub`           | one row: the stream, the place of its last message here, the sources      |
+| `multidrop.hub`           | one row: the stream, the position of its last message here, the sources   |
 
-A row for each value would take four and a half times the disk. Rows come by COPY, in the transaction that
-moves the place on from where this hub left it. Where another hub has moved it, the transaction is refused.
-One hub at a time writes, and others wait for its end.
-A timestamptz has microseconds; `time_ns` is exact. The drive's monotonic clock is not kept.
+A row per value would take four and a half times the disk space. Rows are inserted by COPY, in the transaction
+that advances the position. If another hub has moved the position, the transaction is refused. One hub writes
+at a time, and others wait until it ends. A timestamptz has microseconds; `time_ns` is exact. The drive's
+monotonic clock is not stored.
+
+COPY has the format of the manual's section "COPY, Binary Format". An array is its number of dimensions, a
+flag for nulls, its elements' type, a size, a lower bound, and the elements, each after its length.
 """
 
 from __future__ import annotations
@@ -31,31 +34,31 @@ from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkErro
 
 HEAD = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 END = b"\xff\xff"
-EPOCH_US = 946_684_800_000_000  # 2000-01-01, from which PostgreSQL counts
-FLOAT8, TEXT = 701, 25  # their oids
+EPOCH_US = 946_684_800_000_000  # 2000-01-01, the epoch of PostgreSQL
+FLOAT8, TEXT = 701, 25  # oids
 NULL = b"\xff\xff\xff\xff"
 PIECE = 1 << 18  # bytes, about
-_FIRST = Struct(">hiqiq")  # columns, and a time of 8 bytes, twice
+_FIRST = Struct(">hiqiq")  # number of columns, and twice a time of 8 bytes
 _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
 
 
 class RegisterSet(NamedTuple):
-    """The registers that were asked at once, and what the value of each is; None where nobody knows it."""
+    """The registers of one request, and their units; None if unknown."""
 
     names: tuple[str, ...]
     units: tuple[str | None, ...]
 
 
 class ExchangeRow(NamedTuple):
-    """Rows of one drive that were asked at one time."""
+    """Rows of one drive that were requested together."""
 
     time_ns: int
     uncertainty_ns: int | None
     drive: str
     asked: RegisterSet
     values: list[float | None]
-    misses: list[str] | None  # None where all is ok; else "ok" or the reason
+    misses: list[str] | None  # None if all are ok, otherwise "ok" or the reason
 
 
 class ExchangeRows(NamedTuple):
@@ -67,7 +70,7 @@ class ExchangeRows(NamedTuple):
 
 
 def exchanges_of(table: Any) -> ExchangeRows:
-    """Return the exchanges of a table of `message.ROWS`, in order of time and drive."""
+    """Return the exchanges in a table of `message.ROWS`, in order of time and drive."""
     table = table.combine_chunks()
     if not len(table):
         return ExchangeRows([], frozenset(), frozenset())
@@ -95,8 +98,9 @@ def exchanges_of(table: Any) -> ExchangeRows:
                 tuple(texts["register"][code] for code in key[0]),
                 tuple(None if code is None else texts["unit"][code] for code in key[1]),
             )
-        told = statuses[begin:end]
-        misses = None if told.count(ok) == len(told) else [status_texts[code] for code in told]
+        found_statuses = statuses[begin:end]
+        is_ok = found_statuses.count(ok) == len(found_statuses)
+        misses = None if is_ok else [status_texts[code] for code in found_statuses]
         one = uncertainties[begin:end]
         uncertainty = next((known for known in one if known is not None), None) if misses else one[0]
         drive = texts["drive"][codes["drive"][begin]]
@@ -105,7 +109,7 @@ def exchanges_of(table: Any) -> ExchangeRows:
 
 
 def _numbers(column: Any, kind: str) -> list[Any]:
-    """Return a column's numbers, None where there is none; ten times as fast as to_pylist."""
+    """Return a column's numbers, with None for nulls; ten times as fast as to_pylist."""
     data: Any = memoryview(column.buffers()[1]).cast("B")
     found: list[Any] = data.cast(kind)[column.offset :][: len(column)].tolist()
     if column.null_count:
@@ -115,7 +119,7 @@ def _numbers(column: Any, kind: str) -> list[Any]:
 
 
 def _changes(first: Any, second: Any) -> list[int]:
-    """Return where either column is other than in the row before; 0 is the first."""
+    """Return the rows in which either column differs from the row before; 0 is the first."""
     changed = [pc.not_equal(column[1:], column[:-1]) for column in (first, second)]
     either = pc.or_(*changed)
     return [0, *(at + 1 for at in pc.indices_nonzero(either).to_pylist())]
@@ -199,7 +203,7 @@ create or replace view multidrop.samples as
     join multidrop.register_sets r on r.id = e.registers
     cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
 """
-HAS_UNITS = (  # what was made by an older hub has none
+HAS_UNITS = (  # tables of older hubs have none
     "select from information_schema.columns"
     " where table_schema = 'multidrop' and table_name = 'samples' and column_name = 'unit'"
 )
@@ -207,7 +211,7 @@ COPY = (
     "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
     " from stdin (format binary)"
 )
-# One hub has the database, while its connection lasts: a server that hears nothing of it ends that in 25 s.
+# One hub locks the database while its connection lasts; the server drops a dead connection after 25 s.
 TAKEN = """
 set tcp_keepalives_idle = 10; set tcp_keepalives_interval = 5; set tcp_keepalives_count = 3;
 set lock_timeout = '3s'; select pg_advisory_lock(hashtext('multidrop hub that writes')); set lock_timeout = 0
@@ -230,7 +234,7 @@ class PostgresSink:
             self._connection = None
 
     def begin(self, stream: str) -> KeptPlace:
-        """Connect anew, make what is missing, and return the row of `multidrop.hub`."""
+        """Reconnect, create missing tables, and return the position in `multidrop.hub`."""
         self.close()
         try:
             self._connection = psycopg.connect(
@@ -241,7 +245,7 @@ class PostgresSink:
             with self._connection.transaction():
                 return self._begin(self._connection, stream)
         except psycopg.errors.LockNotAvailable as failure:
-            raise SinkError("another hub writes into this database; this one waits for its end") from failure
+            raise SinkError("another hub writes into this database; waiting until it ends") from failure
         except psycopg.Error as failure:
             raise SinkError(f"PostgreSQL: {_sentence(failure)}") from failure
 
@@ -256,7 +260,7 @@ class PostgresSink:
         assert found is not None
         if found[0] != stream:
             raise NotThisHubs(
-                f"the database holds samples of a stream that was made at {found[0]}, and this one was made "
+                f"the database holds samples of a stream created at {found[0]}, and this one was created "
                 f"at {stream}: name another database"
             )
         self._drives = dict(connection.execute("select name, id from multidrop.families").fetchall())
@@ -268,7 +272,7 @@ class PostgresSink:
         return KeptPlace(found[1], found[2])
 
     def write(self, commit: Commit) -> None:
-        """Move the place on and copy the rows, in one transaction."""
+        """Advance the position and copy the rows, in one transaction."""
         assert self._connection is not None
         try:
             with self._connection.transaction():
@@ -281,7 +285,7 @@ class PostgresSink:
             MOVE, (commit.last, json.dumps(commit.sources), commit.stream, commit.first - 1)
         )
         if moved.rowcount != 1:
-            raise SinkError("another hub writes into this database: end one of them")
+            raise SinkError("another hub writes into this database: stop one of them")
         found: list[ExchangeRows] = [exchanges_of(table) for table in commit.tables]
         self._name(connection, found)
         with connection.cursor() as cursor, cursor.copy(COPY) as copy:
@@ -289,7 +293,7 @@ class PostgresSink:
                 copy.write(piece)
 
     def _name(self, connection: psycopg.Connection[Any], found: Sequence[ExchangeRows]) -> None:
-        """Give ids to names that have none."""
+        """Insert names that have no id yet."""
         drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
         query = "insert into multidrop.families (name) select unnest(%s::text[]) returning name, id"
         if drives:

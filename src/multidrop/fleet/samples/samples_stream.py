@@ -1,7 +1,7 @@
-"""The stream of all gateways' samples, by NATS JetStream's own API (ADR-31 for direct gets).
+"""The stream of all gateways' samples, through JetStream's own API (ADR-31 for direct gets).
 
-A message has the subject `samples.<gateway>.<log id>`, its number in that log as the header
-`Multidrop-Sequence`, and a digest of its bytes. Nothing here keeps a state: the stream is asked.
+A message has the subject `samples.<gateway>.<log id>`, its number in that log in the header
+`Multidrop-Sequence`, and a digest of its bytes. This module keeps no state: it asks the stream.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ from multidrop.printable import masked
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
-BY_SERVER = "Nats-Stream"  # a header of each message that a server gives out of a stream
+BY_SERVER = "Nats-Stream"  # a header of each message that a server returns from a stream
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
-ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
+ANSWER_S = 5.0  # for an answer; an election takes 4 to 9 s, so requests are retried
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
-SENTENCES = {  # and what others of them mean
-    NO_STREAM: f"there is no stream {STREAM!r}: make it by `multidrop fleet init`",
+SENTENCES = {  # for other codes
+    NO_STREAM: f"there is no stream {STREAM!r}: create it with `multidrop fleet init`",
     **dict.fromkeys(
         (10005, 10047),
-        "the servers of NATS have no room for so many samples: keep less by `multidrop fleet init --keep`, "
+        "the NATS servers have no room for so many samples: keep less with `multidrop fleet init --keep`, "
         "or raise max_file in their jetstream blocks",
     ),
 }
 
 
 class StreamError(OSError):
-    """NATS is not reached, refuses, or has no such stream. One sentence."""
+    """NATS cannot be reached, refuses a request, or has no such stream. One sentence."""
 
 
 class StreamAbout(NamedTuple):
-    """A stream's identity and extent: a stream that is made anew counts from 1 again."""
+    """A stream's identity and extent: a new stream counts from 1 again."""
 
     created: str
     first: int
@@ -59,9 +59,9 @@ class StreamAbout(NamedTuple):
 
 
 class LastMessage(NamedTuple):
-    """The newest message of a subject: its place in the stream, its number in the log, its digest.
+    """The newest message of a subject: its position in the stream, its number in the log, its digest.
 
-    The number is 0 where it is none of a gateway, but an answer of a server that somebody had sent there.
+    The number is 0 if it is not a gateway's message but a server's answer that someone directed there.
     """
 
     place: int
@@ -78,14 +78,14 @@ def digest_of(data: bytes) -> str:
 
 
 def end_if_cancelled() -> None:
-    """Raise CancelledError again: `asyncio.wait_for` of 3.11 swallows one that meets an answer."""
+    """Raise CancelledError again: `asyncio.wait_for` of Python 3.11 swallows one that meets an answer."""
     task = asyncio.current_task()
     if task and task.cancelling():
         raise asyncio.CancelledError
 
 
 async def connect(servers: list[str], **options: Any) -> BatchClient:
-    """Return a connection that comes back by itself. Raises StreamError."""
+    """Return a connection that reconnects by itself. Raises StreamError."""
     client = BatchClient()
     try:
         async with asyncio.timeout(ANSWER_S):
@@ -105,7 +105,7 @@ async def connect(servers: list[str], **options: Any) -> BatchClient:
     if (version.major, version.minor) < OLDEST:
         await close(client)
         raise StreamError(
-            f"the server of NATS at {masked(', '.join(servers))} is "
+            f"the NATS server at {masked(', '.join(servers))} is "
             f"{version.major}.{version.minor}.{version.patch}: a fleet needs "
             f"{'.'.join(map(str, OLDEST))} or newer"
         )
@@ -113,21 +113,21 @@ async def connect(servers: list[str], **options: Any) -> BatchClient:
 
 
 async def close(client: Client) -> None:
-    """Close a connection, also of a client that is half connected, or whose servers are gone."""
+    """Close a connection, even if it is half open or its servers are gone."""
     with suppress(Exception):
         async with asyncio.timeout(ANSWER_S):
             await client.close()
 
 
 async def _ignore(_: Exception) -> None:
-    """Do nothing: whoever asked has the error too, and the client would log a traceback for each."""
+    """Do nothing: callers get the error too, and the client would log a traceback for each."""
 
 
 async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> int:
-    """Make the stream where there is none, and return the most bytes that it keeps; -1 for no limit.
+    """Create the stream if it is missing, and return its size limit in bytes; -1 for none.
 
-    The oldest messages go when it has more than `most_bytes`. That much is reserved: a stream without a limit
-    fills the servers, and then no lease can be renewed. A stream that is there stays as it is.
+    The oldest messages are removed above `most_bytes`. That much is reserved: a stream without a limit fills
+    the servers, and then no lease can be renewed. An existing stream stays as it is.
     """
     config = {
         "name": STREAM,
@@ -158,7 +158,7 @@ async def about(client: Client) -> StreamAbout:
 
 
 async def last_of(client: Client, subject: str) -> LastMessage | None:
-    """Return the newest message of a subject, by the stream's leader. Raises StreamError."""
+    """Return the newest message of a subject, from the stream's leader. Raises StreamError."""
     found = await _ask(client, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
     if found is None:
         return None
@@ -171,14 +171,14 @@ async def last_of(client: Client, subject: str) -> LastMessage | None:
 
 
 async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
-    """Store a message, and return its place; None where the subject's last one is another than expected.
+    """Store a message, and return its position; None if the subject's last message is not the expected one.
 
-    Raises StreamError: then it may be stored or not.
+    Raises StreamError; then it may be stored or not.
     """
     try:
         answer = await client.request(subject, data, timeout=ANSWER_S, headers=headers)
     except NoRespondersError as failure:
-        raise StreamError(f"no stream takes {subject}: it has no leader now, or there is none") from failure
+        raise StreamError(f"no stream takes {subject}: it is missing, or has no leader now") from failure
     except (Error, OSError, TimeoutError) as failure:
         raise silent(client, failure) from failure
     found = _parsed(answer.data)
@@ -191,16 +191,16 @@ async def publish(client: Client, subject: str, data: bytes, headers: dict[str, 
 
 
 def number_of(text: str | None) -> int:
-    """Return a header's number; 0 for one that is missing or none."""
+    """Return a header's number; 0 if it is missing or invalid."""
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else 0
 
 
 async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int) -> Any:
-    """Return the answer of JetStream's API; None for one of these errors."""
+    """Return the answer of JetStream's API; None for these errors."""
     try:
         answer = await client.request(f"$JS.API.{subject}", json.dumps(what).encode(), timeout=ANSWER_S)
     except NoRespondersError as failure:
-        raise StreamError("the servers of NATS run without JetStream, or have no quorum now") from failure
+        raise StreamError("the NATS servers run without JetStream, or have no quorum now") from failure
     except (Error, OSError, TimeoutError) as failure:
         raise silent(client, failure) from failure
     found = _parsed(answer.data)
@@ -220,26 +220,26 @@ def _parsed(data: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict) or not isinstance(found.get("error") or {}, dict):
-        raise StreamError("NATS answers something else than JSON")
+        raise StreamError("the answer of NATS is not JSON")
     return found
 
 
 @contextmanager
 def _as_wanted() -> Iterator[None]:
-    """Raise StreamError where an answer lacks what is taken from it."""
+    """Raise StreamError if an answer lacks a field."""
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise StreamError("NATS answers something else than it was asked for") from None
+        raise StreamError("the answer of NATS lacks a field") from None
 
 
 def silent(client: Client, failure: Exception) -> StreamError:
-    """Return why nothing was answered: a server tells of missing rights beside the answer, not by it."""
+    """Return why there was no answer: a server reports missing rights separately."""
     last = client.last_error
     if last and "permissions violation" in str(last).lower():
-        return StreamError(f"the rights of this connection do not suffice: {_text(last)}")
+        return StreamError(f"this connection lacks rights: {_text(last)}")
     if not client.is_connected:
-        return StreamError(f"NATS is not reached: {_text(last or failure)}")
+        return StreamError(f"NATS cannot be reached: {_text(last or failure)}")
     return StreamError(f"NATS did not answer within {ANSWER_S:.0f} s")
 
 
@@ -251,51 +251,51 @@ SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 
 
 class StreamMessage(NamedTuple):
-    """A message as the hub reads it; `sequence` 0 stands for a header that is missing or no number.
+    """A message as the hub reads it; `sequence` is 0 if the header is missing or invalid.
 
-    It is 0 too for an answer of a server: whoever may ask for a stored message may have it sent anywhere, and
-    so into the stream as another gateway's.
+    It is also 0 for an answer of a server: anyone who may read a stored message may have it sent anywhere,
+    and so into the stream as another gateway's.
     """
 
     place: int
     gateway: str
     log: str
     sequence: int
-    lost: int  # rows that the gateway's spool had lost when it sent this
+    lost: int  # rows that the gateway's spool had lost by then
     data: bytes
 
 
 async def read_after(client: BatchClient, place: int, messages: int, size: int) -> list[StreamMessage]:
-    """Return the next messages behind this place: so many and bytes at most, without a hole among them.
+    """Return the next messages after this position, without a gap, within the limits of number and bytes.
 
-    An empty list says that there is none now. Any replica may answer. Raises StreamError.
+    An empty list means that there is none now. Any replica may answer. Raises StreamError.
     """
     wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
     get = SampleGet()
     try:
         await client.batch(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
     except (Error, OSError) as failure:
-        if get.found or get.has_hole:  # each is whole, and the next call goes on behind them
+        if get.found or get.has_hole:  # each is complete; the next call continues after them
             return get.found
         raise _refused(get.end_line) if get.last.done() else silent(client, failure) from failure
     return get.found
 
 
 class SampleGet(DirectGet):
-    """The messages that one direct get gives, by the headers as they came.
+    """The messages that one direct get returns, by their raw headers.
 
-    Whoever may say samples writes headers of a message as he likes, and a parser that stops at a strange one
-    sees his words of whose it is in place of the server's, which are the last.
+    A sender may write any headers into a message. A parser that stops at a strange one would take the
+    sender's claim about its origin for the server's headers, which come last.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[StreamMessage] = []
-        self.has_hole = False  # a message was lost on the way here
+        self.has_hole = False  # a message was lost on its way
         self.end_line = ""
 
     def take(self, headers: bytes, data: bytes) -> None:
-        """Keep a message, or learn that there are no more."""
+        """Keep a message, or the end of the list."""
         self.count += 1
         if self.last.done():
             return
@@ -315,7 +315,7 @@ class SampleGet(DirectGet):
 def _refused(end_line: str) -> StreamError:
     if end_line.startswith("503"):
         return StreamError(f"there is no stream {STREAM!r}, or it has no leader now")
-    return StreamError(f"the stream {STREAM!r} gives nothing: {end_line}")
+    return StreamError(f"the stream {STREAM!r} cannot be read: {end_line}")
 
 
 def _stream_message(stored: DirectMessage, headers: bytes) -> StreamMessage:

@@ -1,14 +1,14 @@
-"""The folder of a spool: a file a message, each on the disk before it has its name.
+"""Spool: a poller's rows on a gateway's disk until the servers have them, one file per message.
 
-| in the folder        | what it holds                                                         |
-|----------------------|-----------------------------------------------------------------------|
+| in the folder        | content                                                                |
+|----------------------|------------------------------------------------------------------------|
 | `spool.json`         | fleet, gateway, and the id of the log whose messages are numbered here |
 | `NUMBER-ROWS.arrows` | a message: its sequence in the log, and its rows                       |
 | `NUMBER-ROWS.damaged`| a newest message of which a disk kept only a part                      |
-| `.spool.lock`        | held by the process that writes here                                   |
+| `.spool.lock`        | locked by the process that writes here                                 |
 
-The newest message is never removed: it says which number comes next. A log's id is made with its folder, so
-a new disk is a new log.
+A file is on the disk before it gets its name. The newest message is never removed: it holds the number that
+comes next. A log's id is created with its folder, so a new disk is a new log.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TEMPORARY = re.compile(r"\..+\.tmp")
 
 
 class SpoolError(ValueError):
-    """A folder that is no spool, or another's, or not to be written."""
+    """A folder that is not a spool, belongs to another gateway, or cannot be written."""
 
 
 class StoredMessage(NamedTuple):
@@ -52,15 +52,15 @@ class StoredMessage(NamedTuple):
 
 
 class SpoolFolder:
-    """The files of one log, of which one process at a time is the owner.
+    """The files of one log, owned by one process at a time.
 
-    Raises SpoolError for a folder that holds something else, is another gateway's or fleet's, is being
-    written by another process, or cannot be written.
+    Raises SpoolError if the folder holds something else, is another gateway's or fleet's, is in use by
+    another process, or cannot be written.
     """
 
     def __init__(self, path: Path, gateway: str, fleet: str) -> None:
         self.path = path
-        self.damage: str | None = None  # a sentence about a newest message that was no whole one
+        self.damage: str | None = None  # a sentence about an incomplete newest message
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(path / ".spool.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -76,7 +76,7 @@ class SpoolFolder:
         try:
             lock(self._lock)
         except BlockingIOError:
-            raise SpoolError(f"the spool {self.path} is being written by another process") from None
+            raise SpoolError(f"the spool {self.path} is in use by another process") from None
         try:
             self.log = self._head({"format": FORMAT, "fleet": fleet, "gateway": gateway})
             self.messages = self._listed()
@@ -90,13 +90,13 @@ class SpoolFolder:
             self._lock = -1
 
     def _head(self, wanted: dict[str, str]) -> str:
-        """Return the log's id: of the folder, or a new one for an empty folder."""
+        """Return the log's id: the folder's, or a new one for an empty folder."""
         path = self.path / HEAD
         if not path.exists():
             others = sorted(one.name for one in self.path.iterdir() if not one.name.startswith("."))
             if others:
                 raise SpoolError(
-                    f"{self.path} is no spool: it holds {others[0]!r} and no {HEAD}; name an empty folder"
+                    f"{self.path} is not a spool: it holds {others[0]!r} and no {HEAD}; name an empty folder"
                 )
             log = secrets.token_hex(8)
             self._store(path, json.dumps({**wanted, "log": log}).encode())
@@ -113,7 +113,7 @@ class SpoolFolder:
         return str(found["log"])
 
     def _listed(self) -> dict[int, StoredMessage]:
-        """Return the messages in order, and remove what a killed process had begun."""
+        """Return the messages in order, and remove unfinished files of a killed process."""
         found = {}
         self.newest = 0
         for path in self.path.iterdir():
@@ -121,22 +121,22 @@ class SpoolFolder:
                 path.unlink()
             elif match := _NAME.fullmatch(path.name):
                 number = int(match[1])
-                self.newest = max(self.newest, number)  # also a damaged one: it is not given again
+                self.newest = max(self.newest, number)  # also a damaged one: its number is not reused
                 if match[3] == "arrows":
                     found[number] = StoredMessage(number, int(match[2]), path.stat().st_size, path)
         return dict(sorted(found.items()))
 
     def _check_newest(self) -> None:
-        """Put a newest message away that is not whole."""
+        """Put an incomplete newest message aside."""
         newest = self.messages.get(self.newest)
         if newest and (mistake := _mistake(newest)):
             del self.messages[self.newest]
             newest.path.rename(newest.path.with_suffix(".damaged"))
             self._sync_folder()
-            self.damage = f"{newest.path} is damaged, and was put away with {newest.rows} rows: {mistake}"
+            self.damage = f"{newest.path} is damaged, and was put aside with {newest.rows} rows: {mistake}"
 
     def write(self, data: bytes, rows: int) -> StoredMessage:
-        """Store the next message; it is on the disk when this returns. Raises OSError: try again."""
+        """Store the next message; it is on the disk when this returns. Raises OSError: then retry."""
         number = self.newest + 1
         path = self.path / f"{number:012d}-{rows}.arrows"
         self._store(path, data)
@@ -148,12 +148,12 @@ class SpoolFolder:
         self.newest = stored.sequence
 
     def remove(self, message: StoredMessage) -> None:
-        """Remove a message that is not the newest. Raises OSError."""
+        """Remove a message other than the newest. Raises OSError."""
         message.path.unlink(missing_ok=True)
         del self.messages[message.sequence]
 
     def _store(self, path: Path, data: bytes) -> None:
-        """Write a file that has its name once it is on the disk, and leave nothing where that fails."""
+        """Write a file that gets its name once it is on the disk; leave nothing if that fails."""
         part = path.with_name(f".{path.name}.tmp")
         try:
             file = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
@@ -195,39 +195,39 @@ def _parsed(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-ENOUGH_ROWS = 1 << 14  # for a message at once
-ENOUGH_S = 1.0  # since the first row, for a message of fewer
-MOST_WAITING = 1_000_000  # rows in memory, for a disk that is slow or full: 38 MB
-AGAIN_S = 1.0  # between attempts at a disk that failed
-TELLING_S = 60.0  # between sentences about rows that are lost
-ENDING_S = 10.0  # for which `close` waits for the disk
+ENOUGH_ROWS = 1 << 14  # for a message without delay
+ENOUGH_S = 1.0  # since the first row, for a smaller message
+MOST_WAITING = 1_000_000  # rows in memory if the disk is slow or full: 38 MB
+AGAIN_S = 1.0  # between attempts after a failure of the disk
+TELLING_S = 60.0  # between log lines about lost rows
+ENDING_S = 10.0  # `close` waits this long for the disk
 
 _log = logging.getLogger("multidrop.fleet.samples.spool")
 
 
 class SpoolState(NamedTuple):
-    """The state of a spool; rows and bytes count since it was opened, but for those stored."""
+    """The state of a spool. Rows count since it was opened; bytes are those stored."""
 
     log: str  # id
     written: int  # rows that reached the disk
-    lost: int  # rows that did not, or were removed before they were forwarded
+    lost: int  # rows that did not, or were removed before they were sent
     waiting: int  # rows in memory
     oldest: int  # sequence of the oldest message, 0 without one
     newest: int
-    acknowledged: int | None  # sequence up to which the stream has all; None: it was not asked yet
+    acknowledged: int | None  # the stream has all up to this sequence; None: not asked yet
     stored: int  # bytes
-    trouble: str | None  # with the disk, now
+    trouble: str | None  # of the disk, now
 
 
 class Spool:
     """Keeps rows in a folder: `poller.on_batch(spool.append)`.
 
-    Rows become a message, a file of its own, when 16384 are there or the first is a second old. All files
-    together take `most` bytes: then the oldest are removed, forwarded or not; those that were not are
-    counted as lost, and told once. A disk that is full or slow holds nobody up: a million rows wait in
-    memory, further ones are lost and counted, and it is tried again each second.
+    Rows become a message, in a file of its own, when there are 16384 or the first is a second old. All files
+    together take `most` bytes: above that the oldest are removed, and unsent ones are counted as lost and
+    logged. A full or slow disk delays no one: a million rows wait in memory, further ones are lost and
+    counted, and writing is retried each second.
 
-    Raises SpoolError, and ValueError for a name that no subject may have.
+    Raises SpoolError, and ValueError for an invalid name.
     """
 
     def __init__(
@@ -242,19 +242,19 @@ class Spool:
         self.gateway = checked_name("gateway", gateway)
         self._folder = SpoolFolder(Path(folder), gateway, checked_name("fleet", fleet))
         self.log = self._folder.log
-        self.on_message: Callable[[], object] = lambda: None  # called on the spool's thread after each
+        self.on_message: Callable[[], object] = lambda: None  # called in the spool's thread after each
         self._most = most
         self._units = units or PolledUnits()
         self._stored = sum(message.size for message in self._folder.messages.values())
         self._changing = threading.Condition()
         self._waiting: deque[RowBuffer] = deque()
-        self._packed: deque[Packed] = deque()  # begun: with the thread alone
-        self._first_s: float | None = None  # when the oldest waiting row came
+        self._packed: deque[Packed] = deque()  # only for the thread
+        self._first_s: float | None = None  # when the oldest waiting row arrived
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
-        self._undecided: dict[int, int] = {}  # removed before the stream was asked: rows by sequence
+        self._undecided: dict[int, int] = {}  # rows by sequence, removed before the stream was asked
         self._trouble: str | None = None
-        self._told_s: float | None = None
+        self._logged_s: float | None = None
         self._wanted = 0  # rows that `sync` waits for
         self._over = False
         if self._folder.damage:
@@ -265,9 +265,9 @@ class Spool:
     # ---- for the poller: any thread ----
 
     def append(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write. It takes microseconds, and raises nothing for the disk.
+        """Copy the rows for the thread to write. It takes microseconds and never fails because of the disk.
 
-        If they cannot be copied, as for want of memory, they are lost and counted; later ones are taken.
+        Rows that cannot be copied, such as without memory, are lost and counted; later ones are taken.
         """
         try:
             self._append(batch)
@@ -280,7 +280,7 @@ class Spool:
         with self._changing:
             rows = len(columns.time)
             if self._over or self._in_memory() + rows > MOST_WAITING:
-                self._lose(rows, "the disk does not keep up")
+                self._lose(rows, "the disk is too slow")
                 return
             if not self._waiting or not self._waiting[-1].add(columns):
                 self._waiting.append(RowBuffer())
@@ -291,25 +291,25 @@ class Spool:
                 self._changing.notify_all()
 
     def sync(self, timeout: float | None = None) -> bool:
-        """Wait until all rows that were taken before are on the disk; False when the time is over."""
+        """Wait until all earlier rows are on the disk; False after the timeout."""
         with self._changing:
             wanted = self._wanted = self._taken
             self._changing.notify_all()
             return self._changing.wait_for(lambda: self._written >= wanted, timeout)
 
     def is_alive(self) -> bool:
-        """True until the thread that writes has ended."""
+        """Return True until the writing thread has ended."""
         return self._thread.is_alive()
 
     def state(self) -> SpoolState:
-        """Return how much is where, and what is wrong."""
+        """Return counts and the present problem."""
         with self._changing:
             oldest = next(iter(self._folder.messages), 0)
             counts = self._written, self._lost, self._in_memory(), oldest, self._folder.newest
             return SpoolState(self.log, *counts, self._acknowledged, self._stored, self._trouble)
 
     def close(self) -> None:
-        """Write what waits, and end; a disk that does not answer is waited for 10 s at most."""
+        """Write the waiting rows, and end; wait for the disk for at most 10 s."""
         with self._changing:
             self._over = True
             self._changing.notify_all()
@@ -320,7 +320,7 @@ class Spool:
     # ---- for the forwarder: any thread ----
 
     def following(self, sequence: int) -> StoredMessage | None:
-        """Return the first message behind this sequence."""
+        """Return the first message after this sequence."""
         with self._changing:
             messages = self._folder.messages
             first = max(sequence + 1, next(iter(messages), sequence + 1))
@@ -329,12 +329,12 @@ class Spool:
             )
 
     def stored(self, sequence: int) -> StoredMessage | None:
-        """Return this message, where it is still kept."""
+        """Return this message if it is still stored."""
         with self._changing:
             return self._folder.messages.get(sequence)
 
     def acknowledge(self, sequence: int) -> None:
-        """Note that the stream has all messages up to this one: they are the first to be removed."""
+        """Note that the stream has all messages up to this one: they may be removed first."""
         with self._changing:
             self._acknowledged = sequence
             for removed, rows in self._undecided.items():
@@ -349,12 +349,12 @@ class Spool:
         while not is_over:
             try:
                 is_over = self._write_what_is_due()
-            except Exception as failure:  # such as a want of memory: it goes on with what waits
-                _log.error("the spool %s is interrupted", self._folder.path, exc_info=failure)
+            except Exception as failure:  # such as no memory: continue with the waiting rows
+                _log.error("writing the spool %s failed; retrying", self._folder.path, exc_info=failure)
                 time.sleep(AGAIN_S)
 
     def _write_what_is_due(self) -> bool:
-        """Wait until rows are to be written, and write them; True when the spool has ended."""
+        """Wait until rows are due, and write them; True when the spool has ended."""
         with self._changing:
             if not self._is_due():
                 self._changing.wait(self._patience())
@@ -374,7 +374,7 @@ class Spool:
     def _pack(self, buffer: RowBuffer) -> None:
         try:
             self._packed += buffer.messages(units=self._units)
-        except Exception:  # a mistake of ours must not end the thread
+        except Exception:  # a bug here must not end the thread
             _log.exception("%d rows could not be packed", buffer.rows)
             with self._changing:
                 self._taken -= buffer.rows
@@ -391,7 +391,7 @@ class Spool:
         return max(0.0, self._first_s + ENOUGH_S - time.monotonic())
 
     def _pause(self) -> bool:
-        """Wait before the disk is tried again; True when the spool ends, and what is left is lost."""
+        """Wait before the disk is retried; True if the spool ends, and the rest is lost."""
         with self._changing:
             if not self._over:
                 self._changing.wait_for(lambda: self._over, AGAIN_S)
@@ -402,7 +402,7 @@ class Spool:
     def _write(self, packed: Packed) -> bool:
         try:
             stored = self._folder.write(packed.data, packed.rows)
-        except Exception as failure:  # whatever it is, polling must go on
+        except Exception as failure:  # polling must continue in any case
             self._note(str(failure))
             return False
         with self._changing:
@@ -417,15 +417,17 @@ class Spool:
 
     def _note(self, trouble: str | None) -> None:
         if trouble and not self._trouble:
-            _log.error("the spool %s takes nothing: %s", self._folder.path, trouble)
+            _log.error("the spool %s cannot be written: %s", self._folder.path, trouble)
         if self._trouble and not trouble:
-            _log.warning("the spool %s takes rows again; %d were lost so far", self._folder.path, self._lost)
+            _log.warning(
+                "the spool %s is written again; %d rows were lost so far", self._folder.path, self._lost
+            )
         self._trouble = trouble
         if trouble:
             self._remove_acknowledged()
 
     def _remove_acknowledged(self) -> None:
-        """Remove what the stream has: it is kept for convenience alone, and the disk has no room."""
+        """Remove a message that the stream has: the disk has no room for copies."""
         oldest = self.following(0)
         if oldest and oldest.sequence <= (self._acknowledged or 0) and oldest.sequence < self._folder.newest:
             self._remove(oldest)
@@ -453,9 +455,9 @@ class Spool:
     def _lose(self, rows: int, reason: str) -> None:
         self._lost += rows
         now = time.monotonic()
-        if rows and (self._told_s is None or now - self._told_s >= TELLING_S):
+        if rows and (self._logged_s is None or now - self._logged_s >= TELLING_S):
             _log.error("%s: %d rows of the spool %s were lost so far", reason, self._lost, self._folder.path)
-            self._told_s = now
+            self._logged_s = now
 
     def _waiting_rows(self) -> int:
         return sum(buffer.rows for buffer in self._waiting)

@@ -1,10 +1,10 @@
-"""BatchClient: a NATS client that asks for many things at once, and takes the answers as they came.
+"""BatchClient: a NATS client that sends many requests at once and takes their answers cheaply.
 
-nats-py parses the headers of each message with Python's parser for e-mails, passes it on through a queue,
-and has a timer for each request; a gateway of a large fleet reads tens of thousands of records, and claims
-hundreds of lines at a time. Here such answers are taken where they leave the connection, and only
-the headers that are wanted are looked for. nats-py has no public place for that: where its own one is not
-as it was, the answers come as messages do, which costs more.
+nats-py parses the headers of each message with Python's e-mail parser, passes the message through a queue,
+and has a timer for each request. A gateway of a large fleet reads tens of thousands of records and claims
+hundreds of lines at a time. Here such answers are taken as they leave the connection, and only the needed
+headers are parsed. nats-py has no public hook for that. If its internals change, the answers arrive as
+ordinary messages, which costs more.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 STATUS = slice(9, 12)  # of a block of headers: "NATS/1.0 404 No Messages"
-PROCESSED = 4  # arguments of Client._process_msg behind the subscription's number
-WHOLE = ("204", "404")  # the server's last word after messages, and for none
+PROCESSED = 4  # arguments of Client._process_msg after the subscription's number
+WHOLE = ("204", "404")  # final statuses: after some messages, and after none
 
 
 class DirectMessage(NamedTuple):
@@ -31,7 +31,7 @@ class DirectMessage(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A message whose answer is waited for."""
+    """A message that is answered."""
 
     subject: str
     data: bytes
@@ -39,7 +39,7 @@ class Request(NamedTuple):
 
 
 class Gathered:
-    """Answers that come one by one; `last` has the status of the last one, once it came."""
+    """Answers that arrive one by one; `last` gets the status of the final one."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -50,7 +50,7 @@ class Gathered:
             self.last.set_result(status)
 
     async def wait(self, silence_s: float) -> None:
-        """Wait for the last one, or until nothing has come for so long."""
+        """Wait for the final answer, or until nothing has arrived for `silence_s` seconds."""
         before = -1
         while not self.last.done() and self.count > before:
             before = self.count
@@ -58,14 +58,14 @@ class Gathered:
 
 
 class DirectGet(Gathered):
-    """The messages that one direct get gives."""
+    """The messages that one direct get returns."""
 
     def __init__(self) -> None:
         super().__init__()
         self.messages: list[DirectMessage] = []
 
     def take(self, headers: bytes, data: bytes) -> None:
-        """Keep a message, or learn that there are no more."""
+        """Keep a message, or the end of the list."""
         self.count += 1
         message = stored_message(headers, data)
         if message is None:
@@ -75,7 +75,7 @@ class DirectGet(Gathered):
 
 
 class Replies(Gathered):
-    """The answers to so many requests; None where there is none."""
+    """The answers to a number of requests; None for a missing one."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class Replies(Gathered):
 
 
 class BatchClient(Client):
-    """A client of nats-py with one more subscription, to which such answers come."""
+    """A nats-py client with one more subscription for such answers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ class BatchClient(Client):
         self._subscribing = asyncio.Lock()
 
     async def batch(self, request: Request, get: DirectGet, silence_s: float) -> None:
-        """Gather what a direct get gives. Raises OSError for less than that, and what nats-py raises."""
+        """Collect the result of a direct get. Raises OSError if it is incomplete, and errors of nats-py."""
         await self._ask([request], [get.take], get, silence_s)
         if not get.last.done():
             raise TimeoutError(f"nothing came for {silence_s:g} s")
@@ -109,7 +109,7 @@ class BatchClient(Client):
             raise OSError(f"it ended with {get.last.result() or 'no status'}")
 
     async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
-        """Send all requests, one behind the other, and return their answers; None where none came in time."""
+        """Send all requests in one go, and return their answers; None for each that is late."""
         replies = Replies(len(requests))
         takers = [partial(replies.take, place) for place in range(len(requests))]
         await self._ask(requests, takers, replies, silence_s)
@@ -142,17 +142,17 @@ class BatchClient(Client):
 
     @property
     def is_reading(self) -> bool:
-        """Say whether answers are read: after an error of its own nats-py ends that, and flushes are good."""
+        """Return True while nats-py reads: after an internal error it stops, but flushes still work."""
         return self._reading_task is not None and not self._reading_task.done()
 
     async def _process_pong(self) -> None:
-        """Take a pong whose flush was given up, too: to nats-py it is an error that ends its reading."""
+        """Accept a pong whose flush has timed out; nats-py would stop reading."""
         if self._pongs and self._pongs[0].done():
             self._pongs[0] = asyncio.get_running_loop().create_future()
         await super()._process_pong()
 
     async def _process_msg(self, sid: int, *rest: Any) -> None:
-        """Take an answer out of nats-py's own way; its subject, reply, data and headers are the rest."""
+        """Take an answer past nats-py's queue. `rest` is subject, reply, data and headers."""
         if sid != self._batch_sid or len(rest) != PROCESSED:
             await super()._process_msg(sid, *rest)
             return
@@ -160,7 +160,7 @@ class BatchClient(Client):
         self._take(subject, headers or b"", data)
 
     async def _take_message(self, message: Msg) -> None:
-        """Take an answer that came in nats-py's own way."""
+        """Take an answer that came through nats-py's queue."""
         headers = message.headers or {}
         lines = "".join(f"\r\n{name}: {value}" for name, value in headers.items())
         block = f"NATS/1.0 {headers.get('Status', '')}{lines}\r\n\r\n"
@@ -172,9 +172,9 @@ class BatchClient(Client):
 
 
 def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
-    """Return the message with these headers; None for the server's last word.
+    """Return the message with these headers; None for the end of the list.
 
-    The writer's own headers come first, whatever he calls them; the server's are the last ones.
+    The writer's own headers come first and may have any name; the server's come last.
     """
     subject, sequence = last_header(headers, "Nats-Subject"), last_header(headers, "Nats-Sequence")
     if not subject or not (sequence.isascii() and sequence.isdigit()):
@@ -183,7 +183,7 @@ def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
 
 
 def last_header(headers: bytes, name: str) -> str:
-    """Return a header's text, the last one's where there are several; "" for none."""
+    """Return the text of the last header of this name; "" if there is none."""
     sign = f"\r\n{name}: ".encode()
     at = headers.rfind(sign)
     found = headers[at + len(sign) : headers.find(b"\r\n", at + len(sign))] if at >= 0 else b""

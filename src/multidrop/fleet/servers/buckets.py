@@ -1,4 +1,4 @@
-"""Buckets: records by key, replaced only at a known revision, and followed without a consumer on a server."""
+"""Buckets: records by key, replaced only at a known revision, and read without a consumer."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from multidrop.fleet.servers.batch_client import Request
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.record_shapes import largest, parsed
 
-NONE_YET = 0  # the revision of a key without a record
-BATCH = 1000  # records asked for at a time
-FOLLOW_S = 0.2  # between looks at a bucket
-MOST_STRANGE = 1000  # records of a bucket that are told of
+NONE_YET = 0  # revision of a key without a record
+BATCH = 1000  # records in one read
+FOLLOW_S = 0.2  # between reads of a bucket
+MOST_STRANGE = 1000  # invalid records of a bucket that are logged
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
-_UNAVAILABLE = 10008  # there is no leader, and none can be elected
+_UNAVAILABLE = 10008  # no leader, and none can be elected
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class Record(NamedTuple):
-    """A key's newest value, and the sequence at which the server stored it.
+    """A key's newest value, and the sequence number that the server gave it.
 
-    The value is None for a record that was removed, and for one that is none of ours.
+    The value is None for a removed and for an invalid record.
     """
 
     key: str
@@ -39,9 +39,9 @@ class Record(NamedTuple):
 
 
 class WriteAnswers(NamedTuple):
-    """The records that were replaced, at their new revisions, and the keys of those that had another one.
+    """The records that were replaced, with their new revisions, and the keys of the refused ones.
 
-    Any other may have been replaced or not: read it.
+    Any other record may have been replaced or not: read it.
     """
 
     stored: list[Record]
@@ -49,9 +49,9 @@ class WriteAnswers(NamedTuple):
 
 
 def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
-    """Return the stream that a bucket is: the newest record of each subject, on disk, on so many servers.
+    """Return the settings of a bucket's stream: the newest record of each subject, on disk.
 
-    Nobody removes records: neither by a request, nor by a header of a new one.
+    Records cannot be removed, neither by a request nor by a header of a new record.
     """
     return {
         "name": f"KV_{name}",
@@ -72,10 +72,10 @@ def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
 
 
 async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return what JetStream says to a request about streams.
+    """Return JetStream's answer to a request about streams.
 
-    Raises FleetError with its own words for an error, Unsure where the servers cannot decide, or answer
-    something else.
+    Raises FleetError with the server's text for an error, Unsure if the servers cannot decide or the answer
+    is invalid.
     """
     message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
     said = _table(message.data)
@@ -88,24 +88,24 @@ async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = N
 
 
 def _table(data: bytes) -> dict[str, Any]:
-    """Return the table that an answer is. Raises Unsure for anything else: nobody knows what was done."""
+    """Parse an answer that must be a JSON object. Raises Unsure for anything else: the outcome is unknown."""
     with suppress(ValueError, RecursionError):
         found = json.loads(data)
         if isinstance(found, dict) and isinstance(found.get("error") or {}, dict):
             return found
-    raise Unsure("what NATS answers is no answer of JetStream")
+    raise Unsure("the answer of NATS is not one of JetStream")
 
 
 def _revision(said: Mapping[str, Any]) -> int:
-    """Return the sequence at which a record was stored. Raises Unsure where the answer has none."""
+    """Return the sequence number of a stored record. Raises Unsure if the answer has none."""
     revision = said.get("seq")
     if type(revision) is not int:
-        raise Unsure("what NATS answers has no sequence")
+        raise Unsure("the answer of NATS has no sequence number")
     return revision
 
 
 class ServerError(FleetError):
-    """JetStream's refusal, with its code."""
+    """An error reported by JetStream, with its code."""
 
     def __init__(self, error: Mapping[str, Any]) -> None:
         super().__init__(f"NATS refuses: {error.get('description', error)}")
@@ -117,17 +117,17 @@ class ServerError(FleetError):
 
 
 class Bucket:
-    """One bucket; the path on which it is reached is looked up each time."""
+    """One bucket; `path` is called for each request."""
 
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
         self.path = path
-        self._strange: set[str] = set()  # keys whose record is none of ours, as was told
+        self._strange: set[str] = set()  # keys with an invalid record that was logged
 
     async def put(self, key: str, value: Any, revision: int) -> int:
-        """Replace the record at this very revision, and return the new one.
+        """Replace the record at exactly this revision, and return the new one.
 
-        Raises Conflict where it has another, Unsure where it may or may not have been replaced.
+        Raises Conflict if it has another revision, Unsure if the outcome is unknown.
         """
         message = await self.path().request(*self._put(Record(key, revision, value)))
         said = _table(message.data)
@@ -139,9 +139,9 @@ class Bucket:
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
-        """Replace records, each at the revision given with it.
+        """Replace records, each at its given revision.
 
-        All are sent one behind the other, and the server decides each by itself.
+        All are sent in one go; the server decides on each separately.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
         written = WriteAnswers([], set())
@@ -166,7 +166,7 @@ class Bucket:
         )
 
     async def get(self, key: str) -> Record:
-        """Return the record as the bucket's leader has it; revision 0 for none."""
+        """Return the record as the bucket's leader has it; revision 0 if there is none."""
         wanted = {"last_by_subj": self._all_of(key)}
         try:
             said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)
@@ -178,13 +178,13 @@ class Bucket:
             found = said["message"]
             subject, data = str(found["subject"]), base64.b64decode(found.get("data", ""))
         except (AttributeError, KeyError, TypeError, ValueError):
-            raise Unsure(f"what NATS answers of {self.name}.{key} is no record") from None
+            raise Unsure(f"the answer of NATS about {self.name}.{key} is not a record") from None
         return self._record(subject, _revision(found), data)
 
     async def changes(self, after: int) -> list[Record]:
-        """Return the records with a higher revision, as any of the servers has them: some may be old.
+        """Return at most 1000 records with a higher revision, in order. Any server answers: some may be old.
 
-        At most 1000 at a time, in order. Nothing is kept for it on a server.
+        The server keeps no state for it.
         """
         wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": ">"}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
@@ -192,18 +192,18 @@ class Bucket:
         return [self._record(*message) for message in messages]
 
     async def newest(self, keys: Sequence[str]) -> list[Record]:
-        """Return the records of these keys, 1000 at most, as any of the servers has them: some may be old."""
+        """Return the records of at most 1000 keys. Any server answers: some may be old."""
         wanted = {"multi_last": [self._all_of(key) for key in keys]}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
         messages = await self.path().collect(subject, json.dumps(wanted).encode())
         return [self._record(*message) for message in messages]
 
     def _subject(self, key: str) -> str:
-        """Return the subject on which a record is written."""
+        """Return the subject to write a record to."""
         return f"$KV.{self.name}.{key}"
 
     def _all_of(self, key: str) -> str:
-        """Return all subjects whose newest message is the key's record."""
+        """Return the pattern of all subjects of a key; the newest message among them is its record."""
         return self._subject(key)
 
     def _record(self, subject: str, revision: int, data: bytes) -> Record:
@@ -211,13 +211,13 @@ class Bucket:
         return Record(key, revision, self._value(key, data))
 
     def _value(self, key: str, data: bytes) -> Any:
-        """Return the value; None for what is none of ours, with one warning until a good one comes."""
+        """Return the value; None for an invalid record, which is logged once."""
         value, mistake = parsed(self.name, key, data)
         if not mistake:
             self._strange.discard(key)
         elif key not in self._strange and len(self._strange) < MOST_STRANGE:
             self._strange.add(key)
-            _log.warning("the record %s of the bucket %s is left out: %s", key, self.name, mistake)
+            _log.warning("ignored the record %s of the bucket %s: %s", key, self.name, mistake)
         return value
 
 
@@ -225,9 +225,9 @@ OnTake = Callable[[Record | None, Record], object]
 
 
 class Follower:
-    """The records of a bucket, by key, as far as they were read.
+    """The records of a bucket by key, as far as they were read.
 
-    `on_take` is called with each record that is newer than the one known, which comes first.
+    `on_take` is called with the former and the new record whenever a newer one was read.
     """
 
     def __init__(self, bucket: Bucket, on_take: OnTake = lambda *_: None) -> None:
@@ -237,7 +237,7 @@ class Follower:
         self._after = 0
 
     async def look(self) -> list[Record]:
-        """Read all that changed since, and return it."""
+        """Read all changes since the last call, and return them."""
         changed: list[Record] = []
         while True:
             found = await self.bucket.changes(self._after)
@@ -248,7 +248,7 @@ class Follower:
                 return changed
 
     async def rest(self) -> None:
-        """Wait until the next look."""
+        """Wait for the next read."""
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
@@ -262,7 +262,12 @@ class Follower:
 
 
 class LeaseBucket(Bucket):
-    """A bucket of leases, written to in the name of `writer`."""
+    """A bucket of leases, written in the name of `writer`.
+
+    The subject of a record is `<gateway>.<writer>`, so servers can check who writes. The newest record of all
+    writers counts, and each is replaced only at its revision. A gateway may write only in its own name. So a
+    record that another gateway has written is the end of a session, whatever it contains.
+    """
 
     def __init__(self, name: str, path: Callable[[], ServerPath], writer: str) -> None:
         super().__init__(name, path)

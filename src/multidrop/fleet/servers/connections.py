@@ -1,4 +1,4 @@
-"""Connections to NATS: three paths, each at a server of its own as long as that one lives."""
+"""Connections to NATS: three paths, each at its own server while that one lives."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ from multidrop.printable import masked
 
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
-ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
-PONG_S = 0.7  # a server that takes longer is left for another one
-KEEP_S = 1.0  # between looks at a connection
-# With 0 for attempts, nats-py knocks at a port where nobody listens until our own time-out.
+ANSWER_S = 1.0  # per request; a lease is renewed twice a second
+PONG_S = 0.7  # a slower server is left for another one
+KEEP_S = 1.0  # between checks of a connection
+# With 0 attempts nats-py would retry a closed port until our own timeout.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class ServerPath:
-    """One connection, at its home where that server lives, else at any other."""
+    """One connection, at its home server while that one lives, otherwise at any other."""
 
     def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
         self.urls = [masked(url) for url in urls]  # the first is home
         self._full = dict(zip(self.urls, urls, strict=True))  # with users and passwords
-        self.url = ""  # where it is
+        self.url = ""  # of the present server
         self.others: Sequence[ServerPath] = ()  # of the same process
-        self.spare = Spare()  # of the same process too
+        self.spare = Spare()  # shared with them
         self._options = options or {}
         self._client: BatchClient | None = None
         self._denials = Denials()
-        self._trouble = ""  # that was told
+        self._trouble = ""  # already logged
         self._leaving: set[asyncio.Task[None]] = set()
         self._wanted: dict[str, Callable[[Msg], Any]] = {}  # by subject
         self._standing: dict[str, Subscription] = {}  # at the present server
@@ -63,18 +63,18 @@ class ServerPath:
 
     @property
     def server_name(self) -> str:
-        """Return the name of the server where it is; "" for none."""
+        """Return the name of the present server; "" if there is none."""
         return str(self._client._server_info.get("server_name", "")) if self._client else ""
 
     @property
     def version(self) -> tuple[int, int]:
-        """Return the version of the server where it is."""
+        """Return the version of the present server."""
         assert self._client is not None
         found = self._client.connected_server_version
         return found.major, found.minor
 
     async def open(self) -> None:
-        """Connect to the first server that answers. Raises FleetError when none does."""
+        """Connect to the first server that answers. Raises FleetError if none does."""
         failures = []
         for url in self.urls:
             try:
@@ -89,7 +89,7 @@ class ServerPath:
         raise refusals[0] if refusals else FleetError("; ".join(map(str, failures)))
 
     async def keep(self) -> None:
-        """Go elsewhere from a server that does not answer, and come home again; for ever."""
+        """Leave a server that does not answer, and return home when possible; forever."""
         while True:
             try:
                 await self.look_after()
@@ -103,7 +103,7 @@ class ServerPath:
             await asyncio.sleep(KEEP_S)
 
     async def look_after(self) -> None:
-        """Do once what `keep` does."""
+        """Do once the work of `keep`."""
         if not self.is_open or not await self._answers():
             self._leave()
             await self.open()
@@ -139,37 +139,39 @@ class ServerPath:
             self._client, self.url = None, ""
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Call a coroutine function with each message, wherever this path moves."""
+        """Call a coroutine function with each message, whichever server this path moves to."""
         self._wanted[subject] = called
         await self._follow_wanted()
 
     async def unsubscribe(self, subject: str) -> None:
-        """Take no more messages; nothing happens where none were taken."""
+        """End a subscription, if there is one."""
         self._wanted.pop(subject, None)
         await self._follow_wanted()
 
     async def _follow_wanted(self) -> None:
         async with self._changing:
             if self._client is not None:
-                with suppress(NatsError, OSError):  # it is left soon, and all is brought to the next server
+                with suppress(
+                    NatsError, OSError
+                ):  # this server is left soon; the next one gets all subscriptions
                     await self._bring(self._client, self._standing)
 
     async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
-        """Subscribe to all that is wanted there now, and to nothing else."""
+        """Subscribe to exactly the wanted subjects there."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
-                if called := self._wanted.get(subject):  # it may be unwanted by now
+                if called := self._wanted.get(subject):  # it may have been removed
                     standing[subject] = await client.subscribe(subject, cb=called)
             for subject in standing.keys() - self._wanted.keys():
                 await standing.pop(subject).unsubscribe()
 
     async def subscribe_or_raise(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Subscribe. Raises NoRight where these credentials do not allow to hear it."""
+        """Subscribe. Raises NoRight if these credentials do not allow it."""
         with self._denials.raising(subject):
             await self.subscribe(subject, called)
             client = self._connected()
             with suppress(NatsError, OSError, TimeoutError):
-                await client.flush()  # this ping may leave before what waits to be sent, the next does not
+                await client.flush()  # this ping may overtake pending data, the next one cannot
                 await client.flush()
 
     async def request(
@@ -181,21 +183,21 @@ class ServerPath:
     ) -> Msg:
         """Return the answer.
 
-        Raises Unsure where none comes in time, NoRight where it may not be asked or heard, and NotDelivered
-        where nobody was asked, for certain: that is NobodyThere where the server says so.
+        Raises Unsure if none comes in time, NoRight if the request or its answer is not allowed, NotDelivered
+        if the request certainly reached no one, and NobodyThere if the server reports that.
         """
         client, denials = self._connected(), self._denials
         before = denials.of_request(subject)
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
-            raise NobodyThere(f"nobody answers {subject} at {self.url}") from None
+            raise NobodyThere(f"no one answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages that a direct get gives; the other paths are asked too where this one is slow.
+        """Return all messages of a direct get; the other paths are asked too if this one is slow.
 
         Raises Unsure as `request` does.
         """
@@ -203,7 +205,7 @@ class ServerPath:
         return await first_answer(ways, Request(subject, data), self.spare)
 
     async def gather(self, request: Request, get: DirectGet) -> None:
-        """Gather the messages of a direct get by this path alone. Raises Unsure as `request` does."""
+        """Collect the messages of a direct get on this path only. Raises Unsure as `request` does."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:
@@ -213,7 +215,7 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
 
     async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
-        """Return the answer to each request, or None where it is unsure whether it was carried out."""
+        """Return the answer to each request; None if its outcome is unknown."""
         try:
             return await self._connected().replies(requests, ANSWER_S)
         except (NatsError, OSError) as failure:
@@ -231,14 +233,14 @@ class ServerPath:
 
 
 async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> BatchClient:
-    """Return a connection to this very server. Raises FleetError, in one sentence."""
+    """Connect to exactly this server. Raises FleetError, in one sentence."""
     refusals: list[Exception] = []
-    told = denials or Denials()
+    noted = denials or Denials()
 
     async def note(failure: Exception) -> None:
         if not client.is_connected:
             refusals.append(failure)
-        await told.note(failure)
+        await noted.note(failure)
 
     client = BatchClient()
     settings = {**ONE_TRY, "connect_timeout": CONNECT_S}
@@ -269,9 +271,9 @@ async def _close(client: BatchClient) -> None:
 
 
 def _cut(client: BatchClient) -> None:
-    """Close the socket and end the subscriptions' tasks, which nats-py may leave behind.
+    """Close the socket and end the subscription tasks that nats-py may leave behind.
 
-    It does so where it is cancelled, or the server is gone. The error of its reading task is ignored.
+    It leaves some if it is cancelled or the server is gone. The error of its reading task is ignored.
     """
     for subscription in client._subs.values():
         subscription._stop_processing()
@@ -284,7 +286,7 @@ def _cut(client: BatchClient) -> None:
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
-    """Return three paths: each has another of the servers as its home, where there are so many."""
+    """Return three paths, each with another server as its home if there are enough."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
         path.others, path.spare = [other for other in paths if other is not path], paths[0].spare

@@ -1,7 +1,8 @@
-"""Credentials: who a connection says it is, and which servers it believes.
+"""Credentials: the identity of a connection, and the servers that it trusts.
 
-A key is an Ed25519 pair (an "nkey"). Its secret half is a file of its user alone; servers have the public
-half, which is no secret. A user's answers go to an inbox named by it, which nobody else may listen to.
+A key is an Ed25519 pair (an "nkey"). The secret half is a file for its user only; servers have the public
+half, which is no secret. A user's answers go to an inbox named after the public key, which no other user may
+read.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-SEED = "SU"  # the first letters of a user's secret key
+SEED = "SU"  # prefix of a user's secret key
 CREDS = "-----BEGIN NATS USER JWT-----"
 
 
@@ -24,18 +25,18 @@ def new_seed() -> str:
 
 
 def public_key(seed: str) -> str:
-    """Return the public key of a secret one. Raises ValueError for what is none."""
+    """Return the public key of a secret one. Raises ValueError for an invalid key."""
     import nkeys
 
     try:
         pair = nkeys.from_seed(bytearray(seed.encode()))
     except (nkeys.NkeysError, ValueError) as failure:
-        raise ValueError(f"this is no secret key of a NATS user: {type(failure).__name__}") from None
+        raise ValueError(f"not a secret key of a NATS user: {type(failure).__name__}") from None
     return bytes(pair.public_key).decode()
 
 
 def inbox_of(public: str) -> str:
-    """Return where a user's answers go."""
+    """Return the prefix of a user's inboxes."""
     return f"_INBOX_{public}"
 
 
@@ -44,9 +45,9 @@ def connect_options(
 ) -> dict[str, Any]:
     """Return the options of a connection to these servers.
 
-    `credentials` is a user's secret key, or a .creds file; `ca` the certificate that the servers' are signed
-    by. With it, or with tls:// in a URL, nothing is said before TLS has begun. Raises ValueError for a file
-    that is none.
+    `credentials` is a file with a user's secret key, or a .creds file; `ca` is the certificate that signed
+    the servers'. With it, or with tls:// in a URL, TLS starts before anything else is sent. Raises ValueError
+    for an invalid file.
     """
     options: dict[str, Any] = {}
     if ca is not None or any(url.startswith("tls://") for url in urls):
@@ -66,7 +67,7 @@ def _user(credentials: Path) -> dict[str, Any]:
     try:
         public = public_key(text)
     except ValueError:
-        raise ValueError(f"{credentials} is damaged: it is no key that `fleet rights` wrote") from None
+        raise ValueError(f"{credentials} is damaged: not a key of `fleet rights`") from None
     return {"nkeys_seed_str": text, "inbox_prefix": inbox_of(public)}
 
 

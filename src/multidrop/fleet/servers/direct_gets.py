@@ -1,16 +1,16 @@
-"""Direct gets: reads that any of the servers answers, and that go on while one of them is cut off.
+"""Direct gets: reads that any server can answer, and that continue while one server is cut off.
 
-A server hands such a question to any server that has the records: itself, or one behind a route, by chance.
-One that is cut off gets its share of them until the others notice, which takes them some seconds. So what is
-not answered soon is asked again, by all paths at once. Each answer may be old, as ever: whoever writes upon
-it names the revision that he read.
+A server passes such a read to any server that has the records, by chance: itself or one behind a route. A
+server that is cut off still gets its share of reads until the others notice, which takes seconds. So a read
+without an early answer is repeated on all paths at once. Each answer may be old: a write that builds on it
+names the revision that was read.
 
-Where all are slow, asking again makes them slower, until nobody has an answer in time. So there are so many
-questions to spare and no more: at first none, and a read that is answered in time earns a part of one. An
-answer that comes to the first question after all, which was late and not lost, halves what is left.
+If all servers are slow, repeating reads makes them slower still. So repeats have a budget: it is empty at
+first, and each timely answer earns half a repeat. A first request that is answered late after all was not
+lost, and halves the budget.
 
-And who saw answers take long of late waits in proportion before he asks again. Where many gateways begin at
-once, each reads whole buckets, and what their small questions earn would be spent on large ones.
+A client that has seen slow answers also waits proportionally longer before it repeats. When many gateways
+start at once, each reads whole buckets, and repeats earned by small reads would be spent on large ones.
 """
 
 from __future__ import annotations
@@ -23,57 +23,57 @@ from multidrop.fleet.errors import NoRight, Unsure
 from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request
 from multidrop.supervisor import end_tasks
 
-AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # without a message, before it is asked again; then it is given up
-SLOW = 3.0  # so often what answers take of late is waited, before a question is asked again,
-MOST_SILENCE_S = 1.0  # and no longer: a path gives up then
-FORGET = 0.97  # of what they took, with each answer
-MOST_SPARE = 300.0  # questions: twice what a gateway asks again in the 3 s until servers leave a dead route
-EARNED = 0.5  # of a question, by an answer in time
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # of silence before each repeat; then the read fails
+SLOW = 3.0  # wait this multiple of a usual answer's time before a repeat,
+MOST_SILENCE_S = 1.0  # and no longer: a path gives up after that
+FORGET = 0.97  # decay of that time with each answer
+MOST_SPARE = 300.0  # repeats: twice the need of the 3 s until servers leave a dead route
+EARNED = 0.5  # repeats per timely answer
 
 
 class Way(Protocol):
-    """A path to servers that may be asked."""
+    """A path to servers."""
 
     async def gather(self, request: Request, get: DirectGet) -> None:
-        """Gather what a direct get gives. Raises FleetError."""
+        """Collect the result of a direct get. Raises FleetError."""
 
 
 class Spare:
-    """The number of questions that one process may ask again, and how long it waits before that."""
+    """The budget of repeats of one process, and how long to wait before a repeat."""
 
     def __init__(self) -> None:
         self._left = 0.0
-        self._took_s = MOST_SILENCE_S / SLOW  # by the slowest answers of late; at first it is not known
+        self._took_s = MOST_SILENCE_S / SLOW  # of recent slow answers; unknown at first
 
     def note(self, *, is_late: bool) -> None:
-        """Learn that the first question was answered."""
+        """Update the budget after the first request was answered."""
         self._left = self._left / 2 if is_late else min(self._left + EARNED, MOST_SPARE)
 
     def learn(self, took_s: float) -> None:
-        """Learn how long an answer took."""
+        """Update the usual time of an answer."""
         self._took_s = max(took_s, FORGET * self._took_s)
 
     def silence_s(self, least_s: float) -> float:
-        """Return how long to wait for a message: this at least, and longer where answers take long."""
+        """Return how long to wait for a message: at least `least_s`, longer if answers are slow."""
         return max(least_s, min(SLOW * self._took_s, MOST_SILENCE_S))
 
     def spend(self, ways: Sequence[Way]) -> Sequence[Way]:
-        """Return those of the ways that may be asked again."""
+        """Return the paths on which the read may be repeated."""
         asked = ways[: int(self._left)]
         self._left -= len(asked)
         return asked
 
 
 async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> list[DirectMessage]:
-    """Return the messages of the first whole answer. Raises FleetError where there is none.
+    """Return the messages of the first complete answer. Raises FleetError if there is none.
 
-    The first of the ways is asked alone: at rest it answers in an instant.
+    The first path is asked alone, because it usually answers at once.
     """
     loop = asyncio.get_running_loop()
     gets: dict[asyncio.Task[None], DirectGet] = {}
     asked_at: dict[DirectGet, float] = {}
     first: DirectGet | None = None
-    failure: BaseException = Unsure(f"nothing came to {request.subject}")
+    failure: BaseException = Unsure(f"no answer to {request.subject}")
     try:
         for number, least_s in enumerate(AGAIN_S):
             again = ways[1:] if number == 1 and ways[1:] else ways
@@ -100,7 +100,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
 
 
 async def _is_one_over(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
-    """Wait until one of them is over. Return False where nothing comes for so long, or none is left."""
+    """Wait until one request ends. Return False if nothing arrives for `silence_s`, or none is left."""
     while gets:
         before = sum(get.count for get in gets.values())
         done, _ = await asyncio.wait(gets, timeout=silence_s, return_when=asyncio.FIRST_COMPLETED)

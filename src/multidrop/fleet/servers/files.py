@@ -1,12 +1,12 @@
 """Server files: the configuration of a fleet's NATS servers, and a secret key for each user.
 
-    n1.conf, n2.conf …   a server each, with its route to the others; for that server alone
-    rights.conf          users by their public keys, their rights and their accounts; for all servers
-    keys/NAME.key        the secret key of a user; for its machine alone
-    keys/routes          the servers' own password, as the servers' files have it
+    n1.conf, n2.conf …   one server each, with its routes to the others; only for that server
+    rights.conf          users by their public keys, their rights and accounts; for all servers
+    keys/NAME.key        the secret key of a user; only for its machine
+    keys/routes          the password between servers, as in the servers' files
 
-Keys that are there stay as they are, so that a new gateway changes no other one's. A user whose name is not
-given any more has no rights.
+Existing keys are kept, so a new gateway changes no other's key. A user whose name is no longer given loses
+all rights.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from multidrop.fleet.servers.rights import accounts, rights_of
 from multidrop.printable import masked
 
 CLUSTER = "multidrop"
-ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222, as usual
+ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222
 MOST_PORTS = 65535
 STORE = Path("/var/lib/nats")
-PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: a dead one is left after 3 s, and not after 60 to 90
+PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: detect a dead one after 3 s instead of 60 to 90 s
 
 
 class TlsFiles(NamedTuple):
-    """Paths on a server: its certificate, the key of that, and the certificate that signed all servers'."""
+    """Paths on a server: its certificate, its key, and the certificate that signed all servers'."""
 
     cert: Path
     key: Path
@@ -39,7 +39,7 @@ class TlsFiles(NamedTuple):
 
 
 class ServerAddress(NamedTuple):
-    """A server's name, and where it listens."""
+    """A server's name and address."""
 
     name: str
     host: str
@@ -52,7 +52,7 @@ class ServerAddress(NamedTuple):
 
 
 def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
-    """Return the servers that these URLs name. Raises ValueError for one that has no usable port."""
+    """Return the servers at these URLs. Raises ValueError for a URL without a usable port."""
     found = []
     for number, url in enumerate(urls, 1):
         parts = urlsplit(url)
@@ -61,7 +61,7 @@ def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
         except ValueError:
             port = MOST_PORTS
         if not parts.hostname or port + ROUTE_PORTS > MOST_PORTS:
-            raise ValueError(f"{masked(url)} is no address of a NATS server: write nats://host:4222")
+            raise ValueError(f"{masked(url)} is not an address of a NATS server: write nats://host:4222")
         found.append(ServerAddress(f"n{number}", parts.hostname, port))
     return found
 
@@ -69,9 +69,9 @@ def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
 def write_files(
     folder: Path, gateways: Sequence[str], urls: Sequence[str], tls: TlsFiles | None, store: Path = STORE
 ) -> list[Path]:
-    """Write all files, and return their paths. Secrets are for their owner's eyes alone (mode 0600).
+    """Write all files, and return their paths. Secrets are readable only by their owner (mode 0600).
 
-    Raises ValueError for a mistake, before anything is written.
+    Raises ValueError for a mistake before anything is written.
     """
     servers = addresses_of(urls)
     rights = rights_of(gateways)
@@ -101,7 +101,7 @@ def _public(path: Path, seed: str) -> str:
 
 
 def _write_secret(path: Path, text: str) -> None:
-    """Write a file that nobody else may read at any moment."""
+    """Write a file that is never readable by others, not even for a moment."""
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

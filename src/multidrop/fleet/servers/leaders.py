@@ -1,4 +1,11 @@
-"""Leaders of buckets: each at a server of its own, so that one dead server stops one path alone."""
+"""Leaders of buckets: each bucket is led by another server, so that one failed server stops only one path.
+
+A server that hears no leader asks for votes every 4 to 9 s, each time in a newer term, though the others do
+not hear it. When it returns, a leader with an older term steps down, and the bucket has no leader for 4 to 9
+s. If that happens to two of the lease buckets, no line is polled. Handing over a leadership also makes the
+term newer, and takes an instant. So while a server is silent, the others hand the lease buckets to each other
+more often than it asks. Who may poll depends only on revisions, whichever server leads.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +23,8 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.record_shapes import misshapen
 from multidrop.supervisor import end_tasks
 
-SILENT_NS = 2_000_000_000  # a follower answers its leader's heartbeat once a second
-_CLUSTER = {"leader": str, "replicas": list}  # left out where there is none
+SILENT_NS = 2_000_000_000  # a follower answers its leader once a second
+_CLUSTER = {"leader": str, "replicas": list}  # missing if there is none
 _REPLICA = {"name": str, "current": bool, "offline": bool, "active": int}
 
 
@@ -27,33 +34,33 @@ class Replica(NamedTuple):
     name: str
     is_current: bool
     is_offline: bool
-    active_ns: int  # since the leader heard it; 0 for never
+    active_ns: int  # since the leader heard from it; 0 for never
 
     @property
     def is_ready(self) -> bool:
-        """Say whether it could lead now."""
+        """Return True if it could lead now."""
         return self.is_current and not self.is_offline
 
     @property
     def is_silent(self) -> bool:
-        """Say whether it was not heard for long, or never; one that lags is heard."""
+        """Return True if it was not heard for 2 s, or never; a server that lags is heard."""
         return not self.is_current and not 0 < self.active_ns < SILENT_NS
 
 
 class Cluster(NamedTuple):
-    """A bucket's leader, "" for none, and those that follow it."""
+    """A bucket's leader, "" for none, and its followers."""
 
     leader: str = ""
     followers: tuple[Replica, ...] = ()
 
     def home_of(self, place: int) -> str:
-        """Return the server that should lead the bucket at this place: they take turns, in order of name."""
+        """Return the server that should lead bucket number `place`: servers take turns in order of name."""
         servers = sorted([self.leader, *(follower.name for follower in self.followers)])
         return servers[place % len(servers)]
 
     @property
     def has_silent(self) -> bool:
-        """Say whether one of them is silent."""
+        """Return True if one of the followers is silent."""
         return any(follower.is_silent for follower in self.followers)
 
     @property
@@ -63,61 +70,61 @@ class Cluster(NamedTuple):
 
 
 def cluster_of(info: Mapping[str, Any]) -> Cluster | None:
-    """Return the cluster in a stream's state; None where a server keeps it alone.
+    """Return the cluster in a stream's state; None if a single server keeps the stream.
 
-    Raises Unsure for what is no cluster.
+    Raises Unsure for an invalid state.
     """
     if "cluster" not in info:
         return None
-    told = _believed(info["cluster"], _CLUSTER, leader="", replicas=[])
+    found = _believed(info["cluster"], _CLUSTER, leader="", replicas=[])
     usual = {"current": False, "offline": False, "active": 0}
-    followers = (_believed(one, _REPLICA, **usual) for one in told["replicas"])
+    followers = (_believed(one, _REPLICA, **usual) for one in found["replicas"])
     return Cluster(
-        told["leader"],
+        found["leader"],
         tuple(Replica(one["name"], one["current"], one["offline"], one["active"]) for one in followers),
     )
 
 
-def _believed(told: Any, shape: Mapping[str, type], **usual: Any) -> dict[str, Any]:
-    """Return a table with what is left out of it, or null. Raises Unsure for another shape."""
-    found = told
-    if isinstance(told, dict):
-        found = {**usual, **{name: value for name, value in told.items() if value is not None}}
+def _believed(given: Any, shape: Mapping[str, type], **usual: Any) -> dict[str, Any]:
+    """Return a table with defaults for missing and null entries. Raises Unsure for another shape."""
+    found = given
+    if isinstance(given, dict):
+        found = {**usual, **{name: value for name, value in given.items() if value is not None}}
     if mistake := misshapen(found, shape):
-        raise Unsure(f"what NATS answers of a bucket's servers is none of JetStream's: {mistake}")
+        raise Unsure(f"the answer of NATS about a bucket's servers is invalid: {mistake}")
     return dict(found)
 
 
-SOON_S = 0.4  # at rest it takes some milliseconds
+SOON_S = 0.4  # usually some milliseconds
 
 
 async def cluster_at(path: ServerPath, bucket: str) -> Cluster | None:
-    """Return the servers of a bucket, None for one server alone. Raises FleetError where none answers."""
+    """Return the servers of a bucket, None for a single server. Raises FleetError if none answers."""
     return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"))
 
 
 async def known_cluster(path: ServerPath, bucket: str) -> Cluster:
-    """Return the servers of a bucket, of which one alone leads; nobody leads where none answers."""
+    """Return the servers of a bucket; a cluster without a leader if none answers."""
     with suppress(FleetError):
         return await cluster_at(path, bucket) or Cluster(path.server_name)
     return Cluster()
 
 
 async def has_leader(path: ServerPath, bucket: str) -> bool:
-    """Say whether a bucket has a leader that answers: else no record of it can be written."""
+    """Return True if a bucket has a leader that answers: otherwise its records cannot be written."""
     return bool((await known_cluster(path, bucket)).leader)
 
 
 async def have_leaders(path: ServerPath) -> bool:
-    """Say whether enough buckets of lines' masters have a leader that answers for lines to be claimed."""
+    """Return True if enough buckets of masters have a leader for lines to be claimed."""
     led = await asyncio.gather(*(has_leader(path, bucket) for bucket in names.OWNERS))
     return sum(led) >= NEEDED
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
-    """Return the servers of those buckets of leases and of lines' masters whose leader answers soon.
+    """Return the servers of those lease and master buckets whose leader answers soon.
 
-    One whose server is cut off answers nothing, and holds the others up no longer than that.
+    A leader that is cut off delays the others by at most that time.
     """
     buckets = (*names.LEASES, *names.OWNERS)
     looks = [asyncio.create_task(known_cluster(path, bucket)) for bucket in buckets]
@@ -133,7 +140,7 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Ask leaders elsewhere to step down in favour of their home; return how many were asked."""
+    """Ask leaders that are not at home to step down in favour of their home; return how many were asked."""
     moved = 0
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):
@@ -152,14 +159,14 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
 
 
-HAND_OVER_S = 3.0  # less than the shortest time between two requests for votes
-SILENT_FOR_S = 60.0  # a server that is silent for longer is not waited for
-HANDED_S = 1.0  # it takes 0.03 to 0.3 s
+HAND_OVER_S = 3.0  # less than the shortest time between two vote requests
+SILENT_FOR_S = 60.0  # a server that is silent for longer is ignored
+HANDED_S = 1.0  # a hand-over takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
 
 
 class LeaseTerms:
-    """The times of the hand-overs, and since when a server is silent."""
+    """The times of hand-overs, and since when a server is silent."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -167,9 +174,9 @@ class LeaseTerms:
         self._handed_at: dict[str, float] = {}  # by bucket
 
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
-        """Hand over what is due, and return True where anything was.
+        """Hand over the buckets that are due, and return True if any was.
 
-        It is done one bucket after the other: through us at most one waits for an election.
+        They go one after the other, so at most one of them waits for an election because of this.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
@@ -207,13 +214,13 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
     return False
 
 
-KEEP_S = 0.4  # between looks: leaders tell after 2 s that a server is silent, which asks for votes after 4 s
+KEEP_S = 0.4  # leaders report a silent server after 2 s; it asks for votes after 4 s
 
 
 async def keep_leaders(
     path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
 ) -> None:
-    """Keep leaders for ever, whenever that is ours to do."""
+    """Look after the buckets' leaders forever, while `is_ours()` returns True."""
     terms = LeaseTerms(clock)
     while True:
         await asyncio.sleep(KEEP_S)

@@ -1,4 +1,4 @@
-"""Names of NATS things: buckets, subjects, and names of gateways and lines, which go into them."""
+"""Names in NATS: buckets, subjects, and the gateways and lines that are part of them."""
 
 from __future__ import annotations
 
@@ -14,51 +14,51 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def checked_name(kind: str, name: str) -> str:
-    """Return the name. Raises ValueError for one that a subject cannot have."""
+    """Return the name. Raises ValueError if it cannot be part of a subject."""
     if not isinstance(name, str) or not is_name(name):
         suggestion = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name)).strip("-") or f"{kind}-1"
         raise ValueError(
-            f"the {kind}'s name {name!r} may have letters, digits, _ and - alone: write {suggestion}"
+            f"the {kind}'s name {name!r} may have only letters, digits, _ and -: write {suggestion}"
         )
     return name
 
 
 def is_name(text: str) -> bool:
-    """Say whether a subject can have this as one of its parts."""
+    """Return True if the text can be one part of a subject."""
     return _NAME.fullmatch(text) is not None
 
 
 @functools.lru_cache(1 << 16)
 def owner_buckets(line: str) -> tuple[str, ...]:
-    """Return the buckets with the records of a line's master, in the order in which they are written."""
+    """Return the buckets with the records of a line's master, in writing order."""
     first = zlib.crc32(line.encode()) % len(OWNERS)
     return OWNERS[first:] + OWNERS[:first]
 
 
 def is_inbox(subject: str) -> bool:
-    """Say whether an asker waits for its answer there.
+    """Return True if a requester waits for its answer on this subject.
 
-    Servers let whoever is asked answer to any subject that the asker names, also to one that the asker may
-    not use: to a record of the plant, say. What a server itself answers comes without such a subject.
+    Servers let a responder answer on any subject that the requester names, even one that the requester may
+    not use, such as a record of the plant. Answers of the servers themselves have no such subject.
     """
     return subject.startswith(("_INBOX.", "_INBOX_"))
 
 
 def command_subject(line: str) -> str:
-    """Return the subject on which a line's master is asked for an offer."""
+    """Return the subject for asking a line's master for an offer."""
     return f"cmd.{line}"
 
 
 def do_subject(gateway: str, run: str) -> str:
-    """Return the subject on which one run of a gateway's process is told to do what it has offered."""
+    """Return the subject for telling one run of a gateway's process to carry out its offer."""
     return f"do.{gateway}.{run}"
 
 
 def stop_subject(line: str) -> str:
-    """Return the subject on which a line's master takes stops."""
+    """Return the subject for stops to a line's master."""
     return f"stop.{line}"
 
 
 def gateway_subject(gateway: str, wanted: str) -> str:
-    """Return the subject of a request about a gateway itself: "state", "drain", or "*" for all it takes."""
+    """Return the subject for requests about a gateway: "state", "drain", or "*" for all of them."""
     return f"gateway.{gateway}.{wanted}"

@@ -1,7 +1,7 @@
-"""Plant store: a plant's lines in the bucket `plant`, by name, and their files; each with its revision.
+"""Plant store: the plant's lines in the bucket `plant`, by name, with their family files.
 
-A line's record has the table of the plant file and the text of the family files that it names, so a gateway
-reads the lines that it polls, and no others.
+A line's record holds its table of the plant file and the text of the family files that it uses. So a gateway
+reads only the lines that it polls.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ _FLEET = {"may": Key(dict, "[fleet.may], a table")}
 
 
 def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
-    """Return the plant of a file, and the record of each line by its name.
+    """Return the plant in a file, and the record of each line by name.
 
-    Raises ValueError (PlantError for mistakes of the file) for what a fleet cannot poll: a port that only
-    one machine has, or that a thread serves; a line's name that no subject can have; a family in Python.
+    Raises ValueError (PlantError for mistakes in the file) if a fleet cannot poll it: a port that only one
+    machine has or that a thread serves, a line's name that cannot be part of a subject, or a family in
+    Python.
     """
     plant = Plant.load(path)
     document = tomllib.loads(path.read_text("utf-8"))
@@ -41,7 +42,7 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
         if not line.port.startswith(SOCKETS):
             raise ValueError(
                 f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
-                "which every gateway reaches and can close at once, and no others"
+                "which every gateway can reach and close at once"
             )
     may = _lists(document.get("fleet", {}), plant)
     return plant, {table["name"]: _description(table, path.parent, may) for table in document["line"]}
@@ -66,8 +67,8 @@ def _description(table: Mapping[str, Any], folder: Path, may: Mapping[str, Seque
     for model in {drive["model"] for drive in table["drive"]}:
         if ".py" in model:
             raise ValueError(
-                f"line {table['name']}: the family {model} is a Python file, and gateways run none that "
-                "comes over the network; declare it in TOML"
+                f"line {table['name']}: the family {model} is a Python file, and gateways run no code "
+                "from the network; declare it in TOML"
             )
         if model.endswith(".toml"):
             files |= _family_files(folder, model)
@@ -94,9 +95,9 @@ def _family_files(folder: Path, model: str) -> dict[str, str]:
 
 
 async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
-    """Make these lines the plant, and return how many came, changed, went and stayed.
+    """Store these lines as the plant, and return how many are new, changed, removed and kept.
 
-    A line that is as before keeps its revision, and is polled on as if nothing had happened.
+    An unchanged line keeps its revision, so polling it continues without a break.
     """
     follower = Follower(bucket)
     await follower.look()
@@ -119,7 +120,7 @@ async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
 def line_of(record: Record, folder: Path) -> PlantLine:
     """Return the line that a record describes; its files are written below the folder.
 
-    Raises ValueError for a record that is none.
+    Raises ValueError for an invalid record.
     """
     value, home = record.value, folder / record.key
     home.mkdir(parents=True, exist_ok=True)
@@ -129,13 +130,13 @@ def line_of(record: Record, folder: Path) -> PlantLine:
             raise ValueError(f"line {record.key}: a file {name!r} outside of its folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).write_text(text, "utf-8")
-    plant = home / "line.plant"  # no family file ends so
+    plant = home / "line.plant"  # no family file has this suffix
     plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
     return Plant.load(plant).lines[0]
 
 
 def _toml(value: Any) -> str:
-    """Return a value in TOML, in one line."""
+    """Return a value as TOML on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_toml(str(key))} = {_toml(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list):

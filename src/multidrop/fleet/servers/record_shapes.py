@@ -1,6 +1,6 @@
-"""Shapes of a fleet's records: what each must have before anything of it is believed. Pure.
+"""Shapes of a fleet's records: what each must contain before it is used. Pure.
 
-Whoever may write to a bucket may write anything. What is none of ours is no record, and harms nobody else's.
+Anyone with write access to a bucket may write anything. Invalid records are ignored, and harm no others.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ SHAPES: Mapping[str, Mapping[str, type]] = {
     **dict.fromkeys(names.OWNERS, OWNER),
     names.PLANT: LINE,
 }
-SMALL, LARGE = 1 << 14, 1 << 20  # bytes of a record; a line's has the files of its families
+SMALL, LARGE = 1 << 14, 1 << 20  # bytes of a record; a line's record has its family files
 _KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
 _KINDS |= {dict: "a table", list: "a list"}
 
 
 def largest(bucket: str) -> int:
-    """Return how many bytes a record of this bucket may have."""
+    """Return the size limit of a record of this bucket in bytes."""
     return LARGE if bucket == names.PLANT else SMALL
 
 
 def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
-    """Return the value of a record, and why it is none of ours, or "". A removed one has the value None."""
+    """Return the value of a record, and why it is invalid, or "". A removed record has the value None."""
     if not data:
         return None, ""
     if not names.is_name(key):
-        return None, "its key is no name"
+        return None, "its key is not a valid name"
     if len(data) > largest(bucket):
         return None, f"it has {len(data)} bytes, and {largest(bucket)} are the most"
     try:
-        value = json.loads(data.decode())  # else other encodings are looked for, in each of thousands
+        value = json.loads(data.decode())  # faster: json.loads would detect the encoding of each of thousands
     except (ValueError, RecursionError):
-        return None, "it is no JSON"
+        return None, "not JSON"
     mistake = misshapen(value, SHAPES.get(bucket, {})) or _CHECKS.get(bucket, _nothing)(key, value)
     return (None if mistake else value), mistake
 
 
 def misshapen(value: Any, shape: Mapping[str, type]) -> str:
-    """Return what a value lacks of a shape; "" where it lacks nothing. It may have more."""
+    """Return how a value differs from a shape; "" if it fits. Further entries are allowed."""
     if not isinstance(value, dict):
-        return "it is no table"
+        return "not a table"
     for name, kind in shape.items():
         if name not in value:
             return f"it has no {name!r}"
@@ -67,8 +67,8 @@ def _nothing(key: str, value: Any) -> str:
 
 def _mistake_of_line(key: str, value: Any) -> str:
     if value["line"].get("name") != key:
-        return "it describes another line than its key names"
-    return "" if set(map(type, value["files"].values())) <= {str} else "one of its files is no text"
+        return "its line has another name than its key"
+    return "" if set(map(type, value["files"].values())) <= {str} else "one of its files is not text"
 
 
 def _mistake_of_owner(key: str, value: Any) -> str:

@@ -1,16 +1,29 @@
-"""Rights: what each user of a fleet may publish and subscribe to in its NATS servers. Pure.
+"""Rights: what each user of a fleet may publish and subscribe to on its NATS servers. Pure.
 
-| user      | may                                                                                         |
-|-----------|---------------------------------------------------------------------------------------------|
-| a gateway | say its own samples, write leases in its own name, write owners of lines, read all records, |
-|           | take commands of any line and requests about itself, answer them, bring leaders home        |
-| hub       | read the stream of samples                                                                  |
-| viewer    | read all records, ask gateways about themselves                                             |
-| commander | what a viewer may, and ask for commands                                                     |
-| operator  | what a viewer may, and make what is missing, store the plant, drain gateways                |
+| user      | may                                                                                          |
+|-----------|----------------------------------------------------------------------------------------------|
+| a gateway | publish its own samples, write leases in its own name, write masters of lines, read all      |
+|           | records, take commands of any line and requests about itself, answer them, move leaders home |
+| hub       | read the stream of samples                                                                   |
+| viewer    | read all records, ask gateways about themselves                                              |
+| commander | as a viewer, and send commands                                                               |
+| operator  | as a viewer, and create missing buckets, store the plant, drain gateways                     |
 
-Nobody may change, empty or remove a stream (but for the one that `fleet init` tries servers with), make a
-consumer, or read another user's answers.
+No user may change, empty or remove a stream (except the test bucket of `fleet init`), create a consumer, or
+read another user's answers.
+
+NATS sends an answer to whatever subject the requester names, without checking the requester's rights there.
+So each user has an account of its own, which answers do not leave, and one account without users holds
+everything that is stored. Only these cross accounts:
+
+| from        | to           | what                                                            |
+|-------------|--------------|-----------------------------------------------------------------|
+| a user      | the store    | JetStream requests and records that it may write, as services   |
+| a commander | each gateway | commands, stops and requests about the gateway, as streams      |
+| a gateway   | a commander  | answers to the commander's inbox, as a service                  |
+
+A server does not forward to importers of a stream what arrived through a service, so no answer becomes a
+stop.
 """
 
 from __future__ import annotations
@@ -32,7 +45,7 @@ class UserRights(NamedTuple):
 
     publish: Sequence[str]
     subscribe: Sequence[str] = ()
-    answers: bool = False  # to requests that reach it, where the asker wants the answer
+    answers: bool = False  # to requests that reach it, on the requester's inbox
 
 
 def _api(request: str, *buckets: str) -> list[str]:
@@ -107,25 +120,25 @@ OTHERS: Mapping[str, Callable[[str], UserRights]] = {
 def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
     """Return the rights of each user of a fleet with these gateways, by name.
 
-    Raises ValueError for a name that no subject can have, or that is another user's.
+    Raises ValueError for a name that is invalid or taken.
     """
     for name in gateways:
         names.checked_name("gateway", name)
         if name in OTHERS or gateways.count(name) > 1:
             raise ValueError(
-                f"{name!r} is there twice: each gateway has a name of its own, and not {', '.join(OTHERS)}"
+                f"{name!r} is taken: each gateway needs its own name, other than {', '.join(OTHERS)}"
             )
     found = {name: _gateway(name) for name in gateways}
     return found | {name: make(name) for name, make in OTHERS.items()}
 
 
 STORE = "multidrop"
-LAST_ANSWER = "10s"  # of several: none comes later, and the server remembers the asker for so long
-ANSWER = '{ max: 1, expires: "1m" }'  # of a request: a stop of many drives takes its time
+LAST_ANSWER = "10s"  # for several answers: the server remembers the requester for this long
+ANSWER = '{ max: 1, expires: "1m" }'  # a stop of many drives takes its time
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
-_MANY = "$JS.API.DIRECT.GET."  # these have several answers each
-# In an account without JetStream a server answers to all of its API that it is not enabled, unless this
-# is imported. Nobody may ask it.
+_MANY = "$JS.API.DIRECT.GET."  # several answers each
+# Without this import, a server answers every JetStream request in such an account with "not enabled".
+# No user may send it.
 _INFO = "$JS.API.INFO"
 
 
@@ -159,12 +172,12 @@ def accounts(rights: Mapping[str, UserRights], public: Mapping[str, str]) -> Ite
 
 
 def account_of(user: str) -> str:
-    """Return the name of a user's account, which is never the store's."""
+    """Return the name of a user's account, never that of the store."""
     return f"{STORE}-{user}"
 
 
 def _wanted(mine: UserRights) -> list[str]:
-    """Return what a user may ask gateways for."""
+    """Return the subjects on which a user may send requests to gateways."""
     return [subject for subject in mine.publish if not subject.startswith(_STORED)]
 
 
@@ -177,7 +190,7 @@ def _import(kind: str, account: str, subject: str) -> str:
 
 
 def _shared(some: Iterable[str], others: Iterable[str]) -> Iterator[str]:
-    """Yield the subjects that are among both, where * stands for any one word."""
+    """Yield the subjects that match both lists; * matches any one word."""
     for one in some:
         for other in others:
             words = list(zip(one.split("."), other.split("."), strict=False))

@@ -1,4 +1,4 @@
-"""Setup: makes a fleet's buckets and streams, after a trial of what the servers are good for."""
+"""Setup: creates a fleet's buckets and streams after testing the servers."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
-    """Make what is missing, and return what there is. Raises FleetError, in one sentence.
+    """Create missing buckets, and return a summary. Raises FleetError, in one sentence.
 
-    Buckets that are there stay as they are. To make some takes each of the servers.
+    Existing buckets stay as they are. Creating some requires all servers to answer.
     """
     await open_all(paths)
     reached = min(MOST_REPLICAS, len({path.server_name for path in paths}))
@@ -37,7 +37,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     away = [path.urls[0] for path in paths if path.url != path.urls[0]]
     if away and not replicas:
         raise FleetError(
-            f"{away[0]} does not answer, and what is made now stays on the other servers for good: start it "
+            f"{away[0]} does not answer, and new buckets would stay on the other servers for good: start it "
             "first, or leave its address out"
         )
     replicas = replicas or reached
@@ -51,7 +51,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
 
 
 async def open_all(paths: Sequence[ServerPath]) -> None:
-    """Connect all paths. Raises FleetError where none is reached, or a server is too old."""
+    """Connect all paths. Raises FleetError if no server answers, or one is too old."""
     results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
     failures = [result for result in results if isinstance(result, Exception)]
     too_old = [failure for failure in failures if isinstance(failure, TooOld)]
@@ -60,7 +60,7 @@ async def open_all(paths: Sequence[ServerPath]) -> None:
 
 
 async def check_buckets(path: ServerPath) -> None:
-    """Raise FleetError where there is no fleet in these servers yet, or no quorum; an election is no lack."""
+    """Raise FleetError if these servers have no fleet or no quorum. An election in progress is waited for."""
     ends = asyncio.get_running_loop().time() + WAIT_S
     for bucket in names.BUCKETS:
         try:
@@ -79,7 +79,7 @@ async def check_buckets(path: ServerPath) -> None:
 
 
 async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
-    """Return the state of a bucket once it has a leader: it has none while that moves home, or is elected."""
+    """Return the state of a bucket once it has a leader: it has none while it moves or is elected."""
     while True:
         try:
             info = await ask(path, f"STREAM.INFO.KV_{bucket}")
@@ -94,27 +94,27 @@ async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
 
 
 def check_clock(path: ServerPath, server_time: Any) -> None:
-    """Warn where this machine's clock and the server's are far apart: leases do not mind, samples do.
+    """Warn if this machine's clock and the server's differ: leases do not depend on it, samples do.
 
-    Raises Unsure for what is no time.
+    Raises Unsure for an invalid time.
     """
     try:
         apart = time.time() - datetime.fromisoformat(server_time).timestamp()
     except (TypeError, ValueError, OverflowError):
-        raise Unsure(f"what {path.url} answers of a bucket has no time") from None
+        raise Unsure(f"the answer of {path.url} about a bucket has no time") from None
     if abs(apart) > CLOCKS_APART_S:
         _log.warning(
-            "this machine's clock is %.0f s %s that of %s: set it, for samples have its time",
+            "this machine's clock is %.0f s %s that of %s: set it, because samples have its time",
             *(abs(apart), "ahead of" if apart > 0 else "behind", path.url),
         )
 
 
 def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
-    """Return the sentence for servers that do not decide anything."""
+    """Return the error for servers that cannot decide anything."""
     if isinstance(failure, NobodyThere):
         return FleetError(
             f"no JetStream answers at {path.url}: the configuration of each server needs "
-            '`jetstream { store_dir: "/var/lib/nats" }`, and one that runs must read new rights twice'
+            '`jetstream { store_dir: "/var/lib/nats" }`, and a running server must read new rights twice'
         )
     return FleetError(
         f"the NATS servers around {path.url} have no quorum: more than half of them must run and reach each "
@@ -123,7 +123,7 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
 
 
 async def _kept_on(path: ServerPath) -> int:
-    """Return the least number of servers that keep a bucket; 0 where one is missing."""
+    """Return the least number of servers that keep a bucket; 0 if one is missing."""
     kept = []
     for bucket in names.BUCKETS:
         info = await _info(path, f"KV_{bucket}")
@@ -135,7 +135,7 @@ async def _kept_on(path: ServerPath) -> int:
 
 
 async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
-    """Return the state of a stream, None where there is none; a leader is waited for."""
+    """Return the state of a stream, None if there is none. An election is waited for."""
     ends = asyncio.get_running_loop().time() + WAIT_S
     while True:
         try:
@@ -167,13 +167,13 @@ async def _remove(path: ServerPath, stream: str) -> None:
 async def _try(
     path: ServerPath, subject: str, ends: float, settings: Mapping[str, Any] | None = None
 ) -> None:
-    """Ask for a stream to be changed; before the end of the time a failure is no matter, but for rights."""
+    """Request a change of a stream. Failures other than missing rights are ignored until the time is over."""
     try:
         await ask(path, subject, settings)
     except ServerError:
         if asyncio.get_running_loop().time() > ends:
             raise
-        await asyncio.sleep(0.2)  # no leader yet, or it is under way
+        await asyncio.sleep(0.2)  # no leader yet, or in progress
     except NoRight:
         raise
     except FleetError as failure:
@@ -198,7 +198,7 @@ async def _wait_for_plant(path: ServerPath) -> None:
 
 
 async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
-    """Let several claimants ask for the same revision, again and again: one alone may get it."""
+    """Let several claimants request the same revision, again and again: only one may get it."""
     settings = bucket_settings(CONTEST, replicas)
     await _create(paths[0], settings)
     try:
@@ -215,7 +215,7 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
             if len(granted) > 1:
                 raise FleetError(
                     f"the NATS servers around {paths[0].url} gave one revision of a key to {len(granted)} of "
-                    f"{CLAIMANTS} claimants at once; no lease is safe there"
+                    f"{CLAIMANTS} claimants at once: no lease is safe there"
                 )
             revision = granted[0] if granted else await _revision(claimants[0], paths[0])
             if unsure > 2 * ROUNDS:
