@@ -65,7 +65,7 @@ def test_the_help_describes_each_argument(run: Run, name: str) -> None:
             "may be left out: then a share and the seed are 0, and the longest times and bursts are as",
         ),
         ("fleet serve", "spool, logs and lock; NAME in ~/.local/state/multidrop/fleet if not given"),
-        ("fleet stop", "what was asked for; else commands.jsonl in ~/.local/state/multidrop/fleet"),
+        ("fleet stop", "this machine's commands; else commands.jsonl in ~/.local/state/multidrop/fleet"),
     ],
 )
 def test_the_help_names_the_defaults_of_options(run: Run, name: str, told: str) -> None:

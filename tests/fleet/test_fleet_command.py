@@ -172,7 +172,7 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
         (["start", "pump-1", "pump-2"], "unrecognized arguments: pump-2"),
         (["start", "pump-1", "--all"], "unrecognized arguments: --all"),
         (["start", "pump-1", "--direction", "up"], "invalid choice: 'up'"),
-        (["set-frequency", "pump-1", "fast"], "HZ = fast is no number; write 25"),
+        (["set-frequency", "pump-1", "fast"], "HZ = fast is not a number; write 25"),
         (["stop"], "the stop was NOT sent: stop takes either drives or --all"),
         (["stop", "pump-1", "--all"], "stop takes either drives or --all"),
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),

@@ -263,7 +263,7 @@ def test_the_command_shows_no_secret(run: Run, tmp_path: Path) -> None:
 def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
     status, _, err = run("fleet", "rights", "gw-1", "--nats", "nats://a:4222", "--folder", tmp_path)
     assert (status, len(err.splitlines())) == (0, 1)
-    assert "without TLS the network reads samples and commands too" in err
+    assert "without TLS anyone on the network can read samples and commands" in err
     assert "tls" not in (tmp_path / "n1.conf").read_text()
 
 

@@ -90,13 +90,13 @@ def test_lines_that_do_not_fit_are_counted_and_the_masterless_come_first() -> No
 def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
     head = [drawn(told(), width).splitlines()[2] for width in (200, 80, 72, 64, 56, 48, 40)]
     assert [re.sub(" +", " ", one) for one in head] == [
-        "GATEWAY HOST SESSION SINCE STATE LINES MARGIN SPOOL BEHIND LAG LOST",
-        "GATEWAY HOST SESSION STATE LINES MARGIN SPOOL BEHIND LAG LOST",
-        "GATEWAY SESSION STATE LINES MARGIN SPOOL BEHIND LAG LOST",
-        "GATEWAY STATE LINES MARGIN SPOOL BEHIND LAG LOST",
-        "GATEWAY STATE LINES MARGIN BEHIND LAG LOST",
-        "GATEWAY STATE LINES MARGIN BEHIND LOST",
-        "GATEWAY STATE LINES BEHIND LOST",
+        "GATEWAY HOST SESSION SINCE STATE LINES LEASE SPOOL UNSENT LAG LOST",
+        "GATEWAY HOST SESSION STATE LINES LEASE SPOOL UNSENT LAG LOST",
+        "GATEWAY SESSION STATE LINES LEASE SPOOL UNSENT LAG LOST",
+        "GATEWAY STATE LINES LEASE SPOOL UNSENT LAG LOST",
+        "GATEWAY STATE LINES LEASE UNSENT LAG LOST",
+        "GATEWAY STATE LINES LEASE UNSENT LOST",
+        "GATEWAY STATE LINES UNSENT LOST",
     ]
 
 
@@ -172,7 +172,7 @@ def test_a_gateway_that_is_missing_and_a_lost_port_are_told(
         assert asyncio.run(look._status(Namespace(json=False), [])) == 1
         assert sentence in capsys.readouterr().out.splitlines()
     assert "1 with a lost port" in drawn(lost)
-    assert "gw-1: line line-2 cannot be opened from here, and was handed over" in drawn(lost)
+    assert "gw-1: line line-2 cannot be opened from here; another gateway polls it" in drawn(lost)
 
 
 def test_lines_are_in_the_order_of_their_numbers() -> None:

@@ -59,9 +59,8 @@ CLIENTS = {  # rooms that use what a package's __init__ names, and the commands 
     "fleet": {
         *(f"cli/fleet/{name}.py" for name in ("commands", "connection", "drain", "init", "look")),
         *(f"cli/fleet/{name}.py" for name in ("rights", "serve", "watch")),
-        "cli/fleet/demo/command.py",
+        "cli/fleet/demo.py",
         "cli/hub.py",
-        "cli/fleet/nats.py",
     },
 }
 ROOMS = ("core", "drive", "families", "plant", "transport", "control", "polling", "recording", "history")

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.nats import URLS, add_nats_arguments, nats_options, nats_urls
+from multidrop.cli.fleet.connection import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument

@@ -1,4 +1,4 @@
-"""Requests that are under way when a line is handed over: each of them has its row."""
+"""Requests in flight while a line is handed over: each of them has its row."""
 
 from __future__ import annotations
 
@@ -10,9 +10,17 @@ from pathlib import Path
 
 import pytest
 from lines import until
+from numbered_answers import (
+    PORT,
+    Answers,
+    KeptRow,
+    NumberedDrive,
+    drive_name,
+    judge_drive,
+    plant_file,
+)
+from tables import table
 
-from multidrop.cli.fleet.demo.judgement import Answers, KeptRow, judge_drive
-from multidrop.cli.fleet.demo.numbered_lines import PORT, NumberedDrive, drive_name, plant_file
 from multidrop.core import UNASKED, Mastership
 from multidrop.families import InnovertIBD
 from multidrop.plant.loader import load_plant
@@ -30,7 +38,7 @@ HOUR_NS = 3600 * SECOND
 
 @contextmanager
 def simulated_line(folder: Path, delay: float) -> Iterator[tuple[list[NumberedDrive], PlantLine]]:
-    """Give two drives that answer after so many seconds, and their line."""
+    """Yield two drives that answer after `delay` seconds, and their line."""
     drives = [
         NumberedDrive(InnovertIBD(address=at, name=drive_name("line", at)), response_delay=delay)
         for at in (1, 2)
@@ -42,7 +50,7 @@ def simulated_line(folder: Path, delay: float) -> Iterator[tuple[list[NumberedDr
 
 
 class Gateway:
-    """A poller with a mastership that holds, and all of its rows of values that were asked for."""
+    """A poller with a valid mastership, and its rows of values that were requested."""
 
     def __init__(self, folder: Path) -> None:
         self.mastership = Mastership(guard_s=0.01)
@@ -71,7 +79,7 @@ def gateways(tmp_path: Path) -> Iterator[list[Gateway]]:
 
 
 def hand_over(gateway: Gateway, drives: list[NumberedDrive], line: PlantLine) -> None:
-    """Poll until a drive has taken a request that it has not answered yet, and let the line go then."""
+    """Poll until a drive has received a request, and close the line before it answers."""
     gateway.poller.add_line(line)
     begun = sum(drive.answers for drive in drives)
     until(lambda: sum(drive.answers for drive in drives) > begun)
@@ -90,16 +98,13 @@ def judge(drives: list[NumberedDrive], gateways: list[Gateway]) -> list[Answers]
                 if row.drive == drive.drive.name
             ],
             drive.answers,
-            None,
         )
         for drive in drives
     ]
 
 
 @pytest.mark.slow
-def test_a_line_goes_to_and_fro_with_a_request_under_way_each_time(
-    tmp_path: Path, gateways: list[Gateway]
-) -> None:
+def test_no_row_is_lost_when_a_line_moves_between_gateways(tmp_path: Path, gateways: list[Gateway]) -> None:
     with simulated_line(tmp_path, delay=0.1) as (drives, line):
         for turn in range(8):
             hand_over(gateways[turn % 2], drives, line)
@@ -108,7 +113,7 @@ def test_a_line_goes_to_and_fro_with_a_request_under_way_each_time(
     assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
 
 
-def test_a_request_that_is_not_waited_for_any_longer_says_so(
+def test_an_abandoned_request_has_a_row_with_its_status(
     tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)
@@ -118,3 +123,40 @@ def test_a_request_that_is_not_waited_for_any_longer_says_so(
         judged = judge(drives, gateways)
     assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
     assert {row.status for gateway in gateways for row in gateway.rows} == {"poll ended"}
+
+
+def rows(*numbers: int | None) -> list[KeptRow]:
+    """Return a row each 100 ns; 0 leaves one out, None is a miss."""
+    return [KeptRow(100 * at, number) for at, number in enumerate(numbers) if number != 0]
+
+
+@table(
+    ("found", "answered", "expected"),
+    [
+        (rows(1, 2, 3), 3, Answers(3, 3)),
+        (rows(), 0, Answers()),
+        (rows(1, None, 3), 3, Answers(3, 2, late=1)),
+        (rows(1, None, 2), 2, Answers(2, 2)),
+        (rows(1, 3), 3, Answers(3, 2, lost=1)),
+        (rows(1, None, 4), 4, Answers(4, 2, late=1, lost=1)),
+        (rows(1, 2), 3, Answers(3, 2, lost=1)),
+        (rows(1, 2, 2, 3), 3, Answers(3, 3, doubled=1)),
+    ],
+)
+def test_the_judge_finds_lost_and_doubled_answers(
+    found: list[KeptRow], answered: int, expected: Answers
+) -> None:
+    assert judge_drive(found, answered) == expected
+
+
+@pytest.mark.long
+def test_late_answers_have_a_row_that_says_so(tmp_path: Path, gateways: list[Gateway]) -> None:
+    with simulated_line(tmp_path, delay=0.02) as (drives, line):
+        gateways[0].poller.add_line(line)
+        for delay in (0.02, 0.45, 0.02, 0.9, 0.02):
+            drives[0].response_delay = delay
+            begun = drives[0].answers
+            until(lambda begun=begun: drives[0].answers >= begun + 3)  # type: ignore[misc]
+        judged = judge(drives, gateways)
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+    assert judged[0].late > 0

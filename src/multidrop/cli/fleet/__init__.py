@@ -1,20 +1,20 @@
-"""The `fleet` command: several gateways for the lines of one plant, by NATS JetStream.
+"""The `fleet` command: several gateways share the lines of one plant through NATS JetStream.
 
-Each action is a command of its own; verbs to drives are those of the commands outside.
+Each action is a command of its own, named like the same command outside a fleet.
 """
 
 ACTIONS = {  # name: module in this package, and help
-    "demo": ("demo.command", "kill a gateway of a simulated fleet; show what is missing"),
+    "demo": ("demo", "kill a gateway of a simulated fleet and show the takeover"),
     "rights": ("rights", "write the servers' configuration, and a key for each user"),
-    "init": ("init", "make what is missing in the NATS servers, and store the plant"),
-    "serve": ("serve", "run the gateway of this name"),
-    "drain": ("drain", "let a gateway give all its lines away"),
-    "status": ("look", "say how the gateways are; status 1 where a master is missing"),
-    "lines": ("look", "list the lines, and who is master of each since when"),
+    "init": ("init", "set the NATS servers up, and store the plant"),
+    "serve": ("serve", "run the gateway with this name"),
+    "drain": ("drain", "move all lines of a gateway to the others"),
+    "status": ("look", "show all gateways; exit status 1 if a line is not polled"),
+    "lines": ("look", "list the lines with their masters"),
     "watch": ("watch", "show the fleet live on a terminal"),
-    "stop": ("commands", "stop drives, or all of them; asks nobody"),
-    "coast": ("commands", "take the voltage off and let a motor run out; asks nobody"),
-    "emergency-stop": ("commands", "stop a drive by its own emergency stop; asks nobody"),
+    "stop": ("commands", "stop drives, or all of them, without confirmation"),
+    "coast": ("commands", "let a motor coast to a stop, without confirmation"),
+    "emergency-stop": ("commands", "use a drive's emergency stop, without confirmation"),
     "write": ("commands", "write one register of a drive"),
     "set-frequency": ("commands", "write a drive's frequency setpoint"),
     "start": ("commands", "start a drive's motor"),

@@ -16,8 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli import STOPS
-from multidrop.cli.fleet.connection import STATE, add_server_arguments, run_action, state_folder, urls_of
-from multidrop.cli.fleet.nats import nats_options
+from multidrop.cli.fleet.connection import (
+    STATE,
+    add_server_arguments,
+    nats_options,
+    run_action,
+    state_folder,
+    urls_of,
+)
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.writing import confirm
 from multidrop.printable import plain_number, printable
@@ -28,7 +34,7 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments behind the drive
+_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments after the drive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,15 +48,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for word in _FURTHER.get(action, ()):
         parser.add_argument(word.lower(), metavar=word)
     if action in _DIRECTED:
-        parser.add_argument("--direction", choices=_DIRECTIONS, help="as in force if not given")
+        parser.add_argument("--direction", choices=_DIRECTIONS, help="the present one if not given")
     if action not in STOPS:
-        parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
-    parser.add_argument("--by", metavar="NAME", help="whom the logs name; else USER@HOST")
+        parser.add_argument("--yes", action="store_true", help="do not ask; needed without a terminal")
+    parser.add_argument("--by", metavar="NAME", help="name for the logs; else USER@HOST")
     parser.add_argument(
         "--audit",
         metavar="FILE",
         type=Path,
-        help=f"where this machine notes what was asked for; else commands.jsonl in {STATE}",
+        help=f"log of this machine's commands; else commands.jsonl in {STATE}",
     )
     add_server_arguments(parser)
 
@@ -66,7 +72,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
     if arguments.command in STOPS:
-        by = printable(by)[:MOST_CHARACTERS]  # no name keeps a stop back
+        by = printable(by)[:MOST_CHARACTERS]  # no name may hold a stop back
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
         raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
     log, urls = arguments.audit or state_folder() / "commands.jsonl", urls_of(arguments)
@@ -75,7 +81,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 
 @asynccontextmanager
 async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]:
-    """Give who asks. Where there is none a stop's failure says that nothing was sent."""
+    """Yield a connected commander. If that fails, a stop's error says that nothing was sent."""
     from multidrop.fleet.commands.fleet_commands import HARD_WIRED
     from multidrop.fleet.errors import FleetError
 
@@ -91,13 +97,13 @@ async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]
 
 
 def _user() -> str:
-    with suppress(OSError, KeyError):  # an id without a name, as in a container
+    with suppress(OSError, KeyError):  # a user id without a name, as in a container
         return getpass.getuser()
     return str(os.getuid())
 
 
 def _what(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the command as FleetCommands.request takes it. Raises ValueError for HZ that is no number."""
+    """Return the arguments of FleetCommands.request. Raises ValueError if HZ is not a number."""
     action = arguments.command
     if action == "write":
         return {"register": arguments.register, "value": arguments.value}
@@ -106,16 +112,16 @@ def _what(arguments: argparse.Namespace) -> dict[str, Any]:
         try:
             options["hz"] = plain_number(arguments.hz)
         except ValueError:
-            raise ValueError(f"HZ = {arguments.hz} is no number; write 25") from None
+            raise ValueError(f"HZ = {arguments.hz} is not a number; write 25") from None
     elif getattr(arguments, "direction", None):
         options["direction"] = arguments.direction
     return {"verb": action.replace("-", "_"), "options": options}
 
 
 async def _command(arguments: argparse.Namespace) -> int:
-    """Show what would be done, let a person agree, and have it done by a new offer.
+    """Show the command, let a person confirm it, and carry it out by a new offer.
 
-    The offer that was shown lasts for a second only, and a person takes longer.
+    The offer that was shown is valid for one second only, and a person takes longer.
     """
     from multidrop.fleet.commands.messages import CommandAnswer
 
@@ -126,7 +132,7 @@ async def _command(arguments: argparse.Namespace) -> int:
         if isinstance(preview, CommandAnswer):
             return _show(arguments, preview)
         agreed = preview.text
-        confirm(f"{agreed}; gateway {preview.gateway} is to do it?", arguments)
+        confirm(f"{agreed}; carry it out through gateway {preview.gateway}?", arguments)
     async with _asking(arguments) as asker:
         request = asker.request(arguments.drive, **what)
         with _annotating(request.words):
@@ -146,11 +152,11 @@ async def _stop(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _annotating(what: str) -> Iterator[None]:
-    """Say that the outcome is not known, where Ctrl-C ends the wait for the answer."""
+    """If Ctrl-C interrupts the wait for an answer, print that the outcome is unknown."""
     try:
         yield
     except asyncio.CancelledError:
-        warn(f"{what}: it is not known whether it was sent; look at the drive, and at the gateway's log")
+        warn(f"{what}: it is not known whether it was sent; check the drive, and the gateway's log")
         raise
 
 
@@ -163,7 +169,7 @@ def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
 
 
 def _show_news(answer: CommandAnswer) -> None:
-    with suppress(OSError):  # nobody may be there to read it, and the stop goes on
+    with suppress(OSError):  # the stop continues even if stderr is closed
         print_text(_sentence(answer), file=sys.stderr)
 
 

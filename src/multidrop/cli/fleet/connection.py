@@ -1,34 +1,87 @@
-"""The servers of a fleet: their addresses, and the paths to them that an action has."""
+"""The NATS servers of a fleet: options, addresses, and the paths that an action uses."""
 
 from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
+import os
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.nats import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.signals import run_loop
 from multidrop.control.eeprom_ledger import default_path
+from multidrop.printable import masked
+
+URLS = "nats://127.0.0.1:4222"
+CREDENTIALS, CA = "MULTIDROP_NATS_CREDENTIALS", "MULTIDROP_NATS_CA"
+
+
+def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--credentials",
+        metavar="FILE",
+        type=Path,
+        help=f"key of `fleet rights`, or .creds; else {CREDENTIALS}",
+    )
+    parser.add_argument(
+        "--ca", metavar="FILE", type=Path, help=f"issuer of the servers' certificates; else {CA}"
+    )
+
+
+def nats_urls(given: str | None) -> list[str]:
+    """Return the servers' URLs: those given, separated by commas, or MULTIDROP_NATS.
+
+    Raises ValueError for an empty list, and for a URL that is not nats:// or tls://.
+    """
+    text = given or os.environ.get("MULTIDROP_NATS") or URLS
+    found = [url.strip() for url in text.split(",") if url.strip()]
+    for url in found:
+        if not url.startswith(("nats://", "tls://")):
+            raise ValueError(f"{masked(url)} is not an address of a NATS server; write {URLS}")
+    if not found:
+        raise ValueError(f"{masked(text)!r} names no NATS server; write {URLS}")
+    return found
+
+
+def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
+    """Return the options of a connection. Raises ValueError for a file without a key."""
+    from multidrop.fleet.servers.credentials import connect_options
+
+    logging.getLogger("asyncio").addFilter(_is_news)
+    credentials = arguments.credentials or _named(CREDENTIALS)
+    if credentials:
+        require_extra("nkeys", "fleet", "fleet --credentials")
+    return connect_options(urls, credentials, arguments.ca or _named(CA))
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Drop a log line that asyncio of Python 3.11 writes for each TLS connection closed by the far end."""
+    return "eof_received" not in record.getMessage()
+
+
+def _named(variable: str) -> Path | None:
+    text = os.environ.get(variable)
+    return Path(text) if text else None
+
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
-STATE = "~/.local/state/multidrop/fleet"  # state_folder(), where XDG_STATE_HOME is not set
+STATE = "~/.local/state/multidrop/fleet"  # state_folder(), if XDG_STATE_HOME is not set
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every action takes that speaks with the servers, and says something of what it did."""
+    """Add the options of every action that talks to the servers and prints a result."""
     add_address_arguments(parser)
     add_json_argument(parser)
 
 
 def add_address_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add where the servers are, and who asks."""
+    """Add the servers' addresses and credentials."""
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
@@ -36,33 +89,33 @@ def add_address_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def urls_of(arguments: argparse.Namespace) -> list[str]:
-    """Return the servers' URLs. Raises ValueError for none, and for one that is not nats:// or tls://."""
+    """Return the servers' URLs. Raises ValueError for an invalid or empty list."""
     return nats_urls(arguments.nats)
 
 
 def state_folder() -> Path:
-    """Return the folder of this user's gateways, and of the log of commands that this user asked for.
+    """Return the folder of this user's gateways and log of commands.
 
-    It is beside the ledger: a user without a home has one that cannot be kept, and a stop needs none.
+    It is beside the ledger. A user without a home cannot keep a ledger, and stops do not need one.
     """
     return default_path().parent / "fleet"
 
 
 def require_fleet() -> None:
-    """Raise ValueError where a library is missing that every action needs."""
+    """Raise ValueError if a library is missing that every action needs."""
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
 
 
 def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
-    """Run an action in an event loop of its own, and print the errors that the fleet logs."""
+    """Run an action in its own event loop, and print the fleet's errors."""
     require_fleet()
     with logging_to(warn, "multidrop.fleet", logging.ERROR):
         return run_loop(work())
 
 
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
-    """Run an action with three paths to the servers, which are closed afterwards."""
+    """Run an action with three paths to the servers, and close them afterwards."""
 
     async def with_paths() -> int:
         from multidrop.fleet.servers.connections import paths_of

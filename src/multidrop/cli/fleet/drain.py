@@ -1,4 +1,4 @@
-"""`multidrop fleet drain`: lets a gateway give all its lines away."""
+"""`multidrop fleet drain`: moves all lines of a gateway to the others."""
 
 from __future__ import annotations
 

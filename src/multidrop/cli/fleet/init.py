@@ -1,4 +1,4 @@
-"""`multidrop fleet init`: makes what a fleet needs in its NATS servers, and stores the plant there."""
+"""`multidrop fleet init`: sets the NATS servers up for a fleet, and stores the plant."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, run_with_paths, urls_of
-from multidrop.cli.fleet.nats import nats_options
+from multidrop.cli.fleet.connection import (
+    add_server_arguments,
+    nats_options,
+    require_fleet,
+    run_with_paths,
+    urls_of,
+)
 from multidrop.cli.fleet.tables import size
 from multidrop.cli.support.output import print_text, warn
 
@@ -27,12 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PLANT.toml",
         nargs="?",
         type=Path,
-        help="the plant to be stored; the one that is stored stays if not given",
+        help="the plant to store; without it the stored one stays",
     )
     parser.add_argument(
         "--keep",
         metavar="SIZE",
-        help=f"most that each server keeps of samples, where their stream is made now; {KEEP} if not given",
+        help=f"limit of the samples on each server, if their stream is new; {KEEP} if not given",
     )
     add_server_arguments(parser)
 
@@ -68,9 +73,9 @@ async def _init(
         made["lines"] = await store(Bucket(names.PLANT, lambda: paths[0]), records)
     if kept < 0 or (arguments.keep and kept != keep):
         word = (
-            "has no limit: when it fills the servers no line is polled"
+            "has no limit: when it fills the servers, no line is polled"
             if kept < 0
-            else f"keeps {size(kept)} still"
+            else f"still keeps {size(kept)}"
         )
         warn(f"the stream of samples {word}; `nats stream edit samples --max-bytes {keep}` changes that")
     if arguments.json:

@@ -1,4 +1,4 @@
-"""`multidrop fleet status` and `lines`: show what a fleet's records and its gateways say of it."""
+"""`multidrop fleet status` and `lines`: show a fleet by its records and its gateways' answers."""
 
 from __future__ import annotations
 

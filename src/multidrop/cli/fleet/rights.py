@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files, and say where each belongs. Secrets are in the files alone, and never printed."""
+    """Write the files, and print where each belongs. Secrets are only in the files."""
     require_fleet()
     require_extra("nkeys", "fleet", "fleet rights")
     from multidrop.fleet.servers.files import write_files
@@ -45,11 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_text(
             f"{folder}: copy rights.conf to each server, with the .conf of its name, and each key of keys/ "
-            "to the machine of its user alone, where --credentials names it. A server that runs must read "
+            "only to the machine of its user, for --credentials. A running server must read "
             "them twice: say `nats-server --signal reload` two times"
         )
     if tls is None:
-        warn("without TLS the network reads samples and commands too: give --ca, --cert and --key")
+        warn("without TLS anyone on the network can read samples and commands: give --ca, --cert and --key")
     return 0
 
 

@@ -23,9 +23,9 @@ from multidrop.cli.fleet.tables import (
 )
 from multidrop.cli.support.screen_text import cut
 
-OLD_S = 3.0  # an older look is not shown as the present
-NOTES = 4  # lines of what happened, and of troubles
-MOVES = 8  # rows of the moves with their head, where lines need the room
+OLD_S = 3.0  # an older view is shown as old
+NOTES = 4  # lines of notes, and of problems
+MOVES = 8  # rows of moves with their head, if lines need the room
 
 
 def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
@@ -40,7 +40,7 @@ def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
 
 
 def _body(told: Told, width: int, room: int) -> list[str]:
-    """Return gateways whole, and of moves and lines as many as there is room for."""
+    """Return all gateways, and as many moves and lines as fit."""
     begin = [*gateway_table(told, width - 1), "", count_sentence(told), *trouble_sentences(told)[:NOTES], ""]
     room = max(0, room - len(begin))
     silent = silent_gateways(told)
@@ -51,7 +51,7 @@ def _body(told: Told, width: int, room: int) -> list[str]:
 
 
 def _notes(told: Told, width: int) -> list[str]:
-    """Return the last notes of what happened, each wrapped: as many as there is room for."""
+    """Return the last notes, wrapped, as many as fit."""
     wrapped = [line for note in told.get("notes", ()) for line in textwrap.wrap(note, width - 1)]
     return wrapped[-NOTES:]
 
@@ -65,13 +65,13 @@ def _fitting(lines: list[str], room: int) -> list[str]:
     if len(lines) <= room:
         return lines
     kept = room - 1
-    if kept < 2:  # a head alone
+    if kept < 2:  # only a head
         return []
     return [*lines[:kept], f"and {len(lines) - kept} more lines"]
 
 
 def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list[str | int]]:
-    """Order the lines without a master before those whose master does not answer, and both before others."""
+    """Order lines without a master first, then those whose master does not answer."""
     return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 
@@ -84,7 +84,7 @@ def _title(told: Told, head: str, width: int) -> Text:
 def _warning(told: Told, width: int) -> Text:
     if not told["trouble"]:
         return Text()
-    age = "nothing was read yet" if told["age_s"] is None else f"this is {told['age_s']:.0f} s old"
+    age = "not read yet" if told["age_s"] is None else f"this is {told['age_s']:.0f} s old"
     return Text(_cut(f"{age}: {told['trouble']}", width), style="bold red")
 
 

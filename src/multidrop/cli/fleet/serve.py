@@ -8,8 +8,14 @@ import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-from multidrop.cli.fleet.connection import STATE, add_address_arguments, require_fleet, state_folder, urls_of
-from multidrop.cli.fleet.nats import nats_options
+from multidrop.cli.fleet.connection import (
+    STATE,
+    add_address_arguments,
+    nats_options,
+    require_fleet,
+    state_folder,
+    urls_of,
+)
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.output import logging_by, print_text
 from multidrop.cli.support.signals import on_end_signals, run_loop
@@ -17,7 +23,7 @@ from multidrop.supervisor import supervisor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("gateway", metavar="NAME", help="its name, such as gw-1; each has one of its own")
+    parser.add_argument("gateway", metavar="NAME", help="its name, such as gw-1, unique in the fleet")
     parser.add_argument(
         "--folder",
         metavar="DIR",
@@ -25,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"for its spool, logs and lock; NAME in {STATE} if not given",
     )
     parser.add_argument(
-        "--keep", metavar="SIZE", default="10 GB", help="most that the spool takes; 10 GB if not given"
+        "--keep", metavar="SIZE", default="10 GB", help="size limit of the spool; 10 GB if not given"
     )
     parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there")
     add_log_argument(parser)

@@ -10,7 +10,7 @@ from typing import Any
 
 from multidrop.cli.support.values import Row, aligned, counted
 
-Told = Mapping[str, Any]  # as `--json` prints it
+Told = Mapping[str, Any]  # a fleet, as `--json` prints it
 GATEWAYS = (
     "GATEWAY",
     "HOST",
@@ -18,21 +18,21 @@ GATEWAYS = (
     "SINCE",
     "STATE",
     "LINES",
-    "MARGIN",
+    "LEASE",
     "SPOOL",
-    "BEHIND",
+    "UNSENT",
     "LAG",
     "LOST",
 )
 LINES = ("LINE", "PORT", "MASTER", "SINCE")
-# Columns that are left out, in this order, where a terminal is too narrow for all.
-LEFT_OUT = ("SINCE", "HOST", "SESSION", "SPOOL", "LAG", "MARGIN")
+# Columns that are dropped, in this order, if the terminal is too narrow.
+LEFT_OUT = ("SINCE", "HOST", "SESSION", "SPOOL", "LAG", "LEASE")
 LINES_LEFT_OUT = ("PORT", "SINCE")
 UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def moment(ms: int | None) -> str:
-    """Return a time (ms since 1970) as UTC; "?" for none, and for a number that no calendar has."""
+    """Return a time (ms since 1970) as UTC; "?" for None and for an invalid one."""
     try:
         return "?" if ms is None else time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ms // 1000))
     except (OverflowError, ValueError, OSError):
@@ -40,13 +40,13 @@ def moment(ms: int | None) -> str:
 
 
 def gateway_table(fleet: Told, width: float = inf) -> list[str]:
-    """Return the table of gateways, without some columns where it would be wider than `width`."""
+    """Return the table of gateways, without some columns if it would be wider than `width`."""
     rows = [_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items()]
     return _fitting([GATEWAYS, *rows], "<<><<>>>>>>", LEFT_OUT, width)
 
 
 def _fitting(table: list[Row], sides: str, left_out: Iterable[str], width: float) -> list[str]:
-    """Return the lines of a table, whose first row is its head, without as many columns as need be."""
+    """Return the lines of a table, whose first row is its head, with as many columns as fit."""
     for column in left_out:
         found = aligned(table, sides)
         if max(map(len, found)) <= width:
@@ -85,12 +85,12 @@ def size(number: float) -> str:
 
 
 def natural(name: str) -> list[str | int]:
-    """Return a key that orders names as people do: line-2 before line-10."""
+    """Return a sort key that puts line-2 before line-10."""
     return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def line_table(fleet: Told, names: Iterable[str], width: float = inf) -> list[str]:
-    """Return the table of these lines, without some columns where it would be wider than `width`."""
+    """Return the table of these lines, without some columns if it would be wider than `width`."""
     silent = silent_gateways(fleet)
     rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
     return _fitting([LINES, *rows], "<<<<", LINES_LEFT_OUT, width)
@@ -103,7 +103,7 @@ def _line_row(name: str, line: Told, silent: set[str]) -> Row:
 
 
 def silent_gateways(fleet: Told) -> set[str]:
-    """Return the gateways that do not answer: nobody may poll their lines."""
+    """Return the gateways that do not answer: their lines may not be polled."""
     return {name for name, gateway in fleet["gateways"].items() if gateway["says"] is None}
 
 
@@ -119,17 +119,17 @@ def unsure_lines(fleet: Told) -> list[str]:
 
 
 def lost_lines(fleet: Told) -> list[str]:
-    """Return the lines whose master has lost their port: nobody polls them."""
+    """Return the lines whose master has lost their port: they are not polled."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
 
 
 def failing_lines(fleet: Told) -> list[str]:
-    """Return the lines on which polling raises exceptions: their values are missed."""
+    """Return the lines on which polling raises exceptions: their values are missing."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "failing")]
 
 
 def _lines_in(says: Told | None, key: str) -> list[str]:
-    """Return the lines that a gateway's answer lists; none for an answer without such a list."""
+    """Return the lines that a gateway's answer lists; none if it has no such list."""
     found = (says or {}).get(key)
     return [line for line in found if isinstance(line, str)] if isinstance(found, list) else []
 
@@ -143,7 +143,7 @@ def count_sentence(fleet: Told) -> str:
 
 
 def move_table(moves: Iterable[Told], width: float = inf) -> list[str]:
-    """Return a line for each move: when, which line, from whom, to whom; from whom only where it fits."""
+    """Return a line for each move: time, line, former and new master; the former one only if it fits."""
     rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
     found = aligned(rows, "<<<<")
     if max(map(len, found), default=0) <= width:
@@ -157,7 +157,7 @@ def _from_to(move: Told) -> tuple[str, str]:
 
 
 def trouble_sentences(fleet: Told) -> list[str]:
-    """Return the troubles that gateways report, a sentence for each."""
+    """Return the problems that gateways report, a sentence for each."""
     found = [
         f"{name} on {gateway['host']} is missing: last seen {moment(gateway['seen_ms'])}"
         for name, gateway in fleet.get("missing", {}).items()
@@ -166,7 +166,7 @@ def trouble_sentences(fleet: Told) -> list[str]:
         says = gateway["says"] or {}
         found += [f"{name}: line {line}: {why}" for line, why in (says.get("troubles") or {}).items()]
         found += [
-            f"{name}: line {line} cannot be opened from here, and was handed over"
+            f"{name}: line {line} cannot be opened from here; another gateway polls it"
             for line in _lines_in(says, "unopened")
             if line in fleet["lines"] and fleet["lines"][line]["master"] != name
         ]

@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
-    """Show the fleet until Ctrl-C. While no server answers, what was seen last stays, with its age."""
+    """Show the fleet until Ctrl-C. While no server answers, show the last view with its age."""
     from multidrop.fleet.overview import FleetView, FleetWatch
     from multidrop.fleet.servers.setup import open_all
     from multidrop.supervisor import end_tasks
@@ -60,9 +60,9 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
 
 
 async def follow(watch: FleetWatch, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
-    """Look once a second, and show what was found with its age, until it is over.
+    """Show the fleet once a second, with the age of the view, until `over` is set.
 
-    Raises Ended if what keeps the connection has ended.
+    Raises Ended if the task that keeps the connection has ended.
     """
     while not over.is_set():
         supervisor().check()
@@ -80,7 +80,7 @@ def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
 
 @contextmanager
 def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Give a function that draws a fleet on the whole terminal.
+    """Yield a function that draws a fleet on the whole terminal.
 
     On a terminal without cursor control each picture is printed below the last one.
     """
@@ -102,7 +102,7 @@ def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str,
     with console.screen(hide_cursor=True) as screen:
 
         def draw(told: dict[str, Any]) -> None:
-            console.control(Control.home())  # else rich draws below the last picture
+            console.control(Control.home())  # otherwise rich draws below the last picture
             screen.update(drawn(told))
 
         yield draw

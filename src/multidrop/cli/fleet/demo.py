@@ -1,0 +1,271 @@
+"""`multidrop fleet demo`: a fleet on this machine; one gateway is killed, and the others take over."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from multidrop.cli.fleet.connection import CA, CREDENTIALS, require_fleet
+from multidrop.cli.fleet.demo_processes import (
+    Children,
+    free_ports,
+    server_program,
+    start_nodes,
+    temporary_folder,
+)
+from multidrop.cli.fleet.tables import natural
+from multidrop.cli.fleet.watch import drawing, follow
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.signals import end_signals_cancel
+
+GATEWAYS = ("gw-1", "gw-2", "gw-3")
+KILLED = "gw-2"
+LINES = 12
+DRIVES = 2  # on each line
+WAIT_S = 60.0  # for steps that take seconds on an idle machine
+RUN_S = 2.0  # before the kill, and after each step
+KEEP = "100 MB"  # of samples, of the 256 MB of each server
+
+Fleet = dict[str, Any]
+
+
+class Stage:
+    """The notes so far, and the newest view of the fleet."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.draw: Callable[[Fleet], object] | None = None  # on a terminal
+        self.fleet: Fleet = {"gateways": {}, "lines": {}}
+        self.updated = asyncio.Event()
+        self._started = time.monotonic()
+
+    def note(self, sentence: str) -> None:
+        self.notes.append(f"{time.monotonic() - self._started:5.1f} s  {sentence}")
+        if self.draw is None:
+            print_text(self.notes[-1], flush=True)
+
+    def show(self, fleet: Fleet) -> None:
+        self.fleet = fleet
+        self.updated.set()
+        if self.draw:
+            self.draw({**fleet, "notes": self.notes})
+
+    def masters(self) -> dict[str, str | None]:
+        return {name: line["master"] for name, line in self.fleet["lines"].items()}
+
+    def are_masters(self, gateways: Sequence[str]) -> bool:
+        """Return True if exactly these gateways are the masters of all lines."""
+        return set(self.masters().values()) == set(gateways)
+
+    def unsent(self) -> list[int | None]:
+        """Return the number of unsent messages of each gateway; None if unknown."""
+        answers = [gateway["says"] for gateway in self.fleet["gateways"].values()]
+        return [answer and answer["spool"]["behind"] for answer in answers]
+
+    def shares(self) -> str:
+        """Return the number of lines of each gateway, as text."""
+        found = list(self.masters().values())
+        return ", ".join(f"{name} {found.count(name)}" for name in GATEWAYS if name in found)
+
+    async def until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait for a view in which the condition holds. Raises OSError after a minute."""
+        try:
+            async with asyncio.timeout(WAIT_S):
+                while not condition():
+                    self.updated.clear()
+                    await self.updated.wait()
+        except TimeoutError:
+            raise OSError(f"{what} not within {WAIT_S:.0f} s: the demo has failed") from None
+
+    async def calm(self, seconds: float) -> None:
+        """Wait until no line has changed its master for so long: a view may lag."""
+        before: dict[str, str | None] | None = None
+        while (found := self.masters()) != before:
+            before = found
+            await asyncio.sleep(seconds)
+            self.updated.clear()
+            await self.until(self.updated.is_set, "the fleet was read")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Show the takeover; return 0 if the fleet's samples of all lines were stored."""
+    require_fleet()
+    from multidrop.fleet.servers.connections import OLDEST
+
+    program = server_program(OLDEST)
+    stage = Stage()
+    with temporary_folder() as folder, ExitStack() as stack:
+        none = dict.fromkeys((CREDENTIALS, CA), "")  # those of the user's own fleet
+        children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
+        stack.callback(children.close)
+        demo = Demo(folder, children, stage)
+        demo.start(program)
+        lines, killed_ns = asyncio.run(demo.play())
+        times = demo.end()
+    stored = sum(map(len, times.values()))
+    print_text(f"the hub has stored {stored} samples of {len(times)} drives")
+    gaps = [gap_s(times.get(drive, []), killed_ns) for line in lines for drive in drives_of(line)]
+    print_text(f"the lines of the killed gateway were unpolled for at most {max(gaps):.1f} s")
+    is_complete = len(times) == LINES * DRIVES and max(gaps) < WAIT_S
+    if not is_complete:
+        print_text("samples of some drives are MISSING")
+    return 0 if is_complete else 1
+
+
+def drives_of(line: str) -> list[str]:
+    return [f"{line}-drive-{address}" for address in range(1, DRIVES + 1)]
+
+
+def gap_s(times_ns: Sequence[int], killed_ns: int) -> float:
+    """Return the time (s) between the samples right before and after the kill; infinite if there are none."""
+    before = max((at for at in times_ns if at <= killed_ns), default=killed_ns)
+    after = min((at for at in times_ns if at > killed_ns), default=None)
+    return float("inf") if after is None else (after - before) / 1e9
+
+
+def plant_file(ports: Mapping[str, int]) -> str:
+    """Return a plant file with these lines, on ports of this machine."""
+    return "\n".join(
+        f'[[line]]\nname = "{line}"\nport = "tcp://127.0.0.1:{port}"\n'
+        + "".join(
+            f'[[line.drive]]\nname = "{drive}"\nmodel = "innovert-ibd"\naddress = {address}\n'
+            'poll = ["output_current"]\nevery = "100 ms"\n'
+            for address, drive in enumerate(drives_of(line), 1)
+        )
+        for line, port in ports.items()
+    )
+
+
+class Demo:
+    """The processes of the demo, from start to end."""
+
+    def __init__(self, folder: Path, children: Children, stage: Stage) -> None:
+        self._folder = folder
+        self._children = children
+        self._stage = stage
+        self._parquet = folder / "parquet"
+        self._urls = ""
+
+    def start(self, program: str) -> None:
+        """Start servers, lines, gateways and a hub."""
+        note, children, plant = self._stage.note, self._children, self._folder / "plant.toml"
+        lines = [f"line-{at}" for at in range(1, LINES + 1)]
+        plant.write_text(plant_file(dict(zip(lines, free_ports(LINES), strict=True))), "utf-8")
+        simulator = children.start_multidrop("lines", "simulate", str(plant))
+        assert simulator.stdout is not None
+        simulator.stdout.readline()  # the ports are open
+        self._urls = ",".join(start_nodes(children, self._folder, program))
+        note(f"three NATS servers are ready, in {self._folder}")
+        children.run_multidrop("init", "fleet", "init", str(plant), "--keep", KEEP, "--nats", self._urls)
+        note(f"`fleet init` has stored {LINES} lines of {DRIVES} simulated drives each")
+        for gateway in GATEWAYS:
+            self._start(gateway)
+        self._start_hub("hub", "--every", "2")
+        note(f"{', '.join(GATEWAYS)} and a hub are started")
+
+    def _start(self, gateway: str) -> None:
+        folder = str(self._folder / gateway)
+        self._children.start_multidrop(
+            gateway, "fleet", "serve", gateway, "--folder", folder, "--nats", self._urls
+        )
+
+    def _start_hub(self, name: str, *words: str) -> None:
+        parquet = str(self._parquet)
+        self._children.start_multidrop(name, "hub", *self._urls.split(","), "--parquet", parquet, *words)
+
+    async def play(self) -> tuple[list[str], int]:
+        """Kill a gateway and start it again; return its lines, and the time of the kill (ns, UTC).
+
+        Raises KeyboardInterrupt for a signal.
+        """
+        over = asyncio.Event()
+        with end_signals_cancel(), _drawn(self._stage):
+            watching = asyncio.create_task(self._watch(over))
+            try:
+                return await self._story()
+            finally:
+                over.set()
+                await watching
+
+    async def _watch(self, over: asyncio.Event) -> None:
+        from multidrop.fleet.overview import FleetView, FleetWatch
+        from multidrop.fleet.servers.connections import ServerPath
+
+        path = ServerPath(self._urls.split(","))
+        try:
+            await path.open()
+            await follow(FleetWatch(FleetView(path)), self._stage.show, over)
+        finally:
+            await path.close()
+
+    async def _story(self) -> tuple[list[str], int]:
+        stage = self._stage
+        await stage.until(lambda: stage.are_masters(GATEWAYS), "all lines had masters")
+        await stage.calm(RUN_S)
+        stage.note(f"every line has a master: {stage.shares()}")
+        lines = sorted((line for line, name in stage.masters().items() if name == KILLED), key=natural)
+        killed_ns = time.time_ns()
+        self._children.kill(KILLED)
+        stage.note(f"{KILLED} is KILLED; it was master of {', '.join(lines)}")
+        survivors = [name for name in GATEWAYS if name != KILLED]
+        await stage.until(lambda: stage.are_masters(survivors), f"the lines of {KILLED} were taken over")
+        stage.note(f"the others are masters of its lines now: {stage.shares()}")
+        await asyncio.sleep(RUN_S)
+        self._start(KILLED)
+        stage.note(f"{KILLED} is started again: samples on its disk go to the hub")
+        await stage.until(lambda: stage.are_masters(GATEWAYS), f"{KILLED} had lines again")
+        stage.note(f"it has a share of the lines again: {stage.shares()}")
+        await asyncio.sleep(RUN_S)
+        # At its end a gateway forwards for a few seconds only.
+        await stage.until(lambda: stage.unsent() == [0] * len(GATEWAYS), "all messages were forwarded")
+        return lines, killed_ns
+
+    def end(self) -> dict[str, list[int]]:
+        """End all in good order, let the hub read the rest, and return the times of samples by drive."""
+        children = self._children
+        children.end(*GATEWAYS, "lines", "hub")
+        self._start_hub("hub-once", "--once", "--json")
+        children["hub-once"].wait(WAIT_S)
+        return sample_times(self._parquet)
+
+
+def sample_times(parquet: Path) -> dict[str, list[int]]:
+    """Return the times (ns, UTC) of all samples in a hub's files, by drive."""
+    import pyarrow.parquet as pq
+
+    found: dict[str, list[int]] = {}
+    for path in sorted((parquet / "rows").glob("*.parquet")):
+        table = pq.read_table(path, columns=["time", "drive", "status"])
+        times = table.column("time").cast("int64").to_pylist()
+        drives, statuses = (table.column(name).to_pylist() for name in ("drive", "status"))
+        for at, drive, status in zip(times, drives, statuses, strict=True):
+            if status == "ok":
+                found.setdefault(drive, []).append(at)
+    return found
+
+
+@contextmanager
+def _drawn(stage: Stage) -> Iterator[None]:
+    """Draw on a terminal if rich is installed; print the notes in any case."""
+    if not (sys.stdout.isatty() and find_spec("rich")):
+        yield
+        return
+    try:
+        with drawing("multidrop fleet demo") as stage.draw:
+            shown = len(stage.notes)
+            yield
+    finally:
+        stage.draw = None
+        for sentence in stage.notes[shown:]:
+            print_text(sentence)

@@ -1,1 +1,0 @@
-"""`multidrop fleet demo`: servers, gateways, lines and a hub on this machine; a gateway is killed."""

