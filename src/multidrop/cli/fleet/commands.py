@@ -152,7 +152,7 @@ async def _stop(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _annotating(what: str) -> Iterator[None]:
-    """If Ctrl-C interrupts the wait for an answer, print that the outcome is unknown."""
+    """Print that the outcome is unknown if Ctrl-C interrupts the wait for an answer."""
     try:
         yield
     except asyncio.CancelledError:
