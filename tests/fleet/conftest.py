@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Bear what nats-py leaves of a connection to a server that died: the garbage collector warns of it."""
+    """Ignore remains of nats-py's connections to a dead server, which the garbage collector reports."""
     for item in items:
         if item.path.parent == HERE:
             item.add_marker(pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"))
@@ -22,7 +22,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module")
 def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Return three servers that have nothing of a fleet yet."""
+    """Return three servers without a fleet."""
     require_module("nats")
     with cluster(tmp_path_factory.mktemp("nats")) as running:
         yield running

@@ -1,4 +1,4 @@
-"""Cuts of cables, each gateway and node in a namespace of its own, judged by what the lines saw."""
+"""Cut cables, with each gateway and node in its own namespace, judged by the lines' records."""
 
 from __future__ import annotations
 

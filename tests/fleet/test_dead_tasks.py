@@ -188,7 +188,7 @@ def test_subjects_that_cannot_be_heard_end_the_gateway(gateway: Any, monkeypatch
 
 
 def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_path: Path) -> None:
-    """The page then connects anew."""
+    """The page then reconnects."""
 
     async def main() -> None:
         async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
@@ -199,7 +199,7 @@ def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_path: Pat
     asyncio.run(main())
 
 
-# ---- what goes on ----
+# ---- failures that end no gateway ----
 
 
 def test_a_forwarder_that_fails_is_logged_and_tries_again(

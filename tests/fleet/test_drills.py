@@ -1,6 +1,6 @@
-"""Drills with real processes, judged by what the lines saw: no overlap, and how long a line was silent.
+"""Drills with real processes, judged by the lines' records: no overlap, and short silences.
 
-`python -m bench.questions.fleet_drills --rounds 40` does more of them.
+`python -m bench.questions.fleet_drills --rounds 40` does more.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
-# One of each kind; the bench does them all. A gateway that stands still has a test of its own below.
+# One of each kind; the bench does them all. Suspended gateways have their own test below.
 DONE = (
     "gateway killed",
     "gateway and node killed",

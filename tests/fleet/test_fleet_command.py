@@ -1,4 +1,4 @@
-"""`multidrop fleet`: one sentence for each thing that can be wrong, and what it shows of a fleet."""
+"""`multidrop fleet`: one sentence for each mistake, and the output about a fleet."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def test_an_interruption_says_what_it_leaves_open(
             return self
 
         async def __aexit__(self, *error: object) -> None:
-            """Nothing was opened."""
+            """No port was opened."""
 
         async def stop(self, *what: object, **more: object) -> None:
             task = asyncio.current_task()

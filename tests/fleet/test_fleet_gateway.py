@@ -42,7 +42,7 @@ class Asked:
 
 
 def test_who_waits_for_the_session_of_another_of_its_name_answers_nothing(tmp_path: Path) -> None:
-    """The other one is asked too: `status` would show the wrong one, and `drain` believe it."""
+    """The other one gets the request too: `status` would show the wrong one, and `drain` trust it."""
 
     async def main() -> None:
         gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)

@@ -1,4 +1,4 @@
-"""Rights in a fleet's servers, by the configuration that `fleet rights` writes: what is refused, and to whom.
+"""Rights on a fleet's servers, with the configuration of `fleet rights`: requests that each user is refused.
 
 Each attempt is made twice: at a server with the rights as written, which must refuse it, and at one whose
 users may do everything, which must not. So an attempt that could not be refused is no proof.
@@ -39,7 +39,7 @@ CONSUMERS = ("CONSUMER.CREATE.{}", "CONSUMER.CREATE.{}.c.>", "CONSUMER.DURABLE.C
 COMMANDS = ("cmd.line-1", "stop.line-1", "do.gw-b.run")
 PATIENCE_S = 30.0
 
-FORBIDDEN = {  # what each user must not publish, besides what nobody must
+FORBIDDEN = {  # forbidden to each user, besides the subjects forbidden to all
     "gw-a": (
         *("samples.gw-b.log", "samples.gw-c.log", "samples.gw-a"),
         *("$KV.lease_0.gw-b.gw-b", "$KV.lease_1.gw-b.gw-c", "$KV.lease_2.gw-a.gw-b", "$KV.lease_0.gw-b"),
@@ -126,7 +126,7 @@ async def refused(servers: SecuredCluster) -> set[Attempt]:
                 await client.publish(subject, b"{}")
             else:
                 await client.subscribe(subject)
-        for _ in range(2):  # the first ping may leave before what waits to be sent
+        for _ in range(2):  # the first ping may overtake pending data
             await client.flush()
         await client.close()
         for attempt, subject in mine.items():
@@ -288,7 +288,7 @@ def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[st
 
 
 def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> None:
-    """Rights may be given while a connection stands: an older denial says nothing of a later silence."""
+    """Rights may be granted to an open connection: an older denial does not explain a later silence."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
     asyncio.run(denials.note(denied))

@@ -1,4 +1,4 @@
-"""`fleet watch`: what is old is never shown as the present, and every size has its picture."""
+"""`fleet watch`: an old view is marked as old, and every terminal size has its picture."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_no_head_stands_without_a_row(height: int) -> None:
 
 
 def test_lines_of_a_master_that_does_not_answer_are_told() -> None:
-    """Nobody ends the sessions where all gateways are dead, and each line has a master in the records."""
+    """If all gateways are dead, their sessions are not ended, and each line has a master in the records."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
     found["lines"]["line-7"]["master"] = "gw-2"

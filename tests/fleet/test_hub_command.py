@@ -102,7 +102,7 @@ def test_what_was_kept_is_there_however_the_hub_ends(
 def test_a_signal_waits_for_what_the_hub_is_doing(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    """Raised in the midst of it, in nats-py's own tasks too, it would leave something that is waited for."""
+    """If raised within nats-py's own tasks, it would leave pending futures behind."""
     done: list[str] = []
 
     async def read(hub: SampleHub, *, once: bool) -> None:

@@ -82,7 +82,7 @@ def test_hours_that_are_over_become_one_file(sink: ParquetSink, tmp_path: Path) 
     for path in sorted((tmp_path / "rows").glob("*.parquet"))[3:]:
         path.unlink()
     assert names(tmp_path, "rows")[-1] == "00000017-00000024"
-    assert sink.begin("made") == KeptPlace(24, {"a.x": 24})  # a merged file says where the hub was, too
+    assert sink.begin("made") == KeptPlace(24, {"a.x": 24})  # a merged file has the hub's position, too
 
 
 class Broken(Exception):

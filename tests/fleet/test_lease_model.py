@@ -23,7 +23,7 @@ def killed_at(until: int, terms: Terms) -> int:
 class PathState(NamedTuple):
     """One path: the record, messages under way, and what both sides know. Times are ages in ticks."""
 
-    ended: int | None = None  # since when nobody can renew it any more
+    ended: int | None = None  # since when renewal is impossible
     request: int | None = None  # a renewal on its way to the server, by when it was sent
     ack: int | None = None  # its acknowledgement on its way back
     renewed: int | None = 0  # the newest renewal that the holder counts
@@ -33,7 +33,7 @@ class PathState(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """A holder whose process may stand still at any point, a taker, and a network that delays and loses.
+    """A holder that may be suspended at any point, a taker, and a network that delays and loses.
 
     The taker writes once enough paths have been ended for as long as the guard.
     """
@@ -83,7 +83,7 @@ class Model:
             return None if age is None else min(age + 1, most)
 
         terms = self.terms
-        oldest = terms.lease + terms.guard // 2 + self.lateness + 1  # from here on nothing depends on it
+        oldest = terms.lease + terms.guard // 2 + self.lateness + 1  # from here on no rule depends on it
         return path._replace(
             request=older(path.request, oldest),
             ack=older(path.ack, oldest),
@@ -93,16 +93,16 @@ class Model:
         )
 
     def normal(self, path: PathState) -> PathState:
-        """Return the one path state that stands for all with the same future."""
+        """Return the representative of all path states with the same future."""
         if not self.has_cas:
             return path
         seen = (
             path.seen if path.seen and path.seen[0] else None
-        )  # what it watches is no more: it cannot end it
+        )  # the watched revision is gone: it cannot end it
         request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
 
-    # ---- all of them ----
+    # ---- all interleavings ----
 
     def deadline(self, renewed: Iterable[int | None]) -> int:
         """Return until when the holder may send, relative to now, by the newest renewal of each path."""
@@ -169,13 +169,13 @@ class _PathTable:
         self.later: list[int] = []
         self._deadlines: dict[tuple[int | None, ...], int] = {}  # by the newest renewals
         self.number(PathState())
-        for path in self.paths:  # it grows meanwhile
+        for path in self.paths:  # it grows in the meantime
             after = {self.number(following) for following in model.path_steps(path)}
             self.steps.append(sorted(after - {self.number(path)}))
             self.later.append(self.number(model.grown_older(path)))
 
     def deadline(self, numbers: list[int]) -> int:
-        """Return until when the holder may send where its paths are in these states."""
+        """Return the holder's deadline with its paths in these states."""
         renewed = tuple([self.paths[number].renewed for number in numbers])
         if renewed not in self._deadlines:
             self._deadlines[renewed] = self._model.deadline(renewed)

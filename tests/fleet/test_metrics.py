@@ -1,4 +1,4 @@
-"""Metrics of a fleet's gateway: read by promtool, by this machine alone, and whatever is asked."""
+"""Metrics of a fleet's gateway: valid for promtool, only for this machine, robust to any request."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_a_port_that_is_taken() -> None:
 
 
 def test_whoever_says_nothing_keeps_nobody_out_for_ever() -> None:
-    """Those that are too many are let go at once, and so is who says too much; none holds up the end."""
+    """Clients above the limit, or with too much data, are dropped at once; none delays the end."""
 
     async def ask(port: int, data: bytes) -> bytes:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)

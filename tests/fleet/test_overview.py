@@ -1,4 +1,4 @@
-"""FleetView: masters by the records, answers by the gateways, and nothing of those who do not answer."""
+"""FleetView: masters from the records, answers from the gateways, and None for silent ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOVE = {"line": "line-1", "turn": 5, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
 
 
 class Answering:
-    """A path on which gateways answer what a test says; the others are not there."""
+    """A path on which gateways give the test's answers; other gateways are absent."""
 
     urls = ["nats://a:4222"]
     is_open = True
@@ -46,7 +46,7 @@ def lease(session: int, *, ended: bool = False) -> dict[str, Any]:
 
 
 def view(answers: dict[str, Any] | None = None) -> FleetView:
-    """Return a view of three gateways, of which gw-3 has ended, and five lines."""
+    """Return a view of five lines and three gateways, one of which, gw-3, has ended."""
     made = FleetView(Answering(answers or {}))  # type: ignore[arg-type]
     records, leases = made._records, [MemoryBucket(name) for name in names.LEASES]
     for follower, bucket in zip(records.observer.paths, leases, strict=True):
@@ -80,7 +80,7 @@ def test_a_line_has_a_master_whose_session_is_not_over() -> None:
         "line-2": None,  # of a session before
         "line-3": None,  # of one that ended
         "line-4": None,  # given away
-        "line-5": None,  # nobody's yet
+        "line-5": None,  # no master yet
     }
     first = {"port": "socket://h:1", "revision": 1, "master": "gw-1", "session": 2, "since_ms": 1000}
     assert found["lines"]["line-1"] == first
@@ -95,7 +95,7 @@ def test_who_does_not_answer_says_nothing() -> None:
     assert found["gateways"]["gw-2"]["says"] is None
     assert [move["from"] for move in found["moves"] if move["line"] == "line-1"] == ["gw-9"]
     made._path.answers.clear()  # type: ignore[attr-defined]
-    assert looked(made)["gateways"]["gw-1"]["says"] is None  # what it said before is not the present
+    assert looked(made)["gateways"]["gw-1"]["says"] is None  # its earlier answer is outdated
 
 
 @table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
@@ -112,7 +112,7 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
         "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # it left
         "gw-6": (lease(2, ended=True) | {"by": "gw-6", "at_ms": now_ms}, False),
         "gw-7": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - MISSED_MS}, False),
-        "gw-9": (lease(2), False),  # it begins, on one path
+        "gw-9": (lease(2), False),  # it starts, on one path
         "gw-8": (lease(2, ended=True) | {"by": "gw-1"}, True),
     }
     clock = HandClock()

@@ -80,7 +80,7 @@ def as_read(records: Records) -> LineRecords:
 
 @dataclass(frozen=True)
 class Model:
-    """Sessions that claim and give away at any time, by what they read once, and end at any time.
+    """Sessions that claim and release at any time, by records read once, and end at any time.
 
     Writes are stored late, in any order, or never; an answer is a read like any other. So many records are
     stored at most. Who does not know yet that another is over claims nothing, as who does not act.
@@ -90,13 +90,13 @@ class Model:
     most: int = 5
     needed: int = NEEDED
     has_cas: bool = True
-    gives_up_first: bool = True  # what is given away is not ours before that is sent
+    gives_up_first: bool = True  # a released line stops being ours before the release is sent
     looks_home: bool = True  # before it writes elsewhere
     minds_two_votes: bool = True
     minds_who_lives: bool = True
 
     def search(self) -> tuple[int, State | None]:
-        """Return how many states there are, and one in which two have the line, or nobody can, if any."""
+        """Return the number of states, and one with two masters or a dead end, if any."""
         nothing = (Stored(),) * BUCKETS
         first = State(nothing, (Session(),) * len(self.sessions), frozenset())
         known, layer = {first}, [first]
@@ -165,7 +165,7 @@ class Model:
         return state._replace(sessions=tuple(sessions))
 
     def with_write(self, state: State, write: Write) -> State:
-        """Return the state when the write is stored; what others wrote upon the record before is void."""
+        """Return the state after the write is stored; later writes on the replaced record fail."""
         revision = state.records[write.bucket].revision + 1
         records = list(state.records)
         records[write.bucket] = Stored(write.owner, write.votes, revision)
@@ -178,7 +178,7 @@ class Model:
         )
 
     def acts(self, name: str, session: Session, over: set[str]) -> Iterator[tuple[Session, frozenset[Write]]]:
-        """Yield what a session may begin to do, and what it writes for that."""
+        """Yield the actions that a session may start, with their writes."""
         ours = [bucket for bucket, one in enumerate(session.known) if one.owner == name]
         if ours:
             given = frozenset((bucket, session.known[bucket].revision) for bucket in ours)
@@ -227,7 +227,7 @@ class Model:
 
 
 def read(session: Session, bucket: int, record: Stored) -> Session:
-    """Return the session when it has read this record: an older one than it knows changes nothing."""
+    """Return the session after it has read this record; an older one changes nothing."""
     if session.known[bucket].revision >= record.revision:
         return session
     known = list(session.known)

@@ -1,4 +1,4 @@
-"""The part `fleet` of `serve`: its settings, its health, and what it tells of a real fleet."""
+"""The part `fleet` of `serve`: its settings, its health, and its view of a real fleet."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_it_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch, dying
 
 
 class Looks(FleetView):
-    """A view whose looks succeed until they are told not to."""
+    """A view whose reads succeed until the test makes them fail."""
 
     failure: OSError | None = None
 

@@ -1,4 +1,4 @@
-"""Samples never take the room of leases: a server that can store no more would end all polling."""
+"""Samples never use the space of leases: a server that cannot store leases would end all polling."""
 
 from __future__ import annotations
 

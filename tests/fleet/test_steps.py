@@ -82,7 +82,7 @@ def test_nobody_ends_others_whose_own_lease_is_not_renewed_either(left_s: float,
         clock = HandClock()
         member.lease.clock = clock
         member.lease.until = clock.now + 2 * SECOND
-        await member.step()  # what was seen before is counted anew
+        await member.step()  # earlier observations are timed again
         asked: list[object] = []
 
         async def note(present: object) -> bool:

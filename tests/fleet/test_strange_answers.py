@@ -126,7 +126,7 @@ def test_a_stream_of_samples_that_answers_nonsense_is_tried_again(name: str) -> 
 def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A gateway looks at them in its tasks, of which none may end."""
+    """A gateway reads them in its tasks, none of which may end."""
     monkeypatch.setattr(setup, "WAIT_S", 0.0)  # for the end of an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(Unsure, match="the answer of NATS about a bucket's servers is invalid: "):

@@ -175,7 +175,7 @@ def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) ->
     async def work(path: ServerPath) -> None:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
-        assert (await rogue.get("gw-1")).value == LEASE  # nobody else has written it
+        assert (await rogue.get("gw-1")).value == LEASE  # no other user has written it
         await rogue.put("gw-1", {**LEASE, "session": 8, "ended": False}, revision)
         ended = {**LEASE, "session": 8, "ended": True, "by": "gw-2"}
         assert (await own.get("gw-1")).value == ended
@@ -186,7 +186,7 @@ def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) ->
 
 @pytest.mark.long
 def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each bucket has one of each before the gateway begins, and gets one of each while it works."""
+    """Each bucket has one of each kind before the gateway starts, and gets more while it works."""
     monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
 
     async def strew(path: ServerPath, suffix: str) -> None:
@@ -214,7 +214,7 @@ def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.Mo
         await strew(path, "-again")
         await asyncio.wait([task], timeout=1.0)
         await until_polled(is_first=True)
-        for bucket in names.LEASES[:2]:  # our own ones: that costs a session, and no more
+        for bucket in names.LEASES[:2]:  # our own ones: that costs only a session
             await path.request(f"$KV.{bucket}.gw-a.rogue", b"{")
         await until_polled(is_first=False)
         task.cancel()

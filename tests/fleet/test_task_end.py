@@ -1,4 +1,4 @@
-"""Tasks that swallow a cancellation are ended all the same, and nobody waits for them for ever."""
+"""Tasks that swallow a cancellation are ended in finite time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A session's begin, renewals and end, on records in memory and a clock that the test sets."""
+"""Start, renewals and end of a session, with records in memory and a settable clock."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_renewal_counts_from_what_was_sent() -> None:
 
 
 def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
-    """The moment of its sending is not known any more."""
+    """The time of its sending is unknown."""
 
     async def main() -> None:
         trial = Trial()
@@ -136,7 +136,7 @@ def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
             trial.clock.pass_s(0.5)
             await renew(lease)
         assert not lease.is_valid
-        trial.buckets[1].is_down = False  # nobody has ended it: the same session goes on
+        trial.buckets[1].is_down = False  # no one has ended it: the same session continues
         await renew(lease)
         assert lease.is_valid
         assert lease.session == 1
@@ -145,7 +145,7 @@ def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
 
 
 def test_a_renewal_that_failed_is_tried_again_soon() -> None:
-    """Nothing is waited for any more once its bucket has a leader."""
+    """The renewal does not wait once its bucket has a leader."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -289,7 +289,7 @@ def test_a_late_path_of_an_ended_session_is_none_of_the_next_one() -> None:
 
 
 def test_who_stands_still_between_the_clock_and_the_kernels_timer_goes_on() -> None:
-    """A timer that is set to the past would kill; the engine refuses it, and nothing else happens."""
+    """A timer in the past would kill the process; the engine refuses it."""
 
     class StandingStill(NotedMastership):
         def extend(self, until_ns: int) -> None:
@@ -309,7 +309,7 @@ def test_who_stands_still_between_the_clock_and_the_kernels_timer_goes_on() -> N
 
 
 def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
-    """CLOCK_BOOTTIME begins anew when a machine does."""
+    """CLOCK_BOOTTIME starts again when a machine does."""
 
     async def main() -> None:
         trial = Trial()
@@ -326,7 +326,7 @@ def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
 
 
 def test_no_number_of_a_session_is_used_twice_whatever_others_write() -> None:
-    """Else lines that others know to be nobody's would be those of a session that polls them."""
+    """Otherwise lines that others consider free could belong to a session that polls them."""
 
     async def main() -> None:
         trial = Trial()
@@ -600,7 +600,7 @@ def test_nobody_waits_for_a_path_without_a_leader_to_end_the_dead(has_rival: boo
 
 
 def test_what_is_judged_is_what_is_ended() -> None:
-    """A record that is renewed between the judgement and its end stays, even if it was read meanwhile."""
+    """A record that is renewed between the judgement and its end stays, even if it was read again."""
 
     async def main() -> None:
         trial = Trial()
@@ -766,7 +766,7 @@ def test_who_may_be_dead_is_looked_at_in_that_very_moment(since_s: float, rests_
 
 
 def test_who_gets_no_answer_judges_nobody() -> None:
-    """The server that it reads from may stand still, while the leases are renewed by others."""
+    """The server that it reads from may be suspended while others renew the leases."""
 
     async def main() -> None:
         trial = Trial()
@@ -922,7 +922,7 @@ def test_a_path_that_was_down_at_the_beginning_is_taken_later() -> None:
 
 
 def test_a_path_with_another_beginning_of_the_same_number_is_taken_later() -> None:
-    """A gateway of this name that died while it began has left it; two paths are ours, so it is over."""
+    """A gateway of this name that died while it started has left it; two paths are ours, so it is over."""
 
     async def main() -> None:
         trial = Trial()

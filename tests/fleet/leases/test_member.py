@@ -41,7 +41,7 @@ from multidrop.fleet.servers.setup import open_all  # noqa: E402
 
 LINES = [f"line-{at}" for at in range(30)]
 PATIENCE_S = 120.0
-LONG = USUAL._replace(lease=600 * SECOND)  # where no lease may run out, however busy the machine is
+LONG = USUAL._replace(lease=600 * SECOND)  # no lease may expire, however busy the machine is
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -95,7 +95,7 @@ class Gateways:
         return member
 
     async def die(self, name: str) -> None:
-        """End it as SIGKILL does: it says nothing more, and its sockets are gone."""
+        """End it as SIGKILL does: it sends nothing, and its sockets are closed."""
         member, task = self.members.pop(name), self.tasks.pop(name)
         member._leave = _do_nothing  # type: ignore[method-assign]
         task.cancel()
@@ -118,7 +118,7 @@ class Gateways:
         return sorted(line for lines in self.taken().values() for line in lines) == sorted(LINES)
 
     def are_shared(self) -> bool:
-        """Say whether each polls what the balance gives it, and all are there."""
+        """Return True if each polls its assigned lines, and all are present."""
         return all(
             set(member.wanted.values()) == set(self.members)
             and {line for line, gateway in member.wanted.items() if gateway == member.name}
@@ -182,7 +182,7 @@ def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluste
             again = await running.join("b")
             assert not again.polled
             await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
-            assert again.lease.session >= 2  # more where the machine let it stand still
+            assert again.lease.session >= 2  # more if the machine was suspended
 
     asyncio.run(main())
 
@@ -314,7 +314,7 @@ def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
 def test_beside_gateways_with_other_rules_no_line_is_taken(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither when a gateway begins, nor where one with other rules comes to those that poll."""
+    """Neither at a gateway's start, nor when an incompatible one joins."""
 
     async def main() -> None:
         async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
@@ -386,7 +386,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
         other = LeaseBucket(names.LEASES[1], member.best, "other")
         while not member.lease.is_weak:
             record = await other.get(member.name)
-            with suppress(Conflict):  # it was renewed meanwhile
+            with suppress(Conflict):  # it was renewed in the meantime
                 await other.put(member.name, {**record.value, "ended": True}, record.revision)
             await member.lease.renew_once(1)
 
@@ -412,7 +412,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
 def test_without_servers_all_fall_silent_and_nobody_is_killed(
     fleet: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The timer is called off after the lines were let go, and never set to the past."""
+    """The timer is cancelled after the lines were closed, and never set to the past."""
 
     async def main() -> None:
         async with gateways(fleet, "a", "b") as running:

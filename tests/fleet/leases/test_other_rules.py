@@ -21,7 +21,7 @@ SENTENCE = "incompatible version of multidrop in this fleet: no line is taken un
 
 
 class Story:
-    """A gateway called "me" looks at the others, whose sessions are in memory."""
+    """A gateway called "me" that watches others, whose sessions are in memory."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock = HandClock()
@@ -40,7 +40,7 @@ class Story:
 
     @property
     def trouble(self) -> str:
-        """Return the sentence after a look at all paths."""
+        """Return the sentence after a read of all paths."""
         for path in range(3):
             asyncio.run(self.observer.look(path))
         self.other_rules.look(self.observer.sessions())

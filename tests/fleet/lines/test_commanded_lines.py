@@ -1,4 +1,4 @@
-"""A line that is let go: its commands end at once, and its stops are answered until it is closed."""
+"""A line that is closed: its commands end at once, its stops are answered until it is closed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from multidrop.supervisor import supervisor  # noqa: E402
 
 
 class HeardPath:
-    """A path without a server: what is heard there, by subject."""
+    """A path without a server; records subscriptions by subject."""
 
     def __init__(self) -> None:
         self.heard: dict[str, Callable[[Any], Any]] = {}
@@ -37,7 +37,7 @@ class HeardPath:
         self.heard.pop(subject, None)
 
     async def ask(self, subject: str, **what: Any) -> dict[str, Any]:
-        """Return what is answered."""
+        """Return the answer."""
         answered: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
         class Asked:
@@ -60,7 +60,7 @@ class SlowLines:
         self.is_going = False
 
     async def take(self, line: str, description: Any) -> None:
-        """Nothing is to be opened."""
+        """Open nothing."""
 
     async def let_go(self, line: str) -> None:
         self.is_going = True
@@ -129,7 +129,7 @@ def test_a_stop_is_carried_out_and_answered_to_an_inbox_alone(tmp_path: Path) ->
 def test_a_command_under_way_is_waited_for_where_the_lease_leaves_time(
     tmp_path: Path, may_wait: bool
 ) -> None:
-    """Its asker is told what came of it; else the line's end cuts its answer off."""
+    """The requester gets the result, before the end of the line can cut the answer off."""
     begun, go_on = threading.Event(), threading.Event()
 
     async def main() -> None:
@@ -156,7 +156,7 @@ def test_a_command_under_way_is_waited_for_where_the_lease_leaves_time(
         for _ in range(10):
             await asyncio.sleep(0.002)
         assert lines.is_going is not may_wait
-        assert (await made.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing begins any more
+        assert (await made.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing starts now
         go_on.set()
         assert (await doing).outcome is CommandOutcome.DONE
         await going
@@ -188,7 +188,7 @@ class ClosedLines(SlowLines):
 def test_a_stop_that_finds_its_line_closed_is_left_to_the_next_master(
     tmp_path: Path, drives: list[str] | None
 ) -> None:
-    """Its asker would believe a refusal, and ask nobody else."""
+    """The requester would accept a refusal, and ask no other gateway."""
 
     async def main() -> None:
         lines = ClosedLines(made.bus(LINE).close)

@@ -57,7 +57,7 @@ class Trial:
         return owner_of(record) == ("a", self.lease.session)
 
     async def read(self) -> None:
-        """Read what the buckets have of the line."""
+        """Read the line's records from the buckets."""
         self.records.want(["hall"])
         for follower in self.records.owners.values():
             await follower.look()
@@ -77,7 +77,7 @@ class Trial:
             await asyncio.sleep(0.001)
 
     async def is_at_rest(self) -> None:
-        """Wait until nothing is under way on the line, while time passes."""
+        """Wait, as time passes, until no task is in progress on the line."""
         while self.keeper._at_work:
             await asyncio.sleep(0.001)
 
@@ -94,7 +94,7 @@ class Trial:
         self.keeper.claim({"hall": claim})
 
     def owner(self) -> tuple[str, int] | None:
-        """Return the owner whom enough votes name, by what the gateway knows."""
+        """Return the owner with enough votes, as far as the gateway knows."""
         record = self.records.owner("hall")
         return owner_of(record) if record else None
 
@@ -116,7 +116,7 @@ class DeadTrial(Trial):
             bucket.store("hall", owner_value(("", 0), 1, 0))
 
     async def claim_without_the_first(self) -> None:
-        """Claim the line while its first bucket holds what it is told up."""
+        """Claim the line while its first bucket delays writes."""
         await self.read_and_begin()
         self.buckets[0].shut()
         self.claim_now()
@@ -247,7 +247,7 @@ def test_a_line_is_let_go_before_it_is_given_away() -> None:
 
 
 def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
-    """A write that nobody answered may still be stored, at any time, until a newer record rules that out."""
+    """An unanswered write may still be stored later, until a newer record rules that out."""
 
     async def main() -> None:
         trial = Trial()
@@ -258,7 +258,7 @@ def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
         await until(lambda: trial.keeper.is_silent)
         for one in trial.buckets:
             one.is_down = True
-        trial.keeper.reconcile()  # given away, and nobody answers
+        trial.keeper.reconcile()  # released, without an answer
         await until(lambda: trial.keeper.is_silent)
         trial.keeper.releasing = set()  # it is to stay after all
         for _ in range(3):
@@ -270,7 +270,7 @@ def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
         trial.keeper.reconcile()
         await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
         assert owner_of(bucket.records["hall"]) == ("a", 1)
-        assert bucket.revision("hall") == 2  # what was given away at 1 can be stored no more
+        assert bucket.revision("hall") == 2  # the release at revision 1 can no longer be stored
 
     asyncio.run(main())
 
@@ -333,7 +333,7 @@ def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.Monkey
 
 
 def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is tried again at once, by newer records: a server that is cut off answers nothing for long."""
+    """Retry at once with newer records: a server that is cut off does not answer for long."""
     monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
 
     async def main() -> None:
@@ -472,7 +472,7 @@ def test_what_was_given_away_in_doubt_is_claimed_anew_where_any_line_may_be() ->
         for bucket in trial.buckets:
             bucket.is_down = True
         trial.keeper.releasing = {"hall"}
-        for _ in range(2):  # it is let go first
+        for _ in range(2):  # it is closed first
             trial.keeper.reconcile()
             await until(lambda: not trial.keeper._tasks)
         assert not trial.keeper.is_mine("hall")
@@ -539,7 +539,7 @@ def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogC
 
 
 class BrokenLines(NotedLines):
-    """Lines whose port cannot be opened, for this reason; "" for none."""
+    """Lines whose port cannot be opened, for this reason; "" opens them."""
 
     why = "nothing listens there"
 

@@ -1,4 +1,4 @@
-"""Moves: who had a line before is told where it was read, and nowhere else."""
+"""Moves: the former master of a line is reported only if its record was read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from multidrop.fleet.lines.moves import Move, Moves, move_of  # noqa: E402
 
 
 def told(*moves: Move) -> list[tuple[str | None, str]]:
-    """Return what is shown of these, in any order."""
+    """Return the shown moves of these, in any order."""
     found = Moves()
     found.add(moves)
     return [(move.before, move.after) for move in found.newest(100)]
@@ -42,7 +42,7 @@ def test_a_move_that_another_saw_whole_is_taken_from_it() -> None:
 
 
 def test_a_line_that_one_gave_away_and_another_took_has_moved_once() -> None:
-    """Each sees its own half: a drained gateway follows no line any more, and the next began late."""
+    """Each sees its own half: a drained gateway follows no lines, and the next one started late."""
     giver, taker = [FIRST, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
     assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]

@@ -1,4 +1,4 @@
-"""Records of a share's lines: what is asked of them, when, and that nothing is missed for good."""
+"""Records of a share's lines: when they are read, and that no change is missed for good."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def is_mine(record: Record) -> bool:
 
 
 class Trial:
-    """A bucket in memory, and what gateway a, in its session 2, knows of it."""
+    """A bucket in memory, and the knowledge of gateway a in session 2 about it."""
 
     def __init__(self) -> None:
         self.bucket = MemoryBucket()
@@ -43,7 +43,7 @@ class Trial:
         self.follower = ShareFollower(made, self.note, is_mine, self.had.__contains__)
 
     def note(self, *_: object) -> None:
-        """Do what the records of a share do with each record."""
+        """Process each record as share records do."""
         self.follower.look_anew()
 
     def looked(self) -> list[str]:
@@ -51,7 +51,7 @@ class Trial:
         return [record.key for record in asyncio.run(self.follower.look())]
 
     def asks(self) -> bool:
-        """Say whether a look asks anything."""
+        """Return True if a read sends a request."""
         before = self.bucket.asked
         self.looked()
         return self.bucket.asked > before
@@ -96,7 +96,7 @@ def test_of_a_line_that_we_have_by_other_records_nothing_is_asked() -> None:
 def test_a_doubted_line_is_asked_for_again_and_again_though_it_has_left_the_share(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The write that nobody answered may still be stored, when the bucket has a leader again."""
+    """The unanswered write may still be stored when the bucket has a leader again."""
     now = 1000.0
     monkeypatch.setattr(line_records.time, "monotonic", lambda: now)
     trial = Trial()
@@ -176,7 +176,7 @@ def test_a_session_has_lines_of_which_one_record_names_it() -> None:
 
 
 def test_who_did_not_follow_a_line_does_not_say_whose_it_was() -> None:
-    """It was asked for in a cold start, or an hour ago, and was others' since then."""
+    """It was read in a cold start or an hour ago, and has had other masters since."""
     records = followed()
     take(records, 8, owner_value(("b", 1), 8, 0), FIRST, SECOND)
     assert moves_of(records) == [(None, "b")]
@@ -187,7 +187,7 @@ def test_who_did_not_follow_a_line_does_not_say_whose_it_was() -> None:
 
 
 def test_a_line_that_is_claimed_anew_by_its_master_has_not_moved() -> None:
-    """Nobody knew whether it was given away."""
+    """The outcome of its release was unknown."""
     records = followed()
     take(records, 1, owner_value(("a", 2), 1, 0), FIRST, SECOND)
     take(records, 2, owner_value(("a", 2), 2, 0), FIRST, SECOND)
@@ -206,7 +206,7 @@ def test_of_sessions_that_have_no_line_any_more_nothing_is_kept() -> None:
 
 
 def test_lines_that_were_read_before_a_failure_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lines fill whole batches, and a server does not say that there are no more."""
+    """The lines fill whole batches, and a server does not report the end."""
     monkeypatch.setattr(buckets, "BATCH", 2)
     path: Any = None
     records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)

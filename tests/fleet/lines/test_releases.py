@@ -1,4 +1,4 @@
-"""Lines are let go for others only while these can claim them, and will be able to in the next moment."""
+"""Lines are closed for others only while these can claim them, now and in the next moment."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LINES = set(FIRST.values())
 
 
 class Trial:
-    """Releases of a gateway, the buckets that have a leader, and those of which a server is silent."""
+    """Releases of a gateway, the buckets with a leader, and those with a silent server."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.led = set(names.OWNERS)
@@ -95,7 +95,7 @@ def test_a_server_that_is_silent_for_long_is_not_waited_for(monkeypatch: pytest.
     trial.now_s = WAIT_S
     trial.look()
     assert trial.releases.due(LINES) == LINES
-    trial.maimed.clear()  # it is heard, and silent again: it is waited for anew
+    trial.maimed.clear()  # heard, and silent again: the wait restarts
     trial.look()
     trial.maimed = {"own_0", "own_1"}
     trial.look()

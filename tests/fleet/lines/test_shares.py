@@ -1,4 +1,4 @@
-"""Shares of a fleet's lines: made anew at once, or when no gateway comes or goes in a cold start."""
+"""Shares of lines: assigned at once, or in a cold start once no gateway comes or goes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LINES = tuple(f"line-{at}" for at in range(40))
 
 
 class Trial:
-    """Gateway a, whose session has just begun, with a clock of its own and no server."""
+    """Gateway a at the start of its session, with its own clock and no server."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -33,11 +33,11 @@ class Trial:
         self.member.records._lines = LINES
 
     def sees(self, *others: str) -> None:
-        """Look at these gateways, as it does before its session begins."""
+        """Note these gateways, as it does before its session starts."""
         self.member._see(dict.fromkeys(others, VALUE))
 
     def shared_among(self, *others: str) -> set[str]:
-        """Step beside these gateways, and return who has lines by the balance now."""
+        """Step beside these gateways, and return the gateways that have lines now."""
         asyncio.run(self.member._share_out(dict.fromkeys(others, VALUE)))
         return set(Counter(self.member.wanted.values()))
 
@@ -53,7 +53,7 @@ def test_who_comes_back_shares_with_those_who_were_there_all_the_time() -> None:
 
 
 def test_gateways_of_a_cold_start_are_shared_with_once_none_has_come_for_a_while() -> None:
-    """Else the first one would ask for the records of all lines, and the second for half of them."""
+    """Otherwise the first one would read the records of all lines, and the second those of half."""
     trial = Trial()
     assert trial.shared_among("b") == set()
     trial.clock.pass_s(QUIET_NS / SECOND - 0.01)

@@ -152,7 +152,7 @@ def test_no_more_are_named_than_a_lease_has_room_for() -> None:
     assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
 
 
-# ---- who has them ----
+# ---- who gets them ----
 
 LINES = [f"line-{number}" for number in range(60)]
 SHARED = assign(LINES, ["a", "b", "c"])
@@ -176,6 +176,6 @@ def test_a_line_goes_on_to_who_has_not_tried_it() -> None:
 
 
 def test_a_gateway_that_does_not_say_what_it_cannot_open_is_given_nothing() -> None:
-    """One of another version would not take what is given away for it."""
+    """Another version would not take lines handed over to it."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

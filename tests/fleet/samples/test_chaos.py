@@ -1,4 +1,4 @@
-"""Kills of everything between a poller and the sinks: nothing that was told is lost or doubled."""
+"""Kills of everything between a poller and the sinks: no reported sample is lost or doubled."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_what_is_lost_or_doubled_would_be_found(chaos: Any) -> None:
     told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
     whole = {
-        "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),  # two more than it was told
+        "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),  # two more than reported
         "gateway-2": Counter([0, 1, 2]),
     }
     assert chaos.compare(told, whole) == (9, 0, 0, 0)

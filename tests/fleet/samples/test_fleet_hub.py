@@ -1,4 +1,4 @@
-"""The hub: all rows of the stream in a sink, once, with their place; alarms for what is amiss."""
+"""The hub: all rows of the stream in a sink, once, with their position; alarms for errors."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ async def say(
 
 
 class Memory:
-    """A sink that keeps its commits, and fails when told, before or after it kept one."""
+    """A sink that stores commits, and fails on request before or after storing one."""
 
     def __init__(self, fates: str = "") -> None:
         self.commits: list[Commit] = []
@@ -190,7 +190,7 @@ def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.Monke
 def test_a_commit_ends_where_it_has_much_in_memory(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
-    """Few rows may have long names, and what is left out was read too."""
+    """Few rows may have long names, and ignored messages were read too."""
     monkeypatch.setattr(hub_module, "MOST_READ", 1)
     monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
     sink = Memory()
@@ -347,7 +347,7 @@ def commit_of(
 def test_a_commit_has_its_name_once_it_is_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The order of calls to the system is what a power cut would show."""
+    """The order of system calls decides what a power cut leaves."""
     calls: list[str] = []
     really_synced, really_renamed = os.fsync, Path.rename
 

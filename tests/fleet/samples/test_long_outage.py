@@ -94,14 +94,14 @@ def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: i
 
 @pytest.mark.long
 def test_the_hub_is_away_and_the_spool_full_of_what_was_forwarded(tmp_path: Path, most: int) -> None:
-    """The stream has it: nothing is lost where the spool removes it."""
+    """The stream has it, so removal from the spool loses no rows."""
     with cluster(tmp_path / "nats", 1) as servers:
 
         async def live() -> tuple[HubState, SpoolState]:
             client = await connect(servers.urls)
             await create_stream(client, replicas=1)
             await client.close()
-            for first in (0, 8, 16):  # fewer than the spool keeps, so that each time all of it is forwarded
+            for first in (0, 8, 16):  # fewer than the spool holds, so that each time all of it is forwarded
                 spool = Spool(tmp_path / "spool", "gateway-1", most=most)
                 for number in range(first, first + 8):
                     spool.append(numbered(number * EXCHANGES, EXCHANGES))

@@ -191,7 +191,7 @@ def test_another_writers_rows_are_rows() -> None:
 
 
 def alike(rows: int) -> dict[str, Any]:
-    """Return the columns of so many rows, all of which are the same."""
+    """Return the columns of this many equal rows."""
     names = ("drive", "register", "status", "unit")
     return {
         "time": pa.repeat(times(UTC_0)[0], rows),
@@ -219,12 +219,12 @@ OF_ONE_TEXT = {  # of so many rows: small as they are sent, and as they lie in m
 }
 
 
-POOLS: list[pa.MemoryPool] = []  # what was allocated of one may outlive its test
+POOLS: list[pa.MemoryPool] = []  # memory of one test may outlive it
 
 
 @pytest.fixture
 def most_allocated() -> Iterator[Callable[[], int]]:
-    """Return what tells how many bytes pyarrow had at most at a time since this began."""
+    """Return a function that reports pyarrow's peak memory since this call."""
     before = pa.default_memory_pool()
     pool = pa.proxy_memory_pool(pa.system_memory_pool())
     POOLS.append(pool)
@@ -234,7 +234,7 @@ def most_allocated() -> Iterator[Callable[[], int]]:
 
 
 def bomb(compression: str) -> bytes:
-    """Return a message with a large name of which only little is sent."""
+    """Return a message with a large name that is mostly missing."""
     options = pa.ipc.IpcWriteOptions(compression=compression)
     data = written(options, drive=named("f" * BOMB, "fan"))
     assert len(data) < BOMB / 200
@@ -287,7 +287,7 @@ def test_an_older_version_of_the_format_is_no_message() -> None:
 
 @pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
 def test_the_size_is_that_which_pyarrow_unpacks(options: pa.ipc.IpcWriteOptions | None) -> None:
-    """Texts of a kind are compressed, numbers by chance are not, and lists of nothing have no bytes."""
+    """Equal texts are compressed, random numbers are not, and empty lists have no bytes."""
     dice = random.Random(3)
     data = written(
         options,

@@ -75,7 +75,7 @@ def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
     assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]
     assert units_in(table, "value_3") == [(at, "") for at in range(0, 40, 4)]
-    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # nobody described it
+    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # without a description
 
 
 def test_a_message_of_before_has_unknown_units(tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_units_have_the_words_of_a_history() -> None:
 
 @pytest.fixture(params=["as they came", "merged"])
 def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """The folder of a hub: with the change amid its first file, and rows of an older gateway behind it."""
+    """The folder of a hub, with a change within its first file, and later rows of an older gateway."""
     require_module("duckdb")
     folder, units = tmp_path / "kept", changed(tmp_path / "lines")
     sink = ParquetSink(folder)

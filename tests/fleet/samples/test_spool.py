@@ -1,4 +1,4 @@
-"""The spool: what a poller gave it is on the disk, whatever happens, and what is lost is counted."""
+"""The spool: appended rows are on the disk, whatever happens, and lost ones are counted."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
     data = newest.read_bytes()
     before = rows_in(whole)
     ends = [size for size in range(0, len(data), step) if _is_whole(data[:size])]
-    assert all(size >= len(data) - 8 for size in ends)  # an end marker is no row
+    assert all(size >= len(data) - 8 for size in ends)  # an end marker adds no row
     for size in range(0, len(data), step):
         folder = tmp_path / "cut"
         shutil.copytree(whole, folder)
@@ -161,7 +161,7 @@ def _is_whole(data: bytes) -> bool:
 
 
 def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The order of calls to the system is what a power cut would show."""
+    """The order of system calls decides what a power cut leaves."""
     calls: list[str] = []
     names: dict[int, str] = {}
     really: dict[str, Any] = {name: getattr(os, name) for name in ("open", "write", "fsync", "rename")}
@@ -194,7 +194,7 @@ def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (12, 0.6)))
 def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:
-    """Each run has numbers of its own; what it was told is there, in order, without a hole, once."""
+    """Each run has its own numbers; all reported rows are there once, in order, without a gap."""
     dice = random.Random(kills)
     support = Path(spool_filler.__file__).parents[1]
     told = []

@@ -1,4 +1,4 @@
-"""Answers of NATS that an asker wants sent where he may not write: none leaves his own account.
+"""Answers that a user wants sent to foreign subjects: none leaves the user's account.
 
 Each attempt is made twice: with the accounts as written, and with one account for all, where each arrives.
 """
@@ -37,7 +37,7 @@ STREAMS = ("KV_plant", "KV_lease_0", "KV_own_0", STREAM)
 
 
 def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
-    """Return where a user wants answers: its name stands in each subject, and tells whose they are."""
+    """Return a user's reply subjects, each of which contains the user's name."""
     return [
         *(f"$KV.plant.{user}", f"$KV.lease_0.{user}.gw-b", f"$KV.own_0.{user}", f"{STREAM}.gw-b.{user}"),
         *(f"stop.{user}", f"cmd.{user}", f"do.gw-b.{user}", f"gateway.gw-b.{user}"),
@@ -70,7 +70,7 @@ async def connected(servers: SecuredCluster, url: str) -> AsyncIterator[Mapping[
 
 
 def questions(user: str) -> Iterator[tuple[str, bytes]]:
-    """Yield what a user may ask the store, each of which is answered."""
+    """Yield the requests to the store that a user may send; each is answered."""
     stream, key = (STREAM, f"{STREAM}.gw-b.log") if user == "hub" else ("KV_own_0", "$KV.own_0.last")
     yield f"$JS.API.DIRECT.GET.{stream}", json.dumps({"last_by_subj": key}).encode()
     yield f"$JS.API.STREAM.INFO.{stream}", b""
@@ -87,7 +87,7 @@ def all_inboxes(servers: SecuredCluster) -> dict[str, str]:
 
 
 def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
-    """Return the subjects of each user's attempts: where he may not publish himself."""
+    """Return the reply subjects of each user, none of which it may publish to."""
     rights, inboxes = rights_of(GATEWAYS), all_inboxes(servers)
     return {
         user: [
@@ -100,7 +100,7 @@ def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
 
 
 async def arrivals(servers: SecuredCluster, wanted: Set[str]) -> set[str]:
-    """Let each user ask each server for answers elsewhere, and return the subjects where one came.
+    """Let each user request answers elsewhere from each server; return the subjects that got one.
 
     Those that are wanted are waited for: servers do not answer in order.
     """

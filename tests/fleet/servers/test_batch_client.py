@@ -1,4 +1,4 @@
-"""Many answers at once: what is believed of them, and what becomes of those that do not come."""
+"""Many answers at once: which are accepted, and how missing ones end."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_a_record_that_looks_like_the_end_hides_none_behind_it(one: Cluster, way
         await client.flush()
         await client.close()
         while f"{way}-b" not in [record.key for record in await bucket.changes(0)]:
-            await asyncio.sleep(0.05)  # nothing tells that it is stored
+            await asyncio.sleep(0.05)  # no answer says that it is stored
         await bucket.put(f"{way}-c", OWNER, 0)
         found = await bucket.changes(0)
         keys = [record.key for record in found if record.key.startswith(way)]

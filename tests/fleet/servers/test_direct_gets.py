@@ -20,7 +20,7 @@ REQUEST = Request("questions", b"")
 
 
 class SlowWay:
-    """A path that answers each time it is asked after so long, or fails."""
+    """A path that answers each request after this time, or fails."""
 
     def __init__(
         self, name: str, *delays: float, failure: FleetError | None = None, pause: float = 0
@@ -48,7 +48,7 @@ class SlowWay:
 
 
 def answer(*ways: SlowWay) -> tuple[str, float]:
-    """Return whose answer counts, and after how long (s) it has come. Nothing is left under way."""
+    """Return whose answer was used, and after how long (s). No request stays in flight."""
 
     async def main() -> tuple[str, float]:
         found = await first_answer(ways, REQUEST, full())
@@ -155,7 +155,7 @@ def questions(reads: int, ways: Sequence[LateWay], spare: Spare) -> int:
 
 
 def test_nothing_is_asked_again_before_answers_came_in_time() -> None:
-    """Each of many gateways that begin at a time has much to read."""
+    """Many gateways that start together each read a lot."""
     assert questions(100, [LateWay(0.9) for _ in range(3)], Spare()) == 100
 
 
@@ -219,7 +219,7 @@ def test_a_path_without_a_question_to_spare_comes_to_an_end() -> None:
 
 
 def test_who_saw_answers_take_long_waits_longer_before_asking_again() -> None:
-    """Each of many gateways that begin at a time reads all of the plant beside small records."""
+    """Many gateways that start together each read the whole plant beside small records."""
     way, others, spare = LateWay(0.2), [SlowWay("b"), SlowWay("c")], full()
 
     async def main() -> None:

@@ -29,7 +29,7 @@ from multidrop.fleet.servers.leaders import (  # noqa: E402
 
 SERVERS = ("n1", "n2", "n3")
 PATH: Any = None
-ASKS_S = 4.0  # after so long a server that hears nobody may ask for votes
+ASKS_S = 4.0  # a server that hears no one may ask for votes after this time
 
 
 class Servers:
@@ -41,7 +41,7 @@ class Servers:
         self.silent: set[str] = set()
         self.unheard_ns = 0  # never, by this leader
         self.lagging: set[str] = set()
-        self.stuck: set[str] = set()  # buckets that nobody leads after they were handed over
+        self.stuck: set[str] = set()  # buckets without a leader after a hand-over
         self.under_way = 0
         self.now = 0.0
         self.found = LeaseTerms(lambda: self.now)
@@ -173,7 +173,7 @@ def test_a_leader_that_answers_nothing_holds_no_look_up(servers: Servers) -> Non
 def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
     cut_after_s: float, servers: Servers
 ) -> None:
-    """Its leaders answer nothing, and the others tell after 2 s that it is silent."""
+    """Its leaders do not answer, and the others report after 2 s that it is silent."""
 
     async def main() -> None:
         keeping = asyncio.create_task(
@@ -191,7 +191,7 @@ def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
 
 
 def test_leaders_come_home_once_they_can(servers: Servers) -> None:
-    """One that was handed over for a silent server is brought back when it is looked at again."""
+    """A leader that was handed over for a silent server returns home afterwards."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}
 

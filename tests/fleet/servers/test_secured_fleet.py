@@ -1,4 +1,4 @@
-"""A whole fleet with the rights that `fleet rights` writes, and a sentence where they do not suffice."""
+"""A whole fleet with the rights of `fleet rights`, and an error if they are missing."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def told(servers: SecuredCluster, user: str, *words: str) -> str:
     return line
 
 
-@pytest.mark.slow  # the longest file of its room begins at once
+@pytest.mark.slow  # the longest file of its room starts first
 @pytest.mark.long
 def test_a_route_to_a_server_that_is_silent_is_left_soon(tmp_path: Path) -> None:
     """By itself NATS takes a minute and more, and hands that server questions for so long."""
@@ -322,7 +322,7 @@ def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_key_that_is_taken_away_is_told_of_and_its_lines_go_on(tmp_path: Path) -> None:
-    """The servers read their rights again, and end the connections of who has none any more."""
+    """The servers reload their rights, and drop connections of removed users."""
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
         fleet.servers.give_rights_to(["gw-b"])
@@ -359,7 +359,7 @@ def test_a_gateway_that_comes_shares_the_lines_and_ends_nobodys_session(tmp_path
 
 @pytest.mark.long
 def test_a_gateway_in_wrong_hands_makes_lines_silent_and_no_more(tmp_path: Path) -> None:
-    """Somebody with the key of gw-c ends the others' sessions again and again; they begin new ones."""
+    """A thief of gw-c's key ends the others' sessions again and again; they start new ones."""
     with secured_fleet(tmp_path, 1) as fleet:
         fleet.wait_for_polling()
         fleet.running["gw-c"].kill()
@@ -393,7 +393,7 @@ def test_a_gateway_in_wrong_hands_makes_lines_silent_and_no_more(tmp_path: Path)
 
 @pytest.mark.long
 def test_clocks_an_hour_apart_are_told_of_and_change_nothing(tmp_path: Path) -> None:
-    """One of two gateways is an hour ahead; each takes over what the other leaves."""
+    """One of two gateways is an hour ahead; each takes over the lines of the other."""
     (tmp_path / "ahead").mkdir()
     (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)
     ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}

@@ -1,4 +1,4 @@
-"""`fleet init` on real servers: what it makes, and what it refuses."""
+"""`fleet init` on real servers: what it creates and refuses."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
     made = asyncio.run(_init(nats.urls))
     assert made["replicas"] == 3
     assert set(made["servers"]) == {"n1", "n2", "n3"}
-    assert asyncio.run(_init(nats.urls)) == made  # a second time changes nothing
+    assert asyncio.run(_init(nats.urls)) == made  # a second run changes nothing
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluste
 
 
 class Deaf:
-    """A path on which the leaders of some buckets of lines' masters say this, or nothing."""
+    """A path with this answer from the leaders of some buckets of masters, or none."""
 
     server_name = "n1"
 
@@ -107,7 +107,7 @@ def test_an_old_server_is_refused(tmp_path: Path) -> None:
 def test_a_cluster_that_grants_a_key_twice_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An old server does, even if its version is not looked at."""
+    """An old server fails the test, even if its version is ignored."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
         sentence = re.escape("claimants at once; no lease is safe there")
@@ -148,7 +148,7 @@ def test_a_removal_that_nobody_answers_is_looked_after(
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:
-    """Buckets made without it would stay on two servers, of which each one's death ends all polling."""
+    """Buckets created without it would stay on two servers: the failure of either ends all polling."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]
@@ -163,7 +163,7 @@ def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Pa
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
-        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant may be stored meanwhile
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant may be stored in the meantime
 
 
 @pytest.mark.long
@@ -200,7 +200,7 @@ def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
 def test_a_plant_that_cannot_be_read_yet_is_waited_for(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A direct get of a bucket that was made just now may find nobody."""
+    """A direct get of a new bucket may find no server."""
     collect, failures = ServerPath.collect, [Unsure("it ended with 503")] * 2
 
     async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
@@ -250,7 +250,7 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
 def test_a_leader_that_is_being_elected_is_waited_for(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody answers for a bucket whose leader has died, and most of the servers may be there."""
+    """A bucket has no leader for a moment after its leader died, though most servers run."""
     told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
 
     async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
