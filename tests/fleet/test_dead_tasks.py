@@ -260,7 +260,7 @@ def test_a_spool_goes_on_behind_failures_and_counts_rows_that_cannot_be_copied(
     assert "MemoryError" in caplog.text
 
 
-def test_a_compaction_that_cannot_begin_is_tried_again(
+def test_a_failed_start_of_compaction_is_retried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     require_module("duckdb")
@@ -329,7 +329,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
 
 
 @pytest.mark.parametrize("failure", [Ill("amid it"), MemoryError(), SystemExit("of a user")], ids=repr)
-def test_a_line_whose_taking_fails_is_not_polled(
+def test_a_line_that_fails_to_open_is_not_polled(
     taken: Taken, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
     """Another gateway may be its master before long."""
@@ -362,7 +362,7 @@ def test_a_line_that_cannot_be_opened_to_commands_is_not_polled(
     assert taken.lines.poller.buses == {}
 
 
-def test_lines_are_let_go_of_though_polling_has_failed(taken: Taken) -> None:
+def test_lines_are_closed_though_polling_has_failed(taken: Taken) -> None:
     async def main() -> None:
         await taken.lines.take(LINE, taken.description)
         taken.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")

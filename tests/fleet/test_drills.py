@@ -34,7 +34,7 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
         yield found
 
 
-def test_a_gateway_that_stands_still_is_killed_and_its_lines_go_on(drill: FleetDrill) -> None:
+def test_a_suspended_gateway_is_killed_and_its_lines_are_taken_over(drill: FleetDrill) -> None:
     stopped: list[subprocess.Popen[str]] = []
     gaps = drill.judge(lambda: stopped.append(drill.stop_gateway()), seconds=1.0)
     assert max(gaps.values()) > 2.0  # it had lines, and they were taken over

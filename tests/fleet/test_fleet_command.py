@@ -215,7 +215,7 @@ def test_two_gateways_of_one_name_on_one_machine(run: Run, tmp_path: Path, nobod
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None:
+def test_init_creates_and_shows_the_fleet(run: Run, nats: Cluster, tmp_path: Path) -> None:
     servers = ("--nats", ",".join(nats.urls))
     status, out, err = run("fleet", "init", plant(tmp_path), *servers)
     assert (status, err) == (0, "")

@@ -41,7 +41,7 @@ class Asked:
         self.answers.append(json.loads(data))
 
 
-def test_who_waits_for_the_session_of_another_of_its_name_answers_nothing(tmp_path: Path) -> None:
+def test_a_waiting_namesake_answers_no_requests(tmp_path: Path) -> None:
     """The other one gets the request too: `status` would show the wrong one, and `drain` trust it."""
 
     async def main() -> None:
@@ -60,7 +60,7 @@ def test_who_waits_for_the_session_of_another_of_its_name_answers_nothing(tmp_pa
     asyncio.run(main())
 
 
-def test_whose_answer_would_go_elsewhere_than_to_an_inbox_is_not_heard(tmp_path: Path) -> None:
+def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path) -> None:
     """The servers let it go there: a record of the plant is what its asker may not write. And an answer of a
     server to somebody's request, sent here, has no inbox."""
 
@@ -82,7 +82,7 @@ def test_whose_answer_would_go_elsewhere_than_to_an_inbox_is_not_heard(tmp_path:
 
 
 @pytest.mark.parametrize(("trouble", "is_forwarded"), [(None, True), ("the stream is full", False)])
-def test_what_is_left_at_the_end_is_waited_for_unless_the_stream_takes_nothing(
+def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: str | None, is_forwarded: bool
 ) -> None:
     monkeypatch.setattr(fleet_gateway, "FORWARD_S", PATIENCE_S)

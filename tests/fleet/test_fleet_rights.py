@@ -161,7 +161,7 @@ def refusals_where_all_is_allowed(tmp_path_factory: pytest.TempPathFactory) -> s
 
 
 @pytest.mark.parametrize("user", FORBIDDEN)
-def test_what_is_not_ones_right_is_refused(
+def test_a_request_without_the_right_is_refused(
     user: str, refusals: set[Attempt], refusals_where_all_is_allowed: set[Attempt]
 ) -> None:
     wanted = {attempt for attempt in attempts() if attempt.user == user}
@@ -170,7 +170,7 @@ def test_what_is_not_ones_right_is_refused(
     assert refusals_where_all_is_allowed == set()
 
 
-def test_who_says_nothing_of_himself_is_not_admitted(as_written: SecuredCluster) -> None:
+def test_missing_credentials_are_refused(as_written: SecuredCluster) -> None:
     async def main() -> None:
         options = as_written.options("hub")
         everybody: list[dict[str, Any]] = [{}, {"user": "operator", "password": ""}, {"token": "x"}]

@@ -100,7 +100,7 @@ def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
     ]
 
 
-def test_a_narrow_terminal_says_who_is_master_and_to_whom_a_line_went() -> None:
+def test_a_narrow_terminal_shows_masters_and_new_masters() -> None:
     shown = drawn(told(), 40).splitlines()
     assert [re.sub(" +", " ", row) for row in shown if re.match("LINE|line-1 ", row)] == [
         "LINE MASTER SINCE",
@@ -122,14 +122,14 @@ def test_what_does_not_fit_is_wrapped_or_seen_to_be_cut() -> None:
 
 
 @table("height", range(1, 60))
-def test_no_head_stands_without_a_row(height: int) -> None:
+def test_no_table_head_is_shown_without_rows(height: int) -> None:
     rows = drawn(told(lines=12), 80, height).splitlines()
     for row, next_row in pairwise(rows):
         if row.startswith(("LINE ", "last moves")):
             assert re.match(r"line-|1970-", next_row), (row, next_row)
 
 
-def test_lines_of_a_master_that_does_not_answer_are_told() -> None:
+def test_lines_of_a_silent_master_are_shown() -> None:
     """If all gateways are dead, their sessions are not ended, and each line has a master in the records."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
@@ -154,7 +154,7 @@ def test_the_exit_status_says_that_a_master_is_missing(
     assert asyncio.run(look._status(Namespace(json=False), [])) == status
 
 
-def test_a_gateway_that_is_missing_and_a_lost_port_are_told(
+def test_a_missing_gateway_and_a_lost_port_are_shown(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     gone = told() | {"lines": {"line-1": line("gw-1")}}
@@ -180,7 +180,7 @@ def test_lines_are_in_the_order_of_their_numbers() -> None:
     assert [row.split()[0] for row in rows if row.startswith("line-")] == [f"line-{at}" for at in range(12)]
 
 
-def test_what_is_old_is_dim_and_its_age_is_told() -> None:
+def test_an_old_view_is_dim_and_shows_its_age() -> None:
     found = told(12.0, "no connection to nats://a:4222")
     assert "this is 12 s old: no connection to nats://a:4222" in drawn(found)
     lines = picture(found, (120, 40), "")
@@ -194,7 +194,7 @@ def test_a_name_commands_no_terminal() -> None:
     assert "\x1b" not in drawn(found)
 
 
-def test_moves_whose_beginning_nobody_saw() -> None:
+def test_moves_with_an_unseen_start() -> None:
     moves = [MOVE | {"from": None}, MOVE | {"from": ""}, MOVE | {"to": ""}]
     assert [re.sub(" +", " ", row)[27:] for row in move_table(moves)] == [
         "to gw-2",
@@ -225,7 +225,7 @@ class FailingView:
         return {"gateways": {}, "lines": {}, "moves": []}
 
 
-def test_a_look_that_fails_is_told_with_the_age_of_what_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_read_is_shown_with_the_age_of_the_view(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet_watch, "EVERY_S", 0.02)
     shown: list[dict[str, Any]] = []
 
@@ -244,7 +244,7 @@ def test_a_look_that_fails_is_told_with_the_age_of_what_is_shown(monkeypatch: py
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
 
-def test_a_watch_whose_connection_is_kept_no_more_ends() -> None:
+def test_a_watch_ends_with_the_task_of_its_connection() -> None:
     """Else it would show the last look for ever."""
 
     async def main() -> None:

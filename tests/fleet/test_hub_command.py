@@ -76,7 +76,7 @@ def test_all_that_is_there_is_kept_once(
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("end", ["terminal closed", "SIGTERM"])
-def test_what_was_kept_is_there_however_the_hub_ends(
+def test_stored_rows_survive_any_end_of_the_hub(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
 ) -> None:
     words = ["hub", running.urls[0], "--parquet", str(tmp_path), "--every", "0.2"]

@@ -128,7 +128,7 @@ def test_broken_off_before_each_step(
 
 
 @pytest.mark.long
-def test_a_reader_of_merged_files_is_told_or_has_every_row_once(sink: ParquetSink, tmp_path: Path) -> None:
+def test_a_reader_of_merged_files_fails_or_has_every_row_once(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     told = []
     for at in (0, 1, 2, 5):

@@ -71,7 +71,7 @@ def test_what_a_gateway_says_is_scraped() -> None:
     assert {name: value for name, value in found.items() if "{" not in name} == expected
 
 
-def test_what_is_not_known_has_no_sample() -> None:
+def test_unknown_figures_have_no_sample() -> None:
     spool = STATE["spool"] | {"behind": None, "lag_s": None}
     found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "no lease", "spool": spool})
     missing = {"lease_margin_seconds", "session", "behind_messages", "behind_seconds"}
@@ -150,7 +150,7 @@ def test_no_address_that_others_reach(address: str) -> None:
 
 
 @table("address", ["9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999"])
-def test_what_is_no_address(address: str) -> None:
+def test_invalid_addresses_are_rejected(address: str) -> None:
     with pytest.raises(ValueError, match=r"is not an address and port; write --metrics 127\.0\.0\.1:9464"):
         listen(address)
 
@@ -162,7 +162,7 @@ def test_a_port_that_is_taken() -> None:
             listen(f"127.0.0.1:{port}")
 
 
-def test_whoever_says_nothing_keeps_nobody_out_for_ever() -> None:
+def test_a_silent_namesake_does_not_block_forever() -> None:
     """Clients above the limit, or with too much data, are dropped at once; none delays the end."""
 
     async def ask(port: int, data: bytes) -> bytes:

@@ -88,7 +88,7 @@ def test_a_line_has_a_master_whose_session_is_not_over() -> None:
     assert {name: gateway["lines"] for name, gateway in found["gateways"].items()} == {"gw-1": 1, "gw-2": 0}
 
 
-def test_who_does_not_answer_says_nothing() -> None:
+def test_a_silent_gateway_has_no_state() -> None:
     made = view({"gw-1": STATE | {"last_moves": [MOVE]}})
     found = looked(made)
     assert found["gateways"]["gw-1"]["says"] == STATE
@@ -99,7 +99,7 @@ def test_who_does_not_answer_says_nothing() -> None:
 
 
 @table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
-def test_moves_that_are_none_harm_nothing(moves: Any) -> None:
+def test_invalid_moves_are_ignored(moves: Any) -> None:
     found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
     assert found["gateways"]["gw-1"]["says"] == STATE
 

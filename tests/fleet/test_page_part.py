@@ -40,7 +40,7 @@ from multidrop.gateway.settings import read_settings  # noqa: E402
         ("every = 5", "every"),
     ],
 )
-def test_each_mistake_is_told(tmp_path: Path, table: str, sentence: str) -> None:
+def test_each_mistake_is_reported(tmp_path: Path, table: str, sentence: str) -> None:
     with pytest.raises(PlantError) as raised:
         read_settings(written(tmp_path, f"[serve.fleet]\n{table}\n"), {})
     assert sentence in str(raised.value)
@@ -114,7 +114,7 @@ def test_it_is_not_well_once_the_newest_look_is_old() -> None:
     assert watch.told()["age_s"] == 6.0
 
 
-def test_a_password_in_an_address_is_told_to_nobody() -> None:
+def test_a_password_in_an_address_is_never_shown() -> None:
     view = Looks(ServerPath([]))
     view.failure = OSError("no NATS server is reached at nats://anna:s3cret@a:4222, tls://t0ken@b:4222")
     watch = FleetWatch(view)
@@ -123,7 +123,7 @@ def test_a_password_in_an_address_is_told_to_nobody() -> None:
 
 
 @pytest.mark.long
-def test_the_gateway_tells_of_a_real_fleet_and_of_none(fleet: Cluster, tmp_path: Path) -> None:
+def test_the_page_shows_a_real_fleet_and_a_missing_one(fleet: Cluster, tmp_path: Path) -> None:
     urls = ", ".join(f'"{url}"' for url in fleet.urls)
     with served(tmp_path, f"[serve.fleet]\nnats = [{urls}]\n") as gateway:
         assert gateway.get("/api/plant").json["fleet"] is True
@@ -210,7 +210,7 @@ def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path
 
 
 @pytest.mark.slow
-def test_servers_that_are_not_there_are_told(tmp_path: Path) -> None:
+def test_missing_servers_are_reported(tmp_path: Path) -> None:
     [port] = free_ports(1)
     with served(tmp_path, f'[serve.fleet]\nnats = ["nats://127.0.0.1:{port}"]\n') as gateway:
         wanted = f"it was never read: no NATS server is reached at nats://127.0.0.1:{port}"

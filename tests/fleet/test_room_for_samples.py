@@ -76,7 +76,7 @@ def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, 
 
 
 @pytest.mark.long
-def test_a_stream_that_is_there_stays_and_is_told_of(run: Run, tmp_path: Path) -> None:
+def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         with_client(one, lambda client: create_stream(client, replicas=1))
         _, out, err = run("fleet", "init", "--nats", one.urls[0], "--json")

@@ -74,7 +74,7 @@ def test_steps_are_never_taken_without_a_pause() -> None:
 
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
-def test_nobody_ends_others_whose_own_lease_is_not_renewed_either(left_s: float, ends: bool) -> None:
+def test_a_gateway_with_an_expiring_lease_ends_no_other(left_s: float, ends: bool) -> None:
     """The servers fail all alike then; who was ended could not go on when they are back."""
 
     async def main() -> bool:

@@ -91,7 +91,7 @@ def bucket_of(answer: bytes) -> Bucket:
 
 
 @pytest.mark.parametrize("name", [*STRANGE, *PARTS])
-def test_a_record_whose_storing_is_not_told_may_be_stored_or_not(name: str) -> None:
+def test_an_invalid_answer_to_a_write_leaves_its_outcome_unknown(name: str) -> None:
     bucket = bucket_of({**STRANGE, **PARTS}[name])
     with pytest.raises(Unsure, match="the answer of NATS "):
         asyncio.run(bucket.put("a", {}, 1))
@@ -99,13 +99,13 @@ def test_a_record_whose_storing_is_not_told_may_be_stored_or_not(name: str) -> N
 
 
 @pytest.mark.parametrize("name", [*STRANGE, *PARTS])
-def test_a_record_that_is_none_is_not_read(name: str) -> None:
+def test_an_invalid_record_is_not_read(name: str) -> None:
     with pytest.raises(Unsure, match="the answer of NATS "):
         asyncio.run(bucket_of({**STRANGE, **PARTS}[name]).get("a"))
 
 
 @pytest.mark.parametrize("name", STRANGE)
-def test_what_is_no_answer_about_a_stream_is_one_sentence(name: str) -> None:
+def test_an_invalid_answer_about_a_stream_is_reported(name: str) -> None:
     with pytest.raises(FleetError, match="the answer of NATS is not one of JetStream"):
         asyncio.run(ask(Liar(STRANGE[name]), "STREAM.INFO.KV_own_0"))  # type: ignore[arg-type]
 
@@ -123,7 +123,7 @@ def test_a_stream_of_samples_that_answers_nonsense_is_tried_again(name: str) -> 
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(
+def test_invalid_cluster_states_are_reported_and_move_no_leader(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gateway reads them in its tasks, none of which may end."""
@@ -139,7 +139,7 @@ def test_a_bucket_s_servers_that_are_none_are_one_sentence_and_nothing_is_moved(
 
 
 @pytest.mark.parametrize("name", TIMES)
-def test_a_server_s_time_that_is_none_is_one_sentence(name: str) -> None:
+def test_an_invalid_server_time_is_reported(name: str) -> None:
     path: Any = Liar(TIMES[name])
     with pytest.raises(Unsure, match="the answer of nats://liar about a bucket has no time"):
         asyncio.run(check_buckets(path))

@@ -104,7 +104,7 @@ STRANGE: dict[str, tuple[str, str, bytes, str]] = {
 
 
 @table("name", STRANGE)
-def test_what_is_none_of_ours_is_no_record(name: str) -> None:
+def test_invalid_records_are_rejected(name: str) -> None:
     bucket, key, data, mistake = STRANGE[name]
     assert parsed(bucket, key, data) == (None, mistake)
 
@@ -112,7 +112,7 @@ def test_what_is_none_of_ours_is_no_record(name: str) -> None:
 @pytest.mark.parametrize(
     ("bucket", "key", "value"), [("lease_2", "gw-1", LEASE), ("own_0", "l", OWNER), ("plant", "line-1", LINE)]
 )
-def test_what_is_ours_may_have_more_than_it_must(bucket: str, key: str, value: dict[str, Any]) -> None:
+def test_a_valid_record_may_have_further_fields(bucket: str, key: str, value: dict[str, Any]) -> None:
     assert parsed(bucket, key, json.dumps(value).encode()) == (value, "")
     more = {**value, "of another version": [1, 2]}
     assert parsed(bucket, key, json.dumps(more).encode()) == (more, "")
@@ -140,7 +140,7 @@ async def _with_path(running: Cluster, work: Callable[[ServerPath], Any]) -> Non
         await path.close()
 
 
-def test_a_strange_record_is_told_of_once_and_others_are_read(
+def test_an_invalid_record_is_logged_once_and_others_are_read(
     one: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def work(path: ServerPath) -> None:
@@ -278,7 +278,7 @@ STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "spool
         (json.dumps({**STATE, "spool": {"bytes": 0}}).encode(), "it has no 'lost'"),
     ],
 )
-def test_an_answer_that_is_no_state_is_one_sentence(one: Cluster, answer: bytes, mistake: str) -> None:
+def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes, mistake: str) -> None:
     async def work(path: ServerPath) -> None:
         async def lie(message: Msg) -> None:
             await message.respond(answer)

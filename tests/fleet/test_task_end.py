@@ -42,7 +42,7 @@ def test_a_task_is_cancelled_until_it_is_over() -> None:
     asyncio.run(main())
 
 
-def test_what_is_over_keeps_its_end() -> None:
+def test_an_ended_session_stays_ended() -> None:
     async def main() -> None:
         async def failing() -> None:
             raise OSError("the disk is full")

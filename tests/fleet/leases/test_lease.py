@@ -54,7 +54,7 @@ async def look(observer: Observer) -> None:
         await observer.look(path)
 
 
-def test_a_session_begins_on_all_paths_and_counts_from_what_was_sent() -> None:
+def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> None:
     async def main() -> None:
         trial = Trial()
         for bucket in trial.buckets:
@@ -68,7 +68,7 @@ def test_a_session_begins_on_all_paths_and_counts_from_what_was_sent() -> None:
     asyncio.run(main())
 
 
-def test_a_renewal_counts_from_what_was_sent() -> None:
+def test_a_renewal_counts_from_its_sending() -> None:
     async def main() -> None:
         trial = Trial()
         lease = trial.lease()
@@ -240,7 +240,7 @@ def test_the_end_of_a_session_is_written_over_its_own_renewals_alone(later: dict
     asyncio.run(main())
 
 
-def test_renewals_that_are_stored_but_not_answered_when_a_session_ends_begin_nothing() -> None:
+def test_unanswered_renewals_at_the_end_start_no_session() -> None:
     """Else the engine might send again, and the kernel's timer would run for a gateway without a session."""
 
     async def main() -> None:
@@ -264,7 +264,7 @@ def test_renewals_that_are_stored_but_not_answered_when_a_session_ends_begin_not
     asyncio.run(main())
 
 
-def test_a_late_path_of_an_ended_session_is_none_of_the_next_one() -> None:
+def test_a_late_path_of_an_ended_session_is_not_used_by_the_next() -> None:
     async def main() -> None:
         trial = Trial()
         late = GatedBucket("lease_2", answers=True)
@@ -288,7 +288,7 @@ def test_a_late_path_of_an_ended_session_is_none_of_the_next_one() -> None:
     asyncio.run(main())
 
 
-def test_who_stands_still_between_the_clock_and_the_kernels_timer_goes_on() -> None:
+def test_a_suspension_between_clock_and_timer_is_survived() -> None:
     """A timer in the past would kill the process; the engine refuses it."""
 
     class StandingStill(NotedMastership):
@@ -394,7 +394,7 @@ def test_one_path_that_is_free_is_not_taken() -> None:
     asyncio.run(main())
 
 
-def test_two_that_begin_at_once_are_never_both_valid() -> None:
+def test_two_simultaneous_starts_are_never_both_valid() -> None:
     async def main() -> None:
         trial = Trial()
         first, second = trial.lease(), trial.lease()
@@ -434,9 +434,7 @@ def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() 
     asyncio.run(main())
 
 
-def test_who_holds_the_lock_file_knows_that_the_one_before_is_dead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_lock_file_proves_the_predecessors_death(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
 
     async def main() -> None:
@@ -571,7 +569,7 @@ def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
 
 
 @pytest.mark.parametrize("has_rival", [False, True])
-def test_nobody_waits_for_a_path_without_a_leader_to_end_the_dead(has_rival: bool) -> None:
+def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bool) -> None:
     """Its server may have died with the gateway. Another observer may have ended one of the others."""
 
     async def main() -> None:
@@ -599,7 +597,7 @@ def test_nobody_waits_for_a_path_without_a_leader_to_end_the_dead(has_rival: boo
     asyncio.run(main())
 
 
-def test_what_is_judged_is_what_is_ended() -> None:
+def test_only_the_judged_revision_is_ended() -> None:
     """A record that is renewed between the judgement and its end stays, even if it was read again."""
 
     async def main() -> None:
@@ -643,7 +641,7 @@ def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
     asyncio.run(main())
 
 
-def test_nobody_ends_himself() -> None:
+def test_no_gateway_ends_itself() -> None:
     """Such an end would count for all others at once."""
 
     async def main() -> None:
@@ -659,7 +657,7 @@ def test_nobody_ends_himself() -> None:
     asyncio.run(main())
 
 
-def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
+def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
     """Else all gateways would end each other when servers that were away come back."""
 
     async def main() -> None:
@@ -680,7 +678,7 @@ def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
     asyncio.run(main())
 
 
-def test_what_was_over_stays_over_for_who_was_cut_off_itself() -> None:
+def test_an_ended_session_stays_ended_after_a_cut() -> None:
     """Else it counts a dead gateway among the living for a while, and gives lines away to it."""
 
     async def main() -> None:
@@ -708,7 +706,7 @@ def test_what_was_over_stays_over_for_who_was_cut_off_itself() -> None:
     asyncio.run(main())
 
 
-def test_what_others_ended_unseen_is_not_over_for_who_was_cut_off() -> None:
+def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
     """Its last renewal may have been a moment ago."""
 
     async def main() -> None:
@@ -730,7 +728,7 @@ def test_what_others_ended_unseen_is_not_over_for_who_was_cut_off() -> None:
     asyncio.run(main())
 
 
-def test_a_look_tells_when_a_session_may_be_ended_and_when_it_has_ended() -> None:
+def test_a_read_reports_sessions_that_ended_or_may_be_ended() -> None:
     async def main() -> None:
         trial = Trial()
         lease, observer = trial.lease(), trial.observer()
@@ -749,7 +747,7 @@ def test_a_look_tells_when_a_session_may_be_ended_and_when_it_has_ended() -> Non
 
 
 @table(("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)])
-def test_who_may_be_dead_is_looked_at_in_that_very_moment(since_s: float, rests_s: float) -> None:
+def test_a_possibly_dead_gateway_is_read_at_once(since_s: float, rests_s: float) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         trial = Trial()
@@ -765,7 +763,7 @@ def test_who_may_be_dead_is_looked_at_in_that_very_moment(since_s: float, rests_
     run_controlled(main())
 
 
-def test_who_gets_no_answer_judges_nobody() -> None:
+def test_without_answers_no_gateway_is_judged() -> None:
     """The server that it reads from may be suspended while others renew the leases."""
 
     async def main() -> None:
@@ -907,7 +905,7 @@ def test_a_session_that_lost_a_path_is_weak_until_a_whole_one_follows() -> None:
     asyncio.run(main())
 
 
-def test_a_path_that_was_down_at_the_beginning_is_taken_later() -> None:
+def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
     async def main() -> None:
         trial = Trial()
         trial.buckets[2].is_down = True
@@ -921,7 +919,7 @@ def test_a_path_that_was_down_at_the_beginning_is_taken_later() -> None:
     asyncio.run(main())
 
 
-def test_a_path_with_another_beginning_of_the_same_number_is_taken_later() -> None:
+def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
     """A gateway of this name that died while it started has left it; two paths are ours, so it is over."""
 
     async def main() -> None:
@@ -955,7 +953,7 @@ def test_a_path_that_was_ended_before_its_taking_was_known_makes_a_session_weak(
     asyncio.run(main())
 
 
-def test_without_two_paths_no_session_begins() -> None:
+def test_without_two_paths_no_session_starts() -> None:
     async def main() -> None:
         trial = Trial()
         trial.buckets[1].is_down = trial.buckets[2].is_down = True

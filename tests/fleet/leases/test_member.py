@@ -276,7 +276,7 @@ def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
     asyncio.run(main())
 
 
-def test_who_leaves_in_order_is_not_waited_for(fleet: Cluster) -> None:
+def test_an_orderly_end_is_not_waited_for(fleet: Cluster) -> None:
     async def main() -> None:
         async with gateways(fleet, "a", "b", terms=LONG) as running:
             await running.leave("a")
@@ -376,7 +376,7 @@ def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
     asyncio.run(main())
 
 
-def test_who_lost_a_path_gives_the_session_up_one_after_another(
+def test_weak_sessions_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it would fall silent with the next server that dies."""
@@ -409,7 +409,7 @@ def test_who_lost_a_path_gives_the_session_up_one_after_another(
     asyncio.run(main())
 
 
-def test_without_servers_all_fall_silent_and_nobody_is_killed(
+def test_without_servers_all_lines_are_silent_and_no_gateway_is_killed(
     fleet: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The timer is cancelled after the lines were closed, and never set to the past."""

@@ -52,7 +52,7 @@ def story(monkeypatch: pytest.MonkeyPatch) -> Story:
     return Story(monkeypatch)
 
 
-def test_who_has_other_rules_is_named_until_it_ends(story: Story) -> None:
+def test_an_incompatible_gateway_is_named_until_it_ends(story: Story) -> None:
     story.begin("alike", RULES)
     older, newer = story.begin("older", RULES - 1), story.begin("newer", RULES + 1)
     assert story.trouble == SENTENCE.format("newer, older")
@@ -62,7 +62,7 @@ def test_who_has_other_rules_is_named_until_it_ends(story: Story) -> None:
     assert story.trouble == ""
 
 
-def test_who_says_no_rules_has_others(story: Story) -> None:
+def test_a_record_without_a_version_is_incompatible(story: Story) -> None:
     story.begin("first", RULES)
     for bucket in story.buckets:
         bucket.store(
@@ -71,7 +71,7 @@ def test_who_says_no_rules_has_others(story: Story) -> None:
     assert story.trouble == SENTENCE.format("first")
 
 
-def test_who_was_killed_is_waited_for_no_longer_than_its_lease(story: Story) -> None:
+def test_a_killed_gateway_is_waited_for_at_most_its_lease(story: Story) -> None:
     story.begin("older", RULES - 1)
     assert story.trouble
     story.clock.now += USUAL.lease - 1
@@ -80,6 +80,6 @@ def test_who_was_killed_is_waited_for_no_longer_than_its_lease(story: Story) -> 
     assert story.trouble == ""
 
 
-def test_our_own_session_before_is_no_other(story: Story) -> None:
+def test_our_own_earlier_session_is_not_an_incompatible_gateway(story: Story) -> None:
     story.begin("me", RULES - 1)
     assert story.trouble == ""

@@ -71,7 +71,7 @@ async def settled(subjects: CommandSubjects) -> None:
     await asyncio.gather(*supervisor().started)
 
 
-def test_a_line_that_is_let_go_answers_for_its_stops_until_it_is_closed(tmp_path: Path) -> None:
+def test_a_closing_line_answers_its_stops_until_it_is_closed(tmp_path: Path) -> None:
     async def main() -> None:
         path, lines = HeardPath(), SlowLines()
         subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]

@@ -159,7 +159,7 @@ def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands(
     asyncio.run(main())
 
 
-def test_lines_are_let_go_while_there_is_time_to_close_them() -> None:
+def test_lines_are_released_while_there_is_time_to_close_them() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
@@ -216,7 +216,7 @@ def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
     asyncio.run(main())
 
 
-def test_a_line_that_is_let_go_takes_no_stops() -> None:
+def test_a_closed_line_takes_no_stops() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
@@ -229,7 +229,7 @@ def test_a_line_that_is_let_go_takes_no_stops() -> None:
     asyncio.run(main())
 
 
-def test_a_line_is_let_go_before_it_is_given_away() -> None:
+def test_a_line_is_closed_before_it_is_released() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
@@ -246,7 +246,7 @@ def test_a_line_is_let_go_before_it_is_given_away() -> None:
     asyncio.run(main())
 
 
-def test_a_line_is_not_polled_again_while_it_may_have_been_given_away() -> None:
+def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
     """An unanswered write may still be stored later, until a newer record rules that out."""
 
     async def main() -> None:
@@ -283,7 +283,7 @@ def owners(trial: Trial) -> list[tuple[str, int]]:
 ME, NOBODY = ("a", 1), ("", 0)
 
 
-def test_a_line_that_nobody_ever_had_is_claimed_by_one_record() -> None:
+def test_a_new_line_is_claimed_by_one_record() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
@@ -381,7 +381,7 @@ def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
     asyncio.run(main())
 
 
-def test_a_bucket_whose_home_may_be_gone_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bucket_with_a_lost_home_does_not_delay_claims(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was the only one left to be written as long as another was not read."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
 
@@ -412,7 +412,7 @@ def test_where_another_was_first_nothing_more_is_written() -> None:
     asyncio.run(main())
 
 
-def test_a_late_answer_makes_no_line_ours_that_is_being_given_away(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would be opened between the two records that give it away, and be another's in the next moment."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
 
@@ -465,7 +465,7 @@ def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
     asyncio.run(main())
 
 
-def test_what_was_given_away_in_doubt_is_claimed_anew_where_any_line_may_be() -> None:
+def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
     async def main() -> None:
         trial = Trial()
         await trial.claim()
@@ -574,7 +574,7 @@ class BrokenTrial(Trial):
         await until(lambda: not self.keeper._at_work)
 
 
-def test_a_line_that_cannot_be_taken_is_told_once_for_each_reason_and_when_it_is(
+def test_an_unopened_line_is_logged_once_per_reason_and_when_it_opens(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -600,7 +600,7 @@ def test_a_line_that_cannot_be_taken_is_told_once_for_each_reason_and_when_it_is
     ]
 
 
-def test_of_a_line_that_another_has_by_now_no_trouble_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         trial = BrokenTrial(monkeypatch)
         await trial.claim()

@@ -27,12 +27,12 @@ def test_the_newest_move_comes_first() -> None:
     assert told(FIRST, move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2"), ("", "gw-1")]
 
 
-def test_a_line_that_was_given_away_and_taken_has_moved_once() -> None:
+def test_a_released_and_taken_line_has_moved_once() -> None:
     moves = [FIRST, move(2, "gw-1", ""), move(3, "", "gw-2")]
     assert told(*moves) == told(*reversed(moves)) == [("gw-1", "gw-2"), ("", "gw-1")]
 
 
-def test_a_line_that_was_given_away_and_is_nobodys() -> None:
+def test_a_released_line_has_no_master() -> None:
     assert told(FIRST, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
 
 

@@ -33,7 +33,7 @@ def moved(before: dict[str, str], after: dict[str, str]) -> int:
     return sum(before[line] != after[line] for line in before)
 
 
-def test_nobody_has_more_than_110_percent_of_the_mean() -> None:
+def test_no_gateway_has_more_than_110_percent_of_the_mean() -> None:
     shares = Counter(assign(LINES, GATEWAYS).values())
     assert sum(shares.values()) == len(LINES)
     assert max(shares.values()) <= 55
@@ -188,7 +188,7 @@ def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
     assert claim == Claim({"second": 12, "first": 11}, {}, 6)
 
 
-def test_what_was_given_away_in_doubt_is_claimed_at_that_revision() -> None:
+def test_an_uncertain_release_is_reclaimed_at_its_revision() -> None:
     records = records_of(ME, ME, LIVING)
     assert claim_of(ME, records, is_over) is None
     assert claim_of(ME, records, is_over, ["second"]) == Claim({"second": 12}, {}, 6)
@@ -208,7 +208,7 @@ def test_the_owner_is_whom_two_records_name_or_the_first_one_alone() -> None:
     assert owner_by_records(LIVING, NEVER, NEVER) is None
 
 
-def test_of_two_owners_the_newer_one_is_told() -> None:
+def test_the_newer_of_two_owners_is_shown() -> None:
     """The first record of all names a dead session with two votes, while its bucket has no leader."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
@@ -234,7 +234,7 @@ def test_a_name_that_would_do_is_said(name: str, better: str) -> None:
     assert names.is_name(better)
 
 
-def test_records_of_lines_begin_in_all_three_buckets() -> None:
+def test_first_records_are_spread_over_all_three_buckets() -> None:
     places = [names.owner_buckets(line) for line in LINES]
     assert all(sorted(place) == sorted(names.OWNERS) for place in places)
     shares = Counter(place[0] for place in places)

@@ -155,7 +155,7 @@ def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
     return [(move.before, move.after) for move in records.moves.newest(9)]
 
 
-def test_moves_are_told_with_the_master_before_once_two_records_say_so() -> None:
+def test_moves_name_the_former_master_once_two_records_agree() -> None:
     records = followed()
     take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST)
     assert moves_of(records) == [("", "b")]
@@ -175,7 +175,7 @@ def test_a_session_has_lines_of_which_one_record_names_it() -> None:
     assert records.owned_by("b", 1) == set()
 
 
-def test_who_did_not_follow_a_line_does_not_say_whose_it_was() -> None:
+def test_an_unfollowed_line_has_no_former_master() -> None:
     """It was read in a cold start or an hour ago, and has had other masters since."""
     records = followed()
     take(records, 8, owner_value(("b", 1), 8, 0), FIRST, SECOND)
@@ -186,7 +186,7 @@ def test_who_did_not_follow_a_line_does_not_say_whose_it_was() -> None:
     assert moves_of(records)[0] == ("a", "")
 
 
-def test_a_line_that_is_claimed_anew_by_its_master_has_not_moved() -> None:
+def test_a_line_claimed_again_by_its_master_has_not_moved() -> None:
     """The outcome of its release was unknown."""
     records = followed()
     take(records, 1, owner_value(("a", 2), 1, 0), FIRST, SECOND)
@@ -196,7 +196,7 @@ def test_a_line_that_is_claimed_anew_by_its_master_has_not_moved() -> None:
     assert moves_of(records) == [("a", "b"), ("", "a")]
 
 
-def test_of_sessions_that_have_no_line_any_more_nothing_is_kept() -> None:
+def test_sessions_without_lines_are_forgotten() -> None:
     records = followed()
     for session in range(1, 1000):
         take(records, session, owner_value(("b", session), session, 0), FIRST, SECOND)

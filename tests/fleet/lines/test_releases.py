@@ -102,7 +102,7 @@ def test_a_server_that_is_silent_for_long_is_not_waited_for(monkeypatch: pytest.
     assert trial.releases.due(LINES) == set()
 
 
-def test_who_is_in_haste_waits_for_leaders_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drained_gateway_waits_only_for_leaders(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
     trial.maimed = set(names.OWNERS)
     trial.led.remove("own_2")

@@ -45,14 +45,14 @@ class Trial:
         return self.shared_among(*others) == {"a", *others}
 
 
-def test_who_comes_back_shares_with_those_who_were_there_all_the_time() -> None:
+def test_a_returning_gateway_shares_with_the_others() -> None:
     trial = Trial()
     trial.sees("b", "c")
     trial.clock.pass_s(QUIET_NS / SECOND)
     assert trial.is_shared_with_those_who_come("b", "c")
 
 
-def test_gateways_of_a_cold_start_are_shared_with_once_none_has_come_for_a_while() -> None:
+def test_a_cold_start_assigns_lines_once_no_gateway_joins() -> None:
     """Otherwise the first one would read the records of all lines, and the second those of half."""
     trial = Trial()
     assert trial.shared_among("b") == set()
@@ -65,7 +65,7 @@ def test_gateways_of_a_cold_start_are_shared_with_once_none_has_come_for_a_while
     assert trial.is_shared_with_those_who_come("b", "c")
 
 
-def test_who_has_settled_shares_anew_at_once() -> None:
+def test_a_settled_gateway_reassigns_at_once() -> None:
     trial = Trial()
     trial.clock.pass_s(SETTLE_S)
     assert trial.is_shared_with_those_who_come("b", "c")

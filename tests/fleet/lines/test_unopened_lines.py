@@ -93,7 +93,7 @@ def test_one_line_at_a_time_is_tried_again_and_ever_more_rarely() -> None:
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
-def test_a_line_that_nobody_can_open_is_tried_first_and_as_often_as_before() -> None:
+def test_a_line_that_no_gateway_can_open_is_tried_first_and_as_often() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -145,7 +145,7 @@ def test_a_line_that_does_not_come_back_ends_its_trial() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_no_more_are_named_than_a_lease_has_room_for() -> None:
+def test_reported_lines_fit_into_a_lease_record() -> None:
     unopened = UnopenedLines(HandClock())
     for number in range(MOST_BYTES):
         failed(unopened, f"line-{number}")
@@ -166,11 +166,11 @@ def test_only_named_lines_move_and_every_gateway_finds_the_same() -> None:
     assert found == hand_over(dict(reversed(SHARED.items())), {"c": [], "b": [], "a": sorted(OF_A)})
 
 
-def test_a_line_that_nobody_can_open_stays() -> None:
+def test_a_line_that_no_gateway_can_open_stays() -> None:
     assert hand_over(SHARED, {"a": LINES, "b": LINES, "c": LINES}) == SHARED
 
 
-def test_a_line_goes_on_to_who_has_not_tried_it() -> None:
+def test_a_line_goes_to_a_gateway_that_has_not_tried_it() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
     assert {found[line] for line in OF_A} == {"c"}
 

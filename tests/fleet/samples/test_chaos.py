@@ -21,7 +21,7 @@ def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("bench.questions.fleet_chaos")
 
 
-def test_what_is_lost_or_doubled_would_be_found(chaos: Any) -> None:
+def test_lost_or_doubled_rows_would_be_found(chaos: Any) -> None:
     told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
     whole = {
         "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),  # two more than reported

@@ -207,7 +207,7 @@ def test_a_commit_ends_where_it_has_much_in_memory(
 
 
 @pytest.mark.slow
-def test_what_is_missing_or_doubled_is_told_and_counted(
+def test_missing_or_doubled_messages_are_logged_and_counted(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> HubState:
@@ -240,7 +240,7 @@ def test_what_is_missing_or_doubled_is_told_and_counted(
     ]
 
 
-def test_messages_that_the_stream_removed_are_told(
+def test_messages_that_the_stream_removed_are_reported(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> None:
@@ -320,7 +320,7 @@ def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path
     assert told == (len(one_drive), sum(v is not None for v in one_drive), sum(filter(None, one_drive)))
 
 
-def test_a_file_that_was_begun_is_no_commit(running: Cluster, tmp_path: Path) -> None:
+def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
     """A killed hub leaves one: the rows are read again."""
 
     async def live() -> None:

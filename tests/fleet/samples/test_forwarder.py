@@ -199,7 +199,7 @@ class Refusing:
         return await self._client.request(subject, data, **details)
 
 
-def test_a_stream_that_refuses_is_told_of_once_until_it_takes_a_message(
+def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> None:
@@ -232,7 +232,7 @@ def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_p
     asyncio.run(live())
 
 
-def test_a_folder_that_was_set_back_is_told_and_sends_nothing(
+def test_a_restored_old_folder_is_logged_and_not_forwarded(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> None:

@@ -93,7 +93,7 @@ def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: i
 
 
 @pytest.mark.long
-def test_the_hub_is_away_and_the_spool_full_of_what_was_forwarded(tmp_path: Path, most: int) -> None:
+def test_a_spool_full_of_forwarded_messages_survives_a_missing_hub(tmp_path: Path, most: int) -> None:
     """The stream has it, so removal from the spool loses no rows."""
     with cluster(tmp_path / "nats", 1) as servers:
 

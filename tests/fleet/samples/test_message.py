@@ -86,7 +86,7 @@ def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
 
 
 @pytest.mark.long
-def test_a_message_is_no_larger_than_it_may_be() -> None:
+def test_a_message_keeps_its_size_limit() -> None:
     found = packed(numbered(0, 2000), most=8_000)
     assert len(found) > 2
     assert all(len(message.data) <= 8_000 for message in found)
@@ -97,7 +97,7 @@ def test_a_message_is_no_larger_than_it_may_be() -> None:
 
 
 @pytest.mark.slow
-def test_a_message_has_no_more_rows_than_codes_have_room_for() -> None:
+def test_a_message_has_at_most_65536_rows() -> None:
     found = packed(*(numbered(first, 1000) for first in range(0, 7000, 1000)))
     assert [message.rows for message in found] == [MOST_ROWS, 70_000 - MOST_ROWS]
 
@@ -278,7 +278,7 @@ def test_rows_that_take_no_bytes_are_counted_first(most_allocated: Callable[[], 
     assert most_allocated() < 1 << 20
 
 
-def test_an_older_version_of_the_format_is_no_message() -> None:
+def test_an_older_format_version_is_rejected() -> None:
     """It has another way to say that buffers are compressed."""
     options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
     with pytest.raises(MessageError, match="another version of the format"):

@@ -61,7 +61,7 @@ def say_with(url: str, subject: str, headers: str) -> None:
 
 
 @pytest.mark.parametrize("parser", [None, _as_mail])
-def test_nobody_says_anothers_samples_by_headers(
+def test_headers_cannot_forge_the_origin_of_samples(
     running: Cluster, parser: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     if parser:

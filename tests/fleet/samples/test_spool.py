@@ -220,7 +220,7 @@ def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None
 # ---- bounds ----
 
 
-def test_the_oldest_are_removed_at_the_limit_and_those_not_forwarded_are_counted_and_told(
+def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     filled(folder, 1)
@@ -244,7 +244,7 @@ def test_the_oldest_are_removed_at_the_limit_and_those_not_forwarded_are_counted
     assert "the spool is full at" in caplog.text
 
 
-def test_what_was_removed_before_the_stream_was_asked_counts_when_it_answers(folder: Path) -> None:
+def test_early_removals_are_counted_when_the_stream_answers(folder: Path) -> None:
     filled(folder, 6)
     spool = Spool(folder, GATEWAY, most=1)  # the newest stays
     spool.append(numbered(30, 5))
@@ -259,7 +259,7 @@ def test_what_was_removed_before_the_stream_was_asked_counts_when_it_answers(fol
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_holds_nobody_up(
+def test_a_full_disk_is_logged_and_delays_no_poller(
     folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.01)
@@ -332,7 +332,7 @@ def test_a_full_disk_takes_neither_what_the_stream_lacks_nor_the_newest_which_sa
     assert (spool.state().newest, spool.state().lost) == (4, 0)
 
 
-def test_a_disk_that_stands_still_holds_nobody_up(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hanging_disk_delays_no_poller(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     goes_on, stands = threading.Event(), threading.Event()
     really = os.fsync
 

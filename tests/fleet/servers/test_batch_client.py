@@ -129,7 +129,7 @@ def test_other_headers_are_of_no_stored_message(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
-def test_a_record_that_looks_like_the_end_hides_none_behind_it(one: Cluster, way: str) -> None:
+def test_a_record_like_an_end_marker_hides_no_later_one(one: Cluster, way: str) -> None:
     async def work(path: ServerPath) -> None:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
@@ -171,7 +171,7 @@ def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluste
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("way")
-def test_a_request_without_an_answer_is_told_from_those_that_have_one(one: Cluster) -> None:
+def test_unanswered_requests_are_distinguished_from_answered_ones(one: Cluster) -> None:
     async def main() -> None:
         client = await connect(one.urls[0], {})
         deaf = await client.subscribe("deaf")
@@ -228,7 +228,7 @@ def test_what_a_server_that_is_cut_off_got_is_asked_again(
     _with_path(one, work)
 
 
-def test_a_path_whose_server_is_cut_off_has_its_questions_asked_by_the_others(one: Cluster) -> None:
+def test_reads_of_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
     async def main() -> None:
         paths = paths_of(one.urls)
         await asyncio.gather(*(path.open() for path in paths))
@@ -251,7 +251,7 @@ def test_a_path_whose_server_is_cut_off_has_its_questions_asked_by_the_others(on
 
 
 @pytest.mark.usefixtures("way")
-def test_an_answer_that_comes_too_late_is_none_to_another_request(one: Cluster) -> None:
+def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> None:
     async def main() -> None:
         client, other = await connect(one.urls[0], {}), await connect(one.urls[0], {})
         asked: asyncio.Queue[str] = asyncio.Queue()
@@ -291,7 +291,7 @@ def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
     asyncio.run(main())
 
 
-def test_a_connection_that_is_not_read_any_more_is_left_for_a_new_one(one: Cluster) -> None:
+def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
     async def work(path: ServerPath) -> None:
         former = path._client
         assert former

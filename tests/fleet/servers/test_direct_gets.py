@@ -102,7 +102,7 @@ def test_a_way_that_fails_is_not_waited_for() -> None:
     assert answer(*ways) == ("b", 0.01)
 
 
-def test_a_failure_of_all_ways_is_told_at_once() -> None:
+def test_a_failure_of_all_paths_is_raised_at_once() -> None:
     for number in (1, 2, 3):
         ways = [SlowWay("a", 0.01, failure=Unsure("it ended with 503")) for _ in range(number)]
         with pytest.raises(Unsure, match="503"):
@@ -117,7 +117,7 @@ def test_what_may_not_be_asked_is_asked_once() -> None:
     assert asked(ways) == [[0.0], []]
 
 
-def test_a_question_that_nobody_answers_comes_to_an_end() -> None:
+def test_an_unanswered_read_ends() -> None:
     ways = [SlowWay("a"), SlowWay("b"), SlowWay("c")]
 
     async def main() -> float:
@@ -218,7 +218,7 @@ def test_a_path_without_a_question_to_spare_comes_to_an_end() -> None:
     assert asked(ways) == [[0.0], []]
 
 
-def test_who_saw_answers_take_long_waits_longer_before_asking_again() -> None:
+def test_slow_answers_delay_repeats() -> None:
     """Many gateways that start together each read the whole plant beside small records."""
     way, others, spare = LateWay(0.2), [SlowWay("b"), SlowWay("c")], full()
 
@@ -230,7 +230,7 @@ def test_who_saw_answers_take_long_waits_longer_before_asking_again() -> None:
     assert asked(others) == [[0.1], [0.1]]  # of the first read alone
 
 
-def test_what_is_lost_is_asked_again_soon_once_answers_are_quick_again() -> None:
+def test_lost_reads_are_repeated_soon_once_answers_are_fast() -> None:
     ways, spare = [LateWay(0.3) for _ in range(3)], full()
     questions(10, ways, spare)
     for way in ways:
