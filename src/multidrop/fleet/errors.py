@@ -49,7 +49,7 @@ class Conflict(Exception):
 
 
 MOST_DENIALS = 1000
-REFUSALS = (  # part of a failure's text, and what it means
+REFUSALS = (  # part of a failure's text, and its meaning
     (
         "authorization violation",
         "{} refuses these credentials, or the lack of any: see --credentials",

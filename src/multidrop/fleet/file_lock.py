@@ -57,7 +57,7 @@ class LifeLock:
 
 
 def machine_id() -> str:
-    """Return an id of this machine's present boot; "" if unknown, which proves nothing.
+    """Return an id of this machine's present boot; "" if unknown, which is never a proof.
 
     Copies of a disk share the machine's id and the lock file with its id. A gateway that finds a record of
     another boot waits: after a reboot the lease has expired anyway.

@@ -20,7 +20,7 @@ from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 
 _log = logging.getLogger("multidrop.fleet")
 
-JOIN_S = 0.25  # between tries to begin a session
+JOIN_S = 0.25  # between attempts to start a session
 AGAIN_S = 0.1  # after a renewal that failed
 
 
@@ -35,7 +35,7 @@ class MayPoll(Protocol):
     def extend(self, until_ns: int) -> object:
         """Let the engine send until then, and postpone the kernel's timer.
 
-        Raises ValueError, and changes nothing, if that time is in the past.
+        Raises ValueError without any change if that time is in the past.
         """
 
     def end(self) -> object:
@@ -111,7 +111,7 @@ class Lease:
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
-        """Return True if all paths answer, so that a new session would have all of them."""
+        """Return True if all paths answer, so that a new session would have all three."""
         records = await asyncio.gather(*(self._read(path) for path in range(len(self._buckets))))
         return None not in records
 

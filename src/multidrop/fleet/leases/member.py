@@ -319,7 +319,7 @@ class Member:
             await asyncio.sleep(GUARD_LOOK_S)
 
     def _keeps_leaders(self) -> bool:
-        """Return True if this gateway looks after the buckets' leaders: the first one by name does."""
+        """Return True if this gateway manages the buckets' leaders: the first one by name does."""
         return self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name
 
     # ---- one step ----

@@ -20,7 +20,7 @@ from typing import NamedTuple
 SECOND = 1_000_000_000  # ns
 PATHS = 3
 RENEW_S = 0.5  # between renewals of a path
-RULES = 2  # version of the ownership rules (ownership.py): increment it with each change of them
+RULES = 2  # version of the ownership rules (ownership.py): increment it with each change
 
 
 class Terms(NamedTuple):
@@ -57,7 +57,7 @@ def may_send(now: int, until: int) -> bool:
 
 
 def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
-    """Return what is known about a record after reading it."""
+    """Return the updated observation of a record after reading it."""
     return before if before is not None and before.revision == revision else SeenRevision(revision, now)
 
 

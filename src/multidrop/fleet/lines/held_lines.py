@@ -67,7 +67,7 @@ class HeldLines:
             held.is_leaving = True
 
     def shut(self, line: str) -> None:
-        """Accept nothing from now on."""
+        """Accept no commands or stops from now on."""
         self._held.pop(line, None)
 
     def for_command(self, line: str) -> HeldLine | None:
@@ -81,7 +81,7 @@ class HeldLines:
 
 
 def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:
-    """Return the permission lists of a line's record; an invalid list is empty and allows nothing."""
+    """Return the permission lists of a line's record; an invalid list is empty: it allows no command."""
     may = description.get("may")
     given = may if isinstance(may, dict) else {}
     return {key: _entries(given.get(key)) for key in LISTS}

@@ -33,11 +33,11 @@ class Lines(Protocol):
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it.
 
-        If that raises, nothing of the line stays open, and it is tried again.
+        If that raises, the line is closed again, and it is retried.
         """
 
     async def let_go(self, line: str) -> None:
-        """Stop polling the line and close it: after this nothing is sent on it."""
+        """Stop polling the line and close it: no request is sent on it afterwards."""
 
 
 class PortLoss(NamedTuple):
@@ -63,7 +63,7 @@ class TakenLine(NamedTuple):
 
 
 class LineKeeper:
-    """The lines that one gateway polls, and the task in progress on each of them.
+    """The lines that one gateway polls, and the task in progress on each.
 
     `on_change` is called when the next step is due. `port_loss` returns how the port of a polled line is
     lost, or None if it is open.

@@ -37,7 +37,7 @@ SPARE_S = 0.15  # after one bucket has answered, before the spare one is used
 class OwnerRecords:
     """The records of lines that name our present session.
 
-    Nothing is written unless `may_write()` returns True. `on_mine` is called with each line that becomes
+    Records are written only if `may_write()` returns True. `on_mine` is called with each line that becomes
     ours.
     """
 

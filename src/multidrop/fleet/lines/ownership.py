@@ -72,7 +72,7 @@ def owner_by(records: LineRecords) -> Record | None:
 
 
 def turn_of(records: LineRecords) -> int:
-    """Return the newest turn of these records; 0 if the line never had a master."""
+    """Return the newest turn in the records; 0 if the line never had a master."""
     turn = 0
     for record in records.values():
         if record and record.value and record.value["turn"] > turn:

@@ -143,11 +143,11 @@ class FleetRecords:
 
 
 ASKED_AT_ONCE = 500  # lines; servers allow 1024
-DOUBT_S = 30.0  # longer than the election of a bucket's leader, which may still store what it did not answer
+DOUBT_S = 30.0  # longer than an election, after which an unanswered write may still be stored
 
 
 class ShareFollower(Follower):
-    """The records of a share's lines in one bucket; revision 0 stands for a line that never had a master.
+    """The records of a share's lines in one bucket; revision 0 means that the line never had a master.
 
     `is_mine` returns True for a record of our present session, `has` for a line that we poll.
     """
@@ -160,7 +160,7 @@ class ShareFollower(Follower):
         self._has = has
         self._share: frozenset[str] = frozenset()
         self._asked: frozenset[str] | None = frozenset()  # its lines that may change; None: to be found
-        self._doubted: dict[str, float] = {}  # since when writes of these lines have no answer
+        self._doubted: dict[str, float] = {}  # lines with an unanswered write, and since when
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
@@ -239,7 +239,7 @@ class ShareRecords(FleetRecords):
             share.look_anew()
 
     def want(self, lines: Iterable[str]) -> None:
-        """Follow the masters of these lines from now on."""
+        """Follow the masters of exactly these lines from now on."""
         wanted = frozenset(lines)
         for share in self._shares.values():
             share.want(wanted)

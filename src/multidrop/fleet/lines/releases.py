@@ -61,7 +61,7 @@ class Releases:
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
-        """Check the servers once; does nothing if no line is to be released."""
+        """Check the servers once, if any line is to be released."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}

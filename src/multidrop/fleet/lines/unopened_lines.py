@@ -14,7 +14,7 @@ from multidrop.fleet.leases.rules import SECOND
 
 OPENINGS = 3  # failed ones, before a line is reported
 LOST_NS = 6 * SECOND  # from the last reply on a line whose port is lost, before the line is reported
-REPLY_NS = 3 * SECOND  # an older reply says nothing about when the port was lost
+REPLY_NS = 3 * SECOND  # an older reply does not tell when the port was lost
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # until a trial
 TRIAL_NS = 60 * SECOND  # after which the trial of a line that did not come back ends
 MOST_BYTES = 8_000  # of line names in a lease record

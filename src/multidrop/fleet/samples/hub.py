@@ -66,7 +66,7 @@ MOST_READ = 64  # messages in one answer
 MOST_READ_BYTES = 8 << 20
 MOST_ROWS = 1_000_000  # of one commit: 50 MB
 MOST_BYTES = 256 << 20  # of one commit: messages and rows; one answer may exceed it
-LOOKING_S = 0.2  # between reads if there is nothing new
+LOOKING_S = 0.2  # between reads without a new message
 AGAIN_S = 1.0  # after a failure
 BEHIND_S = 5.0  # for a server that still lacks messages that its leader has
 
@@ -106,7 +106,7 @@ class SampleSink(Protocol):
         """Return the stored position of this stream; called at the start and after each failure."""
 
     def write(self, commit: Commit) -> None:
-        """Store all of it, or nothing."""
+        """Store the whole commit, or leave the sink unchanged."""
 
     def close(self) -> None:
         """Release open resources."""
@@ -189,7 +189,7 @@ class SampleHub:
             )
 
     async def _commit(self, once: bool) -> bool:
-        """Collect messages and store them; True if nothing is left of what the stream had when asked."""
+        """Collect messages and store them; True once the sink has all that the stream had when asked."""
         messages: list[StreamMessage] = []
         tables: list[Any] = []
         rows, size, ends = 0, 0, None

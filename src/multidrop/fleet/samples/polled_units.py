@@ -49,7 +49,7 @@ class PolledUnits:
             self._made = None
 
     def table(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
-        """Return the units of these drives' registers. The table is rebuilt after changes of lines or names.
+        """Return the units of the drives' registers. The table is rebuilt after changes of lines or names.
 
         Messages have nearly as many series as rows, so a lookup per series would cost more than all other
         work on a row.

@@ -120,7 +120,7 @@ async def close(client: Client) -> None:
 
 
 async def _ignore(_: Exception) -> None:
-    """Do nothing: callers get the error too, and the client would log a traceback for each."""
+    """Ignore the error: callers get it too, and the client would log a traceback for each."""
 
 
 async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> int:
@@ -234,7 +234,7 @@ def _as_wanted() -> Iterator[None]:
 
 
 def silent(client: Client, failure: Exception) -> StreamError:
-    """Return why there was no answer: a server reports missing rights separately."""
+    """Return the reason for a missing answer: a server reports missing rights separately."""
     last = client.last_error
     if last and "permissions violation" in str(last).lower():
         return StreamError(f"this connection lacks rights: {_text(last)}")

@@ -4,7 +4,7 @@
 |----------------------|------------------------------------------------------------------------|
 | `spool.json`         | fleet, gateway, and the id of the log whose messages are numbered here |
 | `NUMBER-ROWS.arrows` | a message: its sequence in the log, and its rows                       |
-| `NUMBER-ROWS.damaged`| a newest message of which a disk kept only a part                      |
+| `NUMBER-ROWS.damaged`| a newest message that the disk stored only in part                     |
 | `.spool.lock`        | locked by the process that writes here                                 |
 
 A file is on the disk before it gets its name. The newest message is never removed: it holds the number that
@@ -153,7 +153,7 @@ class SpoolFolder:
         del self.messages[message.sequence]
 
     def _store(self, path: Path, data: bytes) -> None:
-        """Write a file that gets its name once it is on the disk; leave nothing if that fails."""
+        """Write a file that gets its name once it is on the disk; remove its remains if that fails."""
         part = path.with_name(f".{path.name}.tmp")
         try:
             file = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
@@ -349,7 +349,7 @@ class Spool:
         while not is_over:
             try:
                 is_over = self._write_what_is_due()
-            except Exception as failure:  # such as no memory: continue with the waiting rows
+            except Exception as failure:  # such as MemoryError: continue with the waiting rows
                 _log.error("writing the spool %s failed; retrying", self._folder.path, exc_info=failure)
                 time.sleep(AGAIN_S)
 

@@ -50,7 +50,7 @@ class Gathered:
             self.last.set_result(status)
 
     async def wait(self, silence_s: float) -> None:
-        """Wait for the final answer, or until nothing has arrived for `silence_s` seconds."""
+        """Wait for the final answer, or until no answer has arrived for `silence_s` seconds."""
         before = -1
         while not self.last.done() and self.count > before:
             before = self.count

@@ -197,7 +197,7 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages of a direct get; the other paths are asked too if this one is slow.
+        """Return all messages of a direct get; repeat it on the other paths if this one is slow.
 
         Raises Unsure as `request` does.
         """

@@ -100,7 +100,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
 
 
 async def _is_one_over(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
-    """Wait until one request ends. Return False if nothing arrives for `silence_s`, or none is left."""
+    """Wait until one request ends. Return False after `silence_s` without data, or if none is left."""
     while gets:
         before = sum(get.count for get in gets.values())
         done, _ = await asyncio.wait(gets, timeout=silence_s, return_when=asyncio.FIRST_COMPLETED)

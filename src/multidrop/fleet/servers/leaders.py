@@ -122,7 +122,7 @@ async def have_leaders(path: ServerPath) -> bool:
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
-    """Return the servers of those lease and master buckets whose leader answers soon.
+    """Return the servers of the lease and master buckets whose leader answers soon.
 
     A leader that is cut off delays the others by at most that time.
     """
@@ -176,7 +176,7 @@ class LeaseTerms:
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
         """Hand over the buckets that are due, and return True if any was.
 
-        They go one after the other, so at most one of them waits for an election because of this.
+        They go one after the other, so at most one waits for an election because of this.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}

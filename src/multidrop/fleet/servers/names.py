@@ -1,4 +1,4 @@
-"""Names in NATS: buckets, subjects, and the gateways and lines that are part of them."""
+"""Names in NATS: buckets and subjects, and the gateways and lines in them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def command_subject(line: str) -> str:
 
 
 def do_subject(gateway: str, run: str) -> str:
-    """Return the subject for telling one run of a gateway's process to carry out its offer."""
+    """Return the subject on which one run of a gateway's process is told to carry out its offer."""
     return f"do.{gateway}.{run}"
 
 
@@ -60,5 +60,5 @@ def stop_subject(line: str) -> str:
 
 
 def gateway_subject(gateway: str, wanted: str) -> str:
-    """Return the subject for requests about a gateway: "state", "drain", or "*" for all of them."""
+    """Return the subject for requests about a gateway: "state", "drain", or "*" for both."""
     return f"gateway.{gateway}.{wanted}"

@@ -17,7 +17,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import Cluster, bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
-ROUNDS = 40  # 2.9.10 fails in the first few of them
+ROUNDS = 40  # 2.9.10 fails in the first few rounds
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
