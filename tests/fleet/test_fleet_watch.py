@@ -130,7 +130,7 @@ def test_no_table_head_is_shown_without_rows(height: int) -> None:
 
 
 def test_lines_of_a_silent_master_are_shown() -> None:
-    """If all gateways are dead, their sessions are not ended, and each line has a master in the records."""
+    """Sessions of dead gateways are not ended without a living one; each line has a master in the records."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
     found["lines"]["line-7"]["master"] = "gw-2"

@@ -102,7 +102,7 @@ def test_stored_rows_survive_any_end_of_the_hub(
 def test_a_signal_waits_for_what_the_hub_is_doing(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    """If raised within nats-py's own tasks, it would leave pending futures behind."""
+    """An error within nats-py's own tasks would leave pending futures behind."""
     done: list[str] = []
 
     async def read(hub: SampleHub, *, once: bool) -> None:
