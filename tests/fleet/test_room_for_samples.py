@@ -94,4 +94,4 @@ def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> N
 def test_a_size_that_is_none(run: Run) -> None:
     status, out, err = run("fleet", "init", "--keep", "much")
     assert (status, out, err.count("\n")) == (2, "", 1)
-    assert "'much' is not a size" in err
+    assert "invalid size 'much'" in err
