@@ -1,8 +1,8 @@
-"""README's and the documentation's code runs as it stands, and their pages hold what the library has.
+"""Run the code of README and the documentation as printed, and check that their pages are complete.
 
-Each page has a directory and a namespace of its own, in which its blocks run in their order. A block that
-begins with `# NAME.toml` or `# NAME.py` is saved under that name. A port /dev/ttyUSBn of a plant file is a
-simulated line with the drives of that file.
+Each page has its own directory and namespace, in which its blocks run in order. A block whose first line is
+`# NAME.toml` or `# NAME.py` is saved under that name. A port /dev/ttyUSBn of a plant file is a simulated line
+with the drives of that file.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from multidrop.sim import Simulator, Wire, simulated
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
-LANGUAGES = {"python", "toml", "sh", "console", "text", "c"}  # text and c are shown, and not run
+LANGUAGES = {"python", "toml", "sh", "console", "text", "c"}  # text and c blocks are not run
 PACKAGES = (
     "multidrop",
     *(f"multidrop.{name}" for name in ("drive", "families.profiles", "sim", "recording", "capture", "scan")),
 )
 
-# Commands that are not run, and why: those that begin so.
+# Commands that are not run, by their first words, and the reason.
 NOT_RUN = {
     "python3 -m venv": "installs: .ci/run does README's",
     ".venv/bin/pip": "installs",
@@ -78,17 +78,17 @@ NOT_RUN = {
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line that somebody else masters: tests/cli/test_cli_sniff.py",
 }
-COMPUTED = "multidrop plan"  # its figures are always the same; those of others are measured
-STATUS = {"multidrop plan full.toml": 1}  # where that is not 0
-SHORTER = (  # what would take long, and what is enough here
+COMPUTED = "multidrop plan"  # deterministic figures; those of other commands are measured
+STATUS = {"multidrop plan full.toml": 1}  # expected exit status, if not 0
+SHORTER = (  # replacements that shorten long runs
     (r"--seconds \d+", "--seconds 1"),
     (r"seconds=\d+", "seconds=0.5"),
     (r"--addresses 1-4", "--addresses 1-3 --quick"),
     (r"(multidrop scan /dev/ttyUSB0)", r"\1 --addresses 1-2 --baudrates 9600 --formats 8N1 --quick"),
     (r"(?m)(multidrop poll plant.toml --out run.arrows)$", r"\1 --seconds 1"),
-    (r'Bus\("(/dev/ttyUSB\d)"', r'Bus("\1", expiry=30'),  # of a write, on a busy machine
+    (r'Bus\("(/dev/ttyUSB\d)"', r'Bus("\1", expiry=30'),  # expiry of writes, for busy machines
 )
-NEEDED = {  # by the page that says so
+NEEDED = {  # by the page that states the need
     "import polars\n": "polars",
     "import pandas\n": "pandas",
     "import duckdb\n": "duckdb",
@@ -97,7 +97,7 @@ NEEDED = {  # by the page that says so
 
 
 class Block(NamedTuple):
-    """A block of a page, with the line it begins in."""
+    """A fenced block of a page, with the number of its first line."""
 
     language: str
     text: str
@@ -105,7 +105,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return the fenced blocks, without those that are directives of Sphinx."""
+    """Return the fenced blocks, except Sphinx directives."""
     text = page.read_text("utf-8")
     found = re.finditer(r"^( *)```([^\n]*)\n(.*?)^\1```$", text, re.DOTALL | re.MULTILINE)
     return [
@@ -133,10 +133,10 @@ class Session:
     def __init__(self, stack: ExitStack) -> None:
         self.space: dict[str, Any] = {"__name__": "page"}
         self._stack = stack
-        self._wires: dict[str, str] = {}  # the link that stands for each port
+        self._wires: dict[str, str] = {}  # link to the simulated line, by port
 
     def run(self, block: Block) -> None:
-        """Run a block. Raises whatever it raises."""
+        """Run a block. Its exceptions pass through."""
         text = block.text
         for pattern, enough in SHORTER:
             text = re.sub(pattern, enough, text)
@@ -161,7 +161,7 @@ class Session:
         return text
 
     def _save(self, name: str, text: str) -> None:
-        """Save a TOML file; the drives of a plant file are played."""
+        """Save a TOML file, and simulate the drives of a plant file."""
         for line in tomllib.loads(text).get("line", ()):
             if line["port"].startswith("/dev/ttyUSB"):
                 link = self._wires.setdefault(line["port"], str(Path.cwd() / Path(line["port"]).name))
@@ -204,7 +204,7 @@ class Session:
         return printed.getvalue()
 
     def _simulate(self, words: list[str]) -> str:
-        """Start the simulator, which runs until the page's end; return its first line."""
+        """Start the simulator, which runs until the page ends; return its first line."""
         program = "import sys; from multidrop.cli import main; sys.exit(main())"
         command = [sys.executable, "-c", program, *words, "--unpaced"]
         process = self._stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
@@ -214,9 +214,9 @@ class Session:
 
 
 def compare(shown: list[str], printed: str, form: Callable[[str], str]) -> None:
-    """Fail unless each line that a page shows was printed, in this form.
+    """Fail unless every line that a page shows was printed, compared after `form`.
 
-    `…` on the page stands for lines that it leaves out.
+    `…` on the page replaces omitted lines.
     """
     left = [form(line) for line in printed.splitlines()]
     for line in filter(None, map(form, shown)):
@@ -225,12 +225,12 @@ def compare(shown: list[str], printed: str, form: Callable[[str], str]) -> None:
 
 
 def spaced(line: str) -> str:
-    """Return a line without its spaces' widths."""
+    """Return the line with single spaces."""
     return re.sub(r"\s+", " ", line).strip()
 
 
 def shape(line: str) -> str:
-    """Return the line with each number as 0 and without its unit of time, because they are measured."""
+    """Return the line with each number as 0 and without time units, because these are measured."""
     plural = re.sub(r"\b1 miss\b", "1 misses", line)
     return spaced(re.sub(r"\d+(\.\d+)?( (ms|us))?", "0", plural))
 
@@ -266,7 +266,7 @@ def test_what_is_not_run_is_there() -> None:
     assert [begin for begin in NOT_RUN if begin not in text] == []
 
 
-# ---- what pages say in passing ----
+# ---- inline statements ----
 
 PLACEHOLDERS = {
     "PORT": "port",
@@ -316,11 +316,11 @@ def test_no_line_is_too_long() -> None:
     assert [(page, line) for page, line in lines if len(line) > 110] == []
 
 
-# ---- the pages hold what the library has ----
+# ---- completeness of the pages ----
 
 
 def table(page: str, heading: str = "") -> dict[str, str]:
-    """Return the rows of the first table after a heading: the name in the first column, and the rest."""
+    """Return the rows of the first table after a heading: first column to the rest of the row."""
     text = (
         (DOCS / page).read_text("utf-8").partition(heading)[2]
         if heading
@@ -376,7 +376,7 @@ def test_every_family_is_in_the_reference() -> None:
 
 
 def test_no_table_s_head_is_another_table_s_row() -> None:
-    """A row that was copied to be a head leaves the columns below it without a meaning."""
+    """Find table headers that were copied from a row, which mislabel the columns below."""
     for page in PAGES:
         text = page.read_text("utf-8")
         heads = re.findall(r"^(\|.*\|)\n\|-", text, re.MULTILINE)

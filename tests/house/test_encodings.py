@@ -1,4 +1,4 @@
-"""Every text file and pipe of the package says its encoding: on Windows it would be the console's."""
+"""Check that the package states the encoding of every text file and pipe: Windows would guess."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from tables import table
 
 import multidrop
 
-pytestmark = pytest.mark.long  # a rule for who writes the package
+pytestmark = pytest.mark.long  # a rule for the package's authors
 
 SOURCE = Path(multidrop.__file__).parent
 TEXT_MODES = frozenset("rwaxt+")
 
 
 def lacks_encoding(call: ast.Call) -> bool:
-    """Look for it where each call has it. `x.open()` without a mode may open anything, and counts as none."""
+    """Return True if the call opens text without an encoding. `x.open()` without a mode is not counted."""
     name = ast.unparse(call.func)
     options = {keyword.arg for keyword in call.keywords}
     modes = {
@@ -38,7 +38,7 @@ def lacks_encoding(call: ast.Call) -> bool:
 
 
 def lacking(source: str) -> Iterator[int]:
-    """Return the lines of the calls that open a text and do not say its encoding."""
+    """Return the line numbers of calls that open text without an encoding."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and lacks_encoding(node):
             yield node.lineno

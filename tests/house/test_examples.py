@@ -1,4 +1,4 @@
-"""Every example runs against simulated drives, and prints what it is there for."""
+"""Run every example against simulated drives and check its output."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (pat
 
 @table("path", sorted(EXAMPLES.glob("*.py")))
 def test_an_example_is_linked_from_the_pages_and_run_here(path: Path) -> None:
-    if path.name != "simulated_plant.py":  # which the others import
+    if path.name != "simulated_plant.py":  # imported by the others
         assert f"examples/{path.name}" in PAGES
         assert f'"{path.name}"' in Path(__file__).read_text("utf-8")
 
@@ -85,7 +85,7 @@ def test_a_pump_is_stopped_when_its_program_ends(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_noise_hunt(tmp_path: Path) -> None:
-    printed = run(tmp_path, "noise_hunt.py", "5", through=())  # replies are lost there
+    printed = run(tmp_path, "noise_hunt.py", "5", through=())  # this example loses replies
     assert "pump-1: " in printed
     assert "bad checksum" in printed
     capture = tmp_path / "noise" / "all.pcapng"

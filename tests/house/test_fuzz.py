@@ -1,4 +1,4 @@
-"""Run every input of the fuzzers' corpora: old faults stay fixed. tests/fuzz/run finds new inputs."""
+"""Run every input of the fuzzing corpora as a regression test. tests/fuzz/run finds new inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A test that fails ends what it started, and does not wait for it for ever."""
+"""Check that a failing test kills its processes without waiting for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mutants are the mistakes they should be, and each that is explained away can still be made."""
+"""Check that mutants are the intended mistakes, and that each explained mutant still exists."""
 
 from __future__ import annotations
 

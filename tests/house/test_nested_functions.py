@@ -1,4 +1,4 @@
-"""A test that wraps its work in a function and never calls it proves nothing, and passes."""
+"""Find tests that define an inner function but never call it: these pass without testing anything."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def never_named(tree: ast.AST) -> list[str]:
-    """Return the functions within a function that nothing in it names, by their lines."""
+    """Return the inner functions that their outer function never names, with line numbers."""
     found = []
     for outer in ast.walk(tree):
         if isinstance(outer, FUNCTIONS):

@@ -1,4 +1,4 @@
-"""Every module can be imported on a system that has nothing of what POSIX alone has."""
+"""Check that every module can be imported without the modules that only POSIX has."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import sys
 import pytest
 from peers import require_module
 
-# First all of it as here, which imports what is not ours; then ours again, as if this were Windows.
+# Import everything normally first, which loads the dependencies. Then import multidrop again as if on
+# Windows.
 PROGRAM = """
 import importlib, os, pkgutil, select, signal, socket, sys, time
 import multidrop

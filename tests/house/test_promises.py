@@ -1,4 +1,4 @@
-"""The page of promises is true: every promise has its row, and everything that is named there exists."""
+"""Check tests/README.md: every promise has a row, and everything it names exists."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FILE = r"(?:tests|bench|csrc|src|docs|\.ci)/[\w./]*\w/?"
 
 
 def rows() -> dict[str, list[str]]:
-    """Return the first table's cells, by the promise."""
+    """Return the cells of the first table, by promise."""
     table = PAGE.partition("## The promises")[2].partition("\n## ")[0]
     cells = [
         [cell.strip() for cell in line.strip("|").split("|")] for line in re.findall(r"^\|.*", table, re.M)
@@ -52,14 +52,14 @@ def test_files_that_are_named_exist() -> None:
 
 @table("name", named(r"test_\w+(?![\w.])"))
 def test_tests_that_are_named_exist(name: str) -> None:
-    """In the file that was named last before it."""
+    """Look for the test in the last file named before it."""
     for before in re.findall(rf"^(.*)`{name}`", PAGE, re.MULTILINE):
         file = re.findall(r"tests/[\w/]+/test_\w+\.py", before)[-1]
         assert f"def {name}(" in (ROOT / file).read_text("utf-8")
 
 
 def script(command: str) -> Path | None:
-    """Return the file that a command runs, where it is one of ours."""
+    """Return the project file that a command runs, or None."""
     if module := re.search(r"-m (bench[\w.]+)", command):
         return ROOT / f"{module[1].replace('.', '/')}.py"
     files = [ROOT / file for file in re.findall(FILE, command)]

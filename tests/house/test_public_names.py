@@ -1,4 +1,4 @@
-"""Public names: one list, loaded name by name, and what they show in a debugger."""
+"""Check the public names: one list, lazy loading, and their representation in a debugger."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_it_runs_as_a_module() -> None:
 
 
 def test_what_a_declaration_needs() -> None:
-    """A user's own family, by public names alone."""
+    """Declare a user's own family with public names only."""
 
     class Own(multidrop.Drive):
         speed = multidrop.reading(1, "Hz", step=0.1, table=INPUT, number_format=NumberFormat.I16)
@@ -72,7 +72,7 @@ def test_what_a_declaration_needs() -> None:
     assert Own(1, framing=Framing.RTU).speed is Own.speed
 
 
-# ---- in a debugger ----
+# ---- repr in a debugger ----
 
 
 def test_a_drive_and_a_bus() -> None:
@@ -97,7 +97,7 @@ def test_a_poller() -> None:
     assert repr(poller) == "<Poller closed; no lines>"
 
 
-# ---- at a prompt ----
+# ---- completion at a prompt ----
 
 
 def test_the_top_has_few_names_and_shows_no_others() -> None:

@@ -1,6 +1,6 @@
-"""README is short, installs as .ci/run does, and its ten lines do what they say.
+"""Check that README is short, installs like .ci/run, and that its ten-line example works.
 
-Its code runs with that of all pages, in test_docs.py.
+test_docs.py runs the code of all pages.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def test_setting_up_is_what_ci_does() -> None:
 
 @pytest.mark.slow
 def test_ten_lines(tmp_path: Path) -> None:
-    """They run in a fresh interpreter, without a warning, however long it takes."""
+    """Run the lines in a fresh interpreter without a warning."""
     (block,) = re.findall(r"^```python\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
     (tmp_path / "ten_lines.py").write_text(block)
     done = subprocess.run(

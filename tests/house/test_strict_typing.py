@@ -1,4 +1,4 @@
-"""Users' scripts pass `mypy --strict`: the Python blocks of these pages, and the examples."""
+"""Check users' scripts with `mypy --strict`: Python blocks of these pages, and the examples."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FOUND = [
 
 
 def mypy(folder: Path) -> str:
-    """Return what mypy says of the scripts in a folder of a user's own."""
+    """Return mypy's output for the scripts in a user's folder."""
     words = ["--strict", "--follow-imports=silent", "--config-file=", f"--cache-dir={folder / 'cache'}", "."]
     done = subprocess.run(
         [sys.executable, "-m", "mypy", *words],

@@ -1,4 +1,4 @@
-"""Mistakes at the command lines of tools/: each is one sentence, and nothing is begun."""
+"""Check command-line mistakes of tools/: each prints one sentence and starts nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TOOLS = Path(__file__).parents[2] / "tools"
 LINUX = "multidrop-0.1.0-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl"
 WINDOWS = "multidrop-0.1.0-cp311-abi3-win_amd64.whl"
 
-# What is typed in a folder that holds the two wheels, a file and an empty folder, and what is said of it.
+# Arguments, typed in a folder with two wheels, a file and an empty folder; and the expected message.
 MISTAKES = {
     "bare": "bare: it takes RELEASE WHEEL, and was given nothing",
     f"bare stable {LINUX} {LINUX}": f"bare: it takes RELEASE WHEEL, and was given: stable {LINUX} {LINUX}",

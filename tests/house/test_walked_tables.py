@@ -1,4 +1,4 @@
-"""A test that walks a table tries every row, and says which of them failed."""
+"""Check that a table test tries every row and names the rows that fail."""
 
 from __future__ import annotations
 

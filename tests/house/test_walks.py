@@ -1,4 +1,4 @@
-"""The rooms' description has every file, and the two walks through them name what is there."""
+"""Check that the architecture page lists every file, and that its two walks name existing code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\
 
 
 def steps(walk: Path) -> list[tuple[str, str]]:
-    """Return each file that a walk names, and the function or class in it; "" for a file of C."""
+    """Return each file of a walk with its function or class ("" for a C file)."""
     return [(file or c_file, name) for file, name, c_file in STEP.findall(walk.read_text("utf-8"))]
 
 
@@ -32,7 +32,7 @@ def defined(path: Path) -> set[str]:
 
 
 def missing(walk: Path) -> list[str]:
-    """Return the steps that lead nowhere."""
+    """Return the steps whose file, function or class does not exist."""
     return [
         f"{file}:{name}"
         for file, name in steps(walk)
@@ -42,7 +42,7 @@ def missing(walk: Path) -> list[str]:
 
 
 def test_every_file_has_its_row() -> None:
-    """A folder stands for what is in it, and a pattern for each file that it fits."""
+    """Check the rows; a folder covers its contents, and a pattern covers the matching files."""
     rows = [line.split("|")[1] for line in ARCHITECTURE.read_text("utf-8").splitlines() if line[:1] == "|"]
     named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
     places = [*PACKAGE.iterdir(), *(ROOT / "csrc").glob("*.c"), ROOT / "csrc" / "windows"]

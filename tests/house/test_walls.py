@@ -1,4 +1,4 @@
-"""The house's walls, kept by reading the imports."""
+"""Check the import rules between rooms by parsing the sources."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
 
 import multidrop
 
-pytestmark = pytest.mark.long  # rules for who writes the package
+pytestmark = pytest.mark.long  # rules for the package's authors
 
 FILES = files("src")
 OUTSIDE = {
     *("os", "time", "select", "selectors", "socket", "serial", "termios", "fcntl", "pty", "tty"),
     *("signal", "subprocess"),
 }
-# from the ground up: a room imports from itself and from those below it
+# lowest first: a room imports from itself and from rooms below it
 FLOORS = [
     {"errors", "exposition", "printable", "iso_time", "interpreter", "supervisor"},
     {"toml_check"},
@@ -54,7 +54,7 @@ FILES_TOUCHING_THE_SYSTEM = {
 }
 
 
-CLIENTS = {  # rooms that use what a package's __init__ names, and the commands that import them
+CLIENTS = {  # rooms that import only public names, and the commands that import them
     "gateway": {"cli/serve.py"},
     "fleet": {
         *(f"cli/fleet/{name}.py" for name in ("commands", "connection", "drain", "init", "look")),
@@ -67,7 +67,7 @@ ROOMS = ("core", "drive", "families", "plant", "transport", "control", "polling"
 OPEN = {
     f"multidrop.{name}" for name in (*ROOMS, "errors", "exposition", "printable", "supervisor", "toml_check")
 }
-TIED = (  # files that name each other in annotations, each group understood as one
+TIED = (  # groups of files that name each other in annotations
     {"drive/family.py", "drive/verbs.py"},
     {"polling/batch.py", "polling/tables.py"},
     {"sim/drive.py", "sim/protocol.py"},
@@ -86,7 +86,7 @@ def rooms(modules: set[str]) -> set[str]:
 
 
 def floor(name: str) -> int:
-    """Return the floor of a room, or of a public name: those stand above all rooms."""
+    """Return the floor of a room, or of a public name: public names are above all rooms."""
     return next((number for number, names in enumerate(FLOORS) if name in names), len(FLOORS))
 
 
@@ -96,7 +96,7 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
     others = rooms(modules) - {"_core", room(path)}
-    if room(path) in CLIENTS:  # another test is about their imports
+    if room(path) in CLIENTS:  # covered by test_clients_use_public_names_alone
         others -= set(multidrop.__all__)
     return {name for name in others if floor(name) >= floor(room(path))}
 
@@ -133,13 +133,13 @@ def test_imports_point_downwards() -> None:
 
 
 def test_imports_for_types_alone_point_downwards_too() -> None:
-    """A room whose annotations name what stands above it knows too much."""
+    """Check that annotations, too, name only rooms below."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}
 
 
 def test_imports_between_files_run_one_way() -> None:
-    """Those for types alone too: what two files need of each other belongs into one, or below both."""
+    """Check for cycles, including imports for annotations. Shared parts belong in one file or below both."""
     ties = {name: min(group) for group in TIED for name in group}
     graph: dict[str, set[str]] = {}
     for path in FILES:
@@ -155,7 +155,7 @@ def test_imports_between_files_run_one_way() -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_clients_use_public_names_alone(client: str) -> None:
-    """So a gateway of one's own can do all that these do."""
+    """Check that anyone could write such a client with public names."""
     found = {
         str(path.relative_to(PACKAGE)): {
             name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name, client)
@@ -179,7 +179,7 @@ def test_its_commands_alone_import_a_client(client: str) -> None:
 
 
 def test_files_are_short() -> None:
-    """A longer one has two jobs, or a reason."""
+    """Check the length limit, or a listed reason: a longer file has two jobs."""
     lines = {
         path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines())
         for path in [*FILES, *files("csrc", suffixes=(".c", ".h"))]
@@ -190,7 +190,7 @@ def test_files_are_short() -> None:
 def test_no_test_imports_another_one() -> None:
     tests = files("tests")
     names = {path.stem for path in tests if path.name.startswith("test_")}
-    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # few are parsed
+    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # saves parsing
     assert offenders({str(path.relative_to(ROOT)): _imported(path) & names for path in maybe}) == {}
 
 
@@ -199,7 +199,7 @@ def _imported(path: Path) -> set[str]:
 
 
 def test_drive_and_planning_are_pure() -> None:
-    """They know no time but what they are given, and no port."""
+    """Check that these rooms import no clock and no port."""
     ports = {"multidrop.core.port", "multidrop.core.capture"}
     outside = OUTSIDE | ports | {"datetime", "random", "threading", "pathlib", "asyncio"}
     pure = [path for path in FILES if room(path) in ("drive", "planning")]

@@ -1,4 +1,4 @@
-"""A part of the gateway of which everything fails."""
+"""A part of the gateway that fails in every call."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 @dataclass(frozen=True)
 class Settings:
-    """Its one key: how it breaks."""
+    """The part's settings: how it fails."""
 
     breaks: str = "always"
 
@@ -18,7 +18,7 @@ class Settings:
 
 
 class BrokenFeed:
-    """Raises whatever it is asked."""
+    """A feed whose every method raises."""
 
     def take(self, batch: Any) -> NoReturn:
         raise RuntimeError("no room on the disk")

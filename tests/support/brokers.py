@@ -1,4 +1,4 @@
-"""MQTT brokers of others, a listener of others, and a plant whose drives say what a test wants."""
+"""MQTT brokers and a listener by other authors, and a plant whose values the test sets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from multidrop.gateway.http.rights import Caller, May
 from multidrop.gateway.live.hub import Known, Shown
 from multidrop.gateway.parts import PartContext
 
-PATIENCE_S = 30.0  # for an event that comes at once on an idle machine
+PATIENCE_S = 30.0  # for an event that is immediate on an idle machine
 TRIALS = 5
 
 
@@ -37,17 +37,17 @@ def free_port() -> int:
 
 
 class EndedAtOnce(Exception):
-    """A broker that did not stay long enough to listen."""
+    """Raised if a broker's process ended before it listened."""
 
 
 class Broker:
-    """A broker's process on a port of its own."""
+    """A broker's process on its own port."""
 
     def __init__(self, command: Callable[[int], Sequence[str]]) -> None:
         self._command = command
         for _ in range(TRIALS):
             self.port = free_port()
-            with suppress(EndedAtOnce):  # somebody else may have taken the port since it was free
+            with suppress(EndedAtOnce):  # another program may have taken the free port
                 self.start()
                 return
         raise EndedAtOnce(f"the broker ended at once on {TRIALS} ports")
@@ -117,7 +117,7 @@ class Published(NamedTuple):
 
 
 class Listener:
-    """mosquitto_sub, which hears everything that is published from now on, and what was kept."""
+    """A mosquitto_sub process that records retained and new messages."""
 
     def __init__(self, broker: Broker, topic: str = "#") -> None:
         program = require_program("mosquitto_sub")
@@ -131,7 +131,7 @@ class Listener:
         self._probe, self._hears = topic.replace("#", "probe"), threading.Event()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
-        while not self._hears.wait(0.05):  # until the broker has its subscription
+        while not self._hears.wait(0.05):  # until the broker has subscribed it
             publish(broker, self._probe, b"probe")
 
     def _read(self) -> None:
@@ -148,7 +148,7 @@ class Listener:
                 self._received.put(Published(topic, kept == "1", bytes.fromhex(payload)))
 
     def wait_for(self, wanted: Callable[[Published], object]) -> Published:
-        """Return the next message that is wanted; those before it are kept in `all`."""
+        """Return the next message that `wanted` accepts; earlier messages stay in `all`."""
         ends = time.monotonic() + PATIENCE_S
         while True:
             received = self._received.get(timeout=max(0.0, ends - time.monotonic()))
@@ -163,14 +163,14 @@ class Listener:
 
 
 def publish(broker: Broker, topic: str, payload: bytes, *options: str) -> None:
-    """Publish by mosquitto_pub."""
+    """Publish a message with mosquitto_pub."""
     program = require_program("mosquitto_pub")
     command = [program, "-p", str(broker.port), "-t", topic, "-s", *options]
     subprocess.run(command, input=payload, check=True, timeout=PATIENCE_S)
 
 
 def sparkplug_messages() -> ModuleType:
-    """Eclipse's message definitions, as pysparkplug carries them; its own client needs another paho."""
+    """Return Eclipse's message definitions from pysparkplug, whose own client needs another paho."""
     require_module("google.protobuf")
     try:
         path = distribution("pysparkplug").locate_file("pysparkplug/_protobuf/sparkplug_b_pb2.py")
@@ -185,11 +185,11 @@ def sparkplug_messages() -> ModuleType:
 
 
 PUMP, FAN = InvtCHE(1, name="pump-1"), InvtCHE(2, name="вентилятор 2")
-PLAIN_FAN = InvtCHE(2, name="вентилятор-2")  # for nats-server, which takes no topic with a space
+PLAIN_FAN = InvtCHE(2, name="вентилятор-2")  # for nats-server, which rejects topics with a space
 
 
 class SaidHub:
-    """A hub that says what a test wants; values are by drive and register."""
+    """A hub whose values the test sets, by drive and register."""
 
     def __init__(self, fan: str) -> None:
         self.values: dict[tuple[str, str], float | None] = {
@@ -224,7 +224,7 @@ class SaidHub:
 
 
 class NotedCommands:
-    """Commands that are noted, and done."""
+    """Command fakes that record each call and succeed."""
 
     def __init__(self) -> None:
         self.may = May(write=frozenset({"pump-1.setpoint"}), verbs=frozenset({"pump-1.start"}))
@@ -251,7 +251,7 @@ class NotedCommands:
 
 
 def inside(folder: Path, fan: Drive = FAN) -> Any:
-    """Return what a part is given: two drives, a hub and commands of this test."""
+    """Return a part's surroundings: two drives, a hub and command fakes."""
     polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
     drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, fan))
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
@@ -261,7 +261,7 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
 
 
 def without_fan(known: Any) -> Plant:
-    """Return the plant of `inside` that has no fan any more, as the hub has none then."""
+    """Return the plant of `inside` without the fan, which is also removed from the hub."""
     known.hub.names.remove(FAN.name)
     (line,) = known.plant.lines
     plant: Plant = replace(known.plant, lines=(replace(line, drives=line.drives[:1]),))
@@ -269,7 +269,7 @@ def without_fan(known: Any) -> Plant:
 
 
 class Running:
-    """The part in a thread with a loop of its own; `step()` lets it publish once, and returns then."""
+    """A part that runs in a thread with its own loop; `step()` waits for one publication."""
 
     def __init__(self, part: Any) -> None:
         self._part = part
@@ -281,7 +281,7 @@ class Running:
         assert self._published.acquire(timeout=PATIENCE_S)
 
     def adopt(self, plant: Plant) -> None:
-        """Tell the part of another plant, in its loop."""
+        """Pass another plant to the part, in its loop."""
         self._loop.call_soon_threadsafe(self._part.adopt, plant)
 
     async def _live(self) -> None:
@@ -306,5 +306,5 @@ class Running:
         self._loop.close()
 
     def cut(self, connection: int) -> None:
-        """Take a connection away, as a machine that loses its power does."""
+        """Cut a connection without closing it, as a power failure does."""
         self._part._brokers[connection]._client.socket().shutdown(socket.SHUT_RDWR)

@@ -1,4 +1,4 @@
-"""Captures of printed exchanges, and what Wireshark and we make of a capture."""
+"""Captures of printed exchanges, and how Wireshark and the library decode them."""
 
 from __future__ import annotations
 

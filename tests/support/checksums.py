@@ -1,10 +1,10 @@
-"""The three checksums, digit by digit as the documents describe them: not the library's own."""
+"""The three checksums, written from the documents, independent of the library."""
 
 from __future__ import annotations
 
 
 def rtu(body: str | bytes) -> bytes:
-    """The frame with its CRC, bit by bit (INVT CHE manual, 11.6.3)."""
+    """Return the frame with its CRC, computed bit by bit (INVT CHE manual, 11.6.3)."""
     octets = bytes.fromhex(body) if isinstance(body, str) else body
     crc = 0xFFFF
     for octet in octets:
@@ -15,10 +15,10 @@ def rtu(body: str | bytes) -> bytes:
 
 
 def ascii(body: str) -> bytes:
-    """The frame with its LRC: what makes the sum of all octets 0 (INNOVERT IBD manual, appendix 2)."""
+    """Return the frame with its LRC, which makes the sum of octets 0 (INNOVERT IBD manual, appendix 2)."""
     return f":{body}{-sum(bytes.fromhex(body)) & 0xFF:02X}\r\n".encode()
 
 
 def delixi(body: str) -> bytes:
-    """The frame with its sum (Delixi, part 3)."""
+    """Return the frame with its sum (Delixi, part 3)."""
     return f":{body}{sum(bytes.fromhex(body)) & 0xFF:02X}\r\n".encode()

@@ -1,8 +1,8 @@
-"""A poller and a simulated line on a clock of their own: an hour of the line takes seconds.
+"""A poller and a simulated line on a simulated clock: an hour of the line takes seconds.
 
-The poller is the real one with its thread, plan and schedule; line and turns are the core's own code
-(csrc/line.c, csrc/turn.c). In place of the descriptor, the core's thread and the clock are stand-ins:
-time passes only while the test lets it, and never because the machine is busy.
+The poller is real, with its thread, plan and schedule. Line and turns are the core's own code (csrc/line.c,
+csrc/turn.c). The descriptor, the core's thread and the clock are stand-ins: time passes only when the test
+advances it, however busy the machine is.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ ENODEV = 19
 
 
 def transactions_of(line: Any) -> Transactions:
-    """The use of ids on such a line, as transport/line.py tells the core."""
+    """Return how such a line uses transaction ids, as transport/line.py passes it to the core."""
     if not line.is_tcp:
         return Transactions.NONE
     return Transactions.MATCHED if line.ids is TransactionIds.MATCH else Transactions.IGNORED
 
 
 class ClockedWire(FaultyWire):
-    """A hostile wire whose port is nothing that the system knows."""
+    """A faulty wire whose port the operating system does not know."""
 
-    ids = TransactionIds.MATCH  # of its gateway, on tcp://
-    chunk = 1.0  # s; characters that end within it come together: a reply is heard when it is whole
+    ids = TransactionIds.MATCH  # of a tcp:// gateway
+    chunk = 1.0  # s; characters within it arrive together, so the line receives a whole reply at once
 
     def open(self) -> None:
         path = "test line"
@@ -66,7 +66,7 @@ class ClockedWire(FaultyWire):
 
 
 class ClockedRowQueue(RowQueue):
-    """A row queue whose client lets time pass while it waits for a call."""
+    """A row queue whose client advances time while it waits for a call."""
 
     pass_time: Callable[[float], None]
 
@@ -96,7 +96,7 @@ class PortSurroundings(Protocol):
 
 
 class ClockedPort:
-    """A port (core.Port) on which the core takes its turns, with a test's time and wire for its I/O."""
+    """A port (core.Port) that runs the core's turns on simulated time and a simulated wire."""
 
     room = 256
     switching = 0.0
@@ -107,16 +107,16 @@ class ClockedPort:
         self._turn = ffi.new("struct md_turn *")
         self._wake = ffi.new("int64_t *")
         self._urgent: Any = None
-        self._kept: list[object] = []  # the core may still look at it
+        self._kept: list[object] = []  # keeps objects alive that the core may still read
         self._received = b""
-        self._guard = threading.RLock()  # as the engine's mutex
+        self._guard = threading.RLock()  # like the engine's mutex
         self._is_closed = False
         lib.md_turn_init(self._turn, self._slots, self.room, clocked.now)
         self._turn.line.transactions = transactions
         if transactions:
             lib.md_turn_tell_echo(self._turn, lib.MD_NO_ECHO)
 
-    # ---- the clients' side ----
+    # ---- client side ----
 
     @property
     def lost(self) -> bool:
@@ -172,7 +172,7 @@ class ClockedPort:
 
     @property
     def granted(self) -> Completion | None:
-        """The completion of the latest urgent exchange; None while it lasts."""
+        """Return the completion of the latest urgent exchange; None while it is pending."""
         return copied(self._urgent.completion) if self._urgent and self._urgent.is_done else None
 
     def end(self) -> bool:
@@ -184,14 +184,14 @@ class ClockedPort:
             lib.md_turn_close(self._turn)
             self._is_closed = True
 
-    # ---- in place of the engine's thread ----
+    # ---- replaces the engine's thread ----
 
     def hang_up(self) -> None:
         lib.md_turn_lose(self._turn, ENODEV)
         lib.md_turn_want(self._turn, self._wake, self._clocked.now)
 
     def advance(self, received: bytes) -> int:
-        """Carry on until there is nothing to do but wait; return until when."""
+        """Advance until the core waits; return the time at which it continues."""
         with self._guard:
             return NEVER if self._is_closed else self._advance(received)
 
@@ -228,9 +228,9 @@ class ClockedPort:
 
 
 class ClockedLine:
-    """A line as the bus sees it (line.Line)."""
+    """A line with the interface that the bus uses (line.Line)."""
 
-    only_settings = None  # a drive may have any
+    only_settings = None  # any drive may have any
     why_closing = ""
     mastership = None
     may_send = True
@@ -288,12 +288,12 @@ class ClockedLine:
         self.reopen()
         return self
 
-    regain = reopen  # it is lost: the poller has dropped it
-    is_lost = False  # nobody stops a motor here
+    regain = reopen  # the poller has dropped the lost line
+    is_lost = False  # no test here stops a motor
 
 
 class ClockedLines:
-    """Wires, and a poller of a plant on them: `run` lets time pass, and returns the rows that come of it."""
+    """Wires and a poller of a plant on them; `run` advances time and returns the new rows."""
 
     def __init__(self, wire: ClockedWire, drives: Sequence[PolledDrive]) -> None:
         wire.open()
@@ -303,7 +303,7 @@ class ClockedLines:
 
     @classmethod
     def of_lines(cls, wires: Mapping[str, ClockedWire], polled: Plant) -> ClockedLines:
-        """Return lines on several wires, by the names of their ports."""
+        """Return lines on several wires, by port name."""
         clocked = cls.__new__(cls)
         for wire in wires.values():
             wire.open()
@@ -325,7 +325,7 @@ class ClockedLines:
         self.now = self._limit = BEGIN_NS
         self.wires = dict(wires)
         self.ports: dict[str, ClockedPort | None] = {}
-        self.opened: list[str] = []  # ports, each time that one is
+        self.opened: list[str] = []  # port names, one for each time a port opened
         self._queue: ClockedRowQueue | None = None
         self._leaving = False
         self._failure: BaseException | None = None
@@ -333,7 +333,7 @@ class ClockedLines:
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", self._line)
-        patch.setattr(peers, "_former", {})  # they are another clock's
+        patch.setattr(peers, "_former", {})  # earlier peers belong to another clock
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
@@ -343,13 +343,13 @@ class ClockedLines:
 
     @property
     def wire(self) -> ClockedWire:
-        """The only wire."""
+        """Return the only wire."""
         (wire,) = self.wires.values()
         return wire
 
     @property
     def port(self) -> ClockedPort | None:
-        """The only port, while it is open."""
+        """Return the only port if it is open."""
         return next(iter(self.ports.values()), None)
 
     def __enter__(self) -> ClockedLines:
@@ -370,7 +370,7 @@ class ClockedLines:
         return (self.now - BEGIN_NS) / S
 
     def run(self, seconds: float) -> list[Row]:
-        """Let so many seconds pass."""
+        """Let this many seconds pass."""
         with self._turn:
             self._limit += round(seconds * S)
             self._turn.notify_all()
@@ -380,14 +380,14 @@ class ClockedLines:
         return rows_of(self.poller)
 
     def beside(self, do: Callable[[], object]) -> threading.Thread:
-        """Do something on a thread of its own, for which time passes while `run` lets it."""
+        """Call `do` on another thread, whose waits end as `run` advances time."""
         thread = threading.Thread(target=do, daemon=True)
         self._beside.add(thread)
         thread.start()
         return thread
 
     def finish(self, beside: threading.Thread) -> None:
-        """Let time pass until that is done, however late its thread began."""
+        """Advance time until the thread has ended."""
         while beside.is_alive():
             with self._turn:
                 self._limit += S // 20
@@ -404,7 +404,7 @@ class ClockedLines:
             time.sleep(0.0002)
 
     def command(self, drive: Drive, request: Message) -> None:
-        """Have a request carried out ahead of the polling, if the port is there."""
+        """Execute a request ahead of the polling if the port is open."""
         ours = self.poller.bus("line")
         if self.port:
             self.port.begin_urgent(make_exchange(drive, request, ours.peer(drive), NO_ROWS))
@@ -424,7 +424,7 @@ class ClockedLines:
 
     def _pass_time(self, seconds: float) -> None:
         for thread in threading.enumerate():
-            if thread.name == "multidrop reopening":  # on this clock that takes no time
+            if thread.name == "multidrop reopening":  # immediate on this clock
                 thread.join()
         try:
             with self._turn:
@@ -448,18 +448,18 @@ class ClockedLines:
             self.now = min(max(wake, self.now + 1), end_ns)
 
     def _look(self, end_ns: int) -> None:
-        """Let time pass until then, or until the poller is called."""
+        """Advance time to `end_ns`, or until a call wakes the poller."""
         wake = end_ns
         while self.now < end_ns:
             wake = self._settle()
             if self._queue and self._queue.has_called:
                 return
             self.now = min(max(wake, self.now + 1), end_ns)
-        if wake <= end_ns:  # else nothing happens just then, and the next look begins with the same
+        if wake <= end_ns:  # else no event is due before the end
             self._settle()
 
     def _settle(self) -> int:
-        """All that happens now; when something happens next."""
+        """Process all events due now; return the time of the next."""
         wake = NEVER
         for name, wire in self.wires.items():
             received, port = wire.advance(self.now / S), self.ports.get(name)
@@ -473,7 +473,7 @@ class ClockedLines:
         return wake
 
     def send(self, name: str, request: bytes, baudrate: int) -> None:
-        """Hand what the client sends to the drives; the port may be gone by then."""
+        """Send the client's bytes to the drives, unless the port is closed."""
         wire, port = self.wires[name], self.ports.get(name)
         wire.receive(request, self.now / S, baudrate)
         if wire.port is None and port:

@@ -2,7 +2,7 @@
 
 
 class Clock:
-    """Monotonic seconds."""
+    """A clock of monotonic seconds."""
 
     def __init__(self) -> None:
         self.now = 100.0

@@ -1,4 +1,4 @@
-"""A gateway's desks in a test: a simulated drive on a line, and a clock that the test sets."""
+"""A gateway's desks, with a simulated drive on a line and a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ids = count(1)
 
 
 class FailingLog(CommandLog):
-    """A log on a disk that does what the test says before each record."""
+    """A command log whose disk does as the test sets before each record."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -42,9 +42,9 @@ class FailingLog(CommandLog):
 
 
 class Desks:
-    """One gateway's, with one line that it is master of as long as `is_master`.
+    """The desks of one gateway, which is master of its line while `is_master`.
 
-    As long as `is_guarded` a frame of the master before may still come there.
+    While `is_guarded`, frames of the former master may still arrive.
     """
 
     def __init__(self, bus: Bus, sim: SimulatedDrive, folder: Path, may: Mapping[str, Any]) -> None:
@@ -73,12 +73,12 @@ class Desks:
 
     @property
     def writes(self) -> list[tuple[str, int]]:
-        """The writes that the drive took, so far."""
+        """Return the writes that the drive accepted so far."""
         return [(one.name, one.raw) for one in self.sim.counters.writes]
 
     @property
     def written(self) -> set[str]:
-        """Return what was written: a stop is sent again where a busy machine is late with a reply."""
+        """Return the written registers as a set: a slow reply makes a stop repeat."""
         return {name for name, _ in self.writes}
 
     @property
@@ -90,7 +90,7 @@ class Desks:
         return self.desk.offer(LINE, json.dumps(what).encode())
 
     def offered(self, hz: float = 20.0, **what: Any) -> str:
-        """Return the token of an offer: to write the setpoint if nothing else is said."""
+        """Return the token of an offer, by default a setpoint write."""
         answer = self.ask(**(what or {"register": "frequency", "value": hz}))
         assert isinstance(answer, Offered), answer
         return answer.token
@@ -106,7 +106,7 @@ class Desks:
         return await self.stop_by(json.dumps(what).encode())
 
     async def stop_by(self, data: bytes) -> CommandAnswer | None:
-        """Return what becomes of a stop that is asked for by this message."""
+        """Return the answer to a stop message, or None."""
         answer = await self.stops.stop(LINE, data)
         while answer is not None and answer.outcome is CommandOutcome.UNDER_WAY:
             answer = await self.stops.stop(LINE, data)
@@ -115,7 +115,7 @@ class Desks:
 
 
 def _patiently(patience_s: float) -> AbstractContextManager[Any]:
-    """Give the library more of the machine's time, for it may be busy; the desk's clock is the test's."""
+    """Lengthen the library's timeouts for a busy machine; the desk's clock is the test's."""
 
     def patient(limit: Callable[[], float]) -> AbstractContextManager[None]:
         return written_before(lambda: (until := limit()) and until + patience_s * 1e9)

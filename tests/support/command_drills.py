@@ -1,7 +1,7 @@
-"""A drill of commands: a fleet of processes that are killed and stopped, judged by what the drives saw.
+"""Command drill: kill and suspend processes of a fleet, and judge by the writes that the drives received.
 
-Each line has one simulated drive and one asker, which writes another setpoint each time. So the drive's own
-list of writes says how often each command was carried out, and nobody's log has to be believed.
+Each line has one simulated drive and one client, which writes a different setpoint each time. So the drive's
+list of writes shows how often each command was executed, independent of any log.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-HIGHEST = 4999  # raw counts of the setpoint, each of which one drive gets once
-STOP_EVERY = 20  # commands of a drive
+HIGHEST = 4999  # raw counts of the setpoint; a drive gets each value once
+STOP_EVERY = 20  # every 20th command of a drive is a stop
 SENT = (CommandOutcome.DONE, CommandOutcome.FAILED)
 UNSENT = (CommandOutcome.NOT_SENT, CommandOutcome.REFUSED)
 
 
 class Asked(NamedTuple):
-    """One command: the setpoint that it writes (None: a stop), how it was asked for, and what was told."""
+    """One command: its setpoint (None: a stop), how it was requested, and its reported result."""
 
     drive: str
     raw: int | None
     way: str
-    offered_s: float  # monotonic, when the offer came
+    offered_s: float  # monotonic time of the offer
     told: CommandOutcome
-    sent: int  # how often its drive got it
+    sent: int  # how often the drive received it
 
 
 class Verdict(NamedTuple):
-    """A comparison of what the drives saw with what the askers were told."""
+    """The drives' writes compared with the results that clients received."""
 
     told: Counter[str]
     ways: Counter[str]
@@ -58,12 +58,12 @@ class Verdict(NamedTuple):
     twice: int
     wrongly: int
     unknown_sent: int
-    unnoted: int  # carried out, and not in a gateway's log
-    oldest_s: float  # from when the offer came until the drive had the write
+    unnoted: int  # executed without an entry in a gateway's log
+    oldest_s: float  # from the offer until the drive received the write
 
 
 class RoughCommands(FleetCommands):
-    """An asker whose messages are doubled and late, as a network or a program's mistake makes them."""
+    """A client whose messages are duplicated and delayed, as by a faulty network or program."""
 
     def __init__(self, urls: Sequence[str], log: Path, dice: random.Random) -> None:
         super().__init__(urls, by="drill", log=log)
@@ -99,7 +99,7 @@ class RoughCommands(FleetCommands):
 
 
 class CommandDrill:
-    """Three gateways, three NATS nodes, and lines with a drive each."""
+    """Three gateways, three NATS nodes, and lines with one drive each."""
 
     def __init__(
         self, folder: Path, nats: Cluster, simulator: Simulator, sims: dict[str, SimulatedDrive]
@@ -148,7 +148,7 @@ class CommandDrill:
     def close(self) -> None:
         kill_all(self.gateways.values())
 
-    # ---- what the drives saw ----
+    # ---- writes that the drives received ----
 
     def setpoints(self, drive: str) -> Counter[int]:
         return Counter(one.raw for one in list(self.sims[drive].counters.writes) if one.name == "frequency")
@@ -160,10 +160,10 @@ class CommandDrill:
         writes = list(self.sims[drive].counters.writes)
         return next(one.time for one in writes if (one.name, one.raw) == ("frequency", raw))
 
-    # ---- askers ----
+    # ---- clients ----
 
     async def ask(self, commands: int, seconds: float, seed: int = 1, *, is_attacked: bool = True) -> Verdict:
-        """Ask for so many commands in so many seconds, attack meanwhile, and judge."""
+        """Send this many commands in this many seconds under attack, and judge the result."""
         dice = random.Random(seed)
         await self.await_masters()
         askers = [self._asker(drive, commands, seconds, dice.random()) for drive in self.sims]
@@ -173,7 +173,7 @@ class CommandDrill:
         finally:
             attack.cancel()
             deeds = (await asyncio.gather(attack, return_exceptions=True))[0]
-        await asyncio.sleep(3.0)  # whatever is late comes meanwhile
+        await asyncio.sleep(3.0)  # let late messages arrive
         assert isinstance(deeds, Counter), deeds
         return self._judge(asked, deeds)
 
@@ -222,7 +222,7 @@ class CommandDrill:
         twice = wrongly = unknown_sent = unnoted = 0
         oldest = 0.0
         for one in asked:
-            if one.raw is None:  # a stop may be sent again and again
+            if one.raw is None:  # stops may repeat
                 wrongly += (one.told in SENT and not one.sent) or (one.told in UNSENT and bool(one.sent))
                 continue
             sent = seen[one.drive][one.raw]
@@ -265,7 +265,7 @@ class CommandDrill:
         victim.wait()
 
     def _stop_gateway(self, dice: random.Random) -> None:
-        """Let it stand still; one that does so for longer than its lease is killed by the kernel."""
+        """Suspend a gateway; if it is suspended for longer than its lease, the kernel kills it."""
         victim = self.gateways[dice.choice(GATEWAYS)]
         victim.send_signal(signal.SIGSTOP)
         time.sleep(dice.choice((dice.uniform(0.05, 1.5), dice.uniform(0.5, 3.5))))

@@ -1,4 +1,4 @@
-"""Commands as their users give them, in this process or in one of their own."""
+"""Run commands as users do, in this process or in another."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from multidrop.families.registry import find_model
 
 MULTIDROP = [sys.executable, "-m", "multidrop"]
 TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
-find_model(TOY)  # says that the file is run, once in a process: not in the midst of a test
+find_model(TOY)  # imports the file now, because its notice would otherwise appear in the middle of a test
 Run = Callable[..., tuple[int, str, str]]
 TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a user's model is a program\n"
 
 
 def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
-    """A command to its end; `most_bytes`: as if the disk had only so much room."""
+    """Run a command to its end; `most_bytes` simulates a full disk."""
 
     def limit() -> None:
-        import resource  # which Windows lacks
+        import resource  # not on Windows
 
         assert most_bytes is not None
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
@@ -42,7 +42,7 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
 
 @contextmanager
 def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
-    """A command under way, and what it prints."""
+    """Start a command; give its process and output."""
     with BoundProcess([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -52,7 +52,7 @@ def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
 
 
 def plant_file(directory: Path, *, dead: bool = False) -> Path:
-    """One line with a living drive, and one that nobody simulates."""
+    """Write a plant file: one line with a simulated drive and, with `dead`, one that is not simulated."""
     line = f'[[line]]\nname = "hall-1"\nport = "{directory}/ports/hall-1"\n'
     drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
     path = directory / f"{'with-dead' if dead else 'living'}.toml"

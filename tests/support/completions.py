@@ -1,4 +1,4 @@
-"""Completions in the core's own memory, and the rows made of them."""
+"""Completions in the core's memory, and the rows made from them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from multidrop.core.frame import to_c
 
 
 def new_completion(**fields: object) -> Any:
-    """Return a struct md_completion."""
+    """Return a struct md_completion with these fields."""
     return ffi.new("struct md_completion *", fields)
 
 
 def completion_of(found: Any, values: RowLayout | None = None) -> Completion:
-    """Return the same as md_port_carry_out() would fill in for an exchange with these values."""
+    """Return the completion that md_port_carry_out() would fill in for an exchange with these values."""
     completion = Completion(found, room=values.count if values else 0)
     if found.result > 0 and not found.reply.exception:
         reply = ffi.addressof(found, "reply")
@@ -25,7 +25,7 @@ def completion_of(found: Any, values: RowLayout | None = None) -> Completion:
 
 
 def copied(found: Any) -> Completion:
-    """Return what a struct md_completion holds now: the core may write to it again."""
+    """Return a copy of a struct md_completion, which the core may overwrite."""
     return completion_of(ffi.new("struct md_completion *", found[0]))
 
 
@@ -40,26 +40,26 @@ def completed(
 
 
 def add_rows(columns: Columns, block: RowLayout, found: Any, utc_minus_monotonic_ns: int) -> bool:
-    """Append the rows of a struct md_completion; False where there is no room for all of them."""
+    """Append the rows of a struct md_completion; return False if they do not all fit."""
     return bool(lib.md_columns_add(columns.c, block.c, found, utc_minus_monotonic_ns))
 
 
 def add_miss(
     columns: Columns, block: RowLayout, status: Status, due_ns: int, utc_minus_monotonic_ns: int
 ) -> bool:
-    """Append rows for values that were due at `due_ns` and not asked for."""
+    """Append rows for values that were due at `due_ns` but were not read."""
     found = new_completion(result=-status, begun_ns=due_ns)
     return add_rows(columns, block, found, utc_minus_monotonic_ns)
 
 
 def status_of(found: Completion) -> int:
-    """Return the status of its rows."""
+    """Return the status of the completion's rows."""
     if found.result <= 0:
         return -found.result
     return EXCEPTION_STATUS + found.reply.exception if found.reply.exception else 0
 
 
 def pending(port: Port) -> int:
-    """Return how many queued exchanges are not carried out yet."""
+    """Return the number of queued exchanges that are not complete."""
     progress = lib.md_port_progress(port.c)
     return int(progress.submitted - progress.done) & 0xFFFF_FFFF

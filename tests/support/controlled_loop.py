@@ -1,4 +1,4 @@
-"""An asyncio loop whose time passes only while it waits: seconds of timers take none."""
+"""An asyncio loop with simulated time: timers take no real time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _PassingSelector(selectors.SelectSelector):
 
 
 class ControlledLoop(asyncio.SelectorEventLoop):
-    """A loop with a time of its own, in s."""
+    """An event loop with its own time in s."""
 
     def __init__(self) -> None:
         self.passing = _PassingSelector()
@@ -33,6 +33,6 @@ class ControlledLoop(asyncio.SelectorEventLoop):
 
 
 def run_controlled(main: Coroutine[Any, Any, R]) -> R:
-    """Run this to its end on a loop whose time it controls."""
+    """Run a coroutine to its end on a loop with simulated time."""
     with asyncio.Runner(loop_factory=ControlledLoop) as runner:
         return runner.run(main)

@@ -1,7 +1,7 @@
-"""A table of what the tests reached, in Python and in C, and the lines that they did not.
+"""Print coverage of Python and C, and the lines that the tests did not reach.
 
-`python tests/support/covered.py WHERE...`: coverage.py's report in JSON, or the directory in which the core
-was built with --coverage, or both. What is not reached is in tests/README.md, with the reason.
+`python tests/support/covered.py PATH...`: coverage.py's JSON report, the directory of a core built with
+--coverage, or both. tests/README.md explains the lines that are not reached.
 """
 
 from __future__ import annotations
@@ -21,10 +21,8 @@ class Reach:
     lines: int = 0
     branches: int = 0
     taken: int = 0
-    missed: set[int] = field(default_factory=set)  # lines
-    untaken: set[tuple[int, int]] = field(
-        default_factory=set
-    )  # branches of the others: from where, which way
+    missed: set[int] = field(default_factory=set)  # line numbers
+    untaken: set[tuple[int, int]] = field(default_factory=set)  # branches not taken, as (from, to)
 
 
 def of_python(report: Path) -> dict[str, Reach]:
@@ -62,14 +60,14 @@ def of_c(build: Path) -> dict[str, Reach]:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """1-3 7 9-10"""
+    """Return line numbers as ranges: 1-3 7 9-10."""
     runs = groupby(enumerate(sorted(numbers)), lambda each: each[1] - each[0])
     ends = [[number for _, number in run] for _, run in runs]
     return " ".join(f"{end[0]}-{end[-1]}" if len(end) > 1 else f"{end[0]}" for end in ends)
 
 
 def room(name: str) -> str:
-    """Return the name of a row: a file of the core, a directory of Python."""
+    """Return the row's name: a C file of the core, or a Python directory."""
     return name if name.endswith((".c", ".h")) else name.rpartition("/")[0] + "/"
 
 

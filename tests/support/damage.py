@@ -1,4 +1,4 @@
-"""Random Modbus requests and replies, whole and damaged: the same ones for the same seed."""
+"""Random Modbus requests and replies, whole and damaged, reproducible by seed."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}  # 
 ECHOES = (0x05, 0x06, 0x08)
 COIL_VALUES = (b"\xff\x00", b"\x00\x00")
 
-Body = bytes  # of a frame: without start, end and checksum
+Body = bytes  # without start, end and checksum
 
 
 @dataclass(frozen=True)
 class Said:
-    """One frame, and what it was before it was damaged; a reply has the request that it follows."""
+    """A frame and its undamaged original; a reply also has its request."""
 
     framing: Framing
     frame: bytes
     request: Message
-    damage: str  # "" where there is none
+    damage: str  # "" if undamaged
 
     @property
     def body(self) -> Body:
-        """Return the length, as far as it can be made out."""
+        """Return the body as far as it can be located."""
         if self.framing is Framing.RTU:
             return self.frame[:-2]
         digits = self.frame.partition(b":")[2].partition(b"\r")[0]
@@ -42,7 +42,7 @@ class Said:
             return b""
 
     def octet(self, at: int) -> int:
-        """Return the byte of the body; -1 where it ends before."""
+        """Return a byte of the body, or -1 past its end."""
         return self.body[at] if at < len(self.body) else -1
 
     @property
@@ -58,7 +58,7 @@ def data_bytes(function: int, count: int) -> int:
     return (count + 7) // 8 if function in BITS else 2 * count
 
 
-# ---- whole ----
+# ---- undamaged ----
 
 
 def random_request(chance: random.Random) -> Message:
@@ -80,7 +80,7 @@ def random_request(chance: random.Random) -> Message:
 
 
 def random_reply(chance: random.Random, request: Message) -> Message:
-    """Return a reply that a drive may send."""
+    """Return a reply that a drive could send."""
     if chance.random() < 0.15:
         code = chance.choice((1, 2, 3, 4, 6, 0x0B, 0x12, chance.randint(1, 255)))
         return Message(request.address, request.function, exception=code)
@@ -94,7 +94,7 @@ def random_reply(chance: random.Random, request: Message) -> Message:
 
 def _random_data(chance: random.Random, function: int, count: int) -> bytes:
     data = bytearray(chance.randbytes(data_bytes(function, count)))
-    if function in BITS and count % 8:  # the rest of the last byte is 0 (6.1 of the application protocol)
+    if function in BITS and count % 8:  # unused bits of the last byte are 0 (6.1 of the application protocol)
         data[-1] &= (1 << count % 8) - 1
     return bytes(data)
 
@@ -118,13 +118,13 @@ def reply_body(reply: Message) -> Body:
     return head + reply.start.to_bytes(2) + reply.count.to_bytes(2)
 
 
-# ---- damaged, and the checksum made right again ----
+# ---- damaged with a correct checksum ----
 
 Change = Callable[[random.Random, Body], Body]
 
 
 def _put(at: int, choices: Callable[[random.Random, int], int], chance: random.Random, body: Body) -> Body:
-    """Another byte there, where there is one."""
+    """Replace a byte, if the body is long enough."""
     if at >= len(body):
         return body
     return body[:at] + bytes([choices(chance, body[at]) & 0xFF]) + body[at + 1 :]
@@ -152,18 +152,18 @@ REPAIRED: dict[str, Change] = {
     "bit flipped": _flip,
     "address": partial(_put, 0, lambda chance, _: chance.choice((0, 248, 255, chance.randrange(256)))),
     "function": partial(_put, 1, _another_function),
-    "third byte": partial(_put, 2, _near),  # a reply's byte count, an exception's code
+    "third byte": partial(_put, 2, _near),  # a reply's byte count, or an exception code
     "start": partial(_put, 3, _near),
     "value": partial(_put, 5, _near),
     "count": _another_count,
-    "byte count": partial(_put, 6, _near),  # a request's
+    "byte count": partial(_put, 6, _near),  # of a request
     "shorter": lambda chance, body: body[: chance.randrange(1, len(body))],
     "longer": lambda chance, body: body + chance.randbytes(chance.choice((1, 2, 8))),
     "exception": lambda chance, body: bytes([body[0], body[1] | 0x80, chance.choice((0, 1, 2, 9, 0x20))]),
     "exception to 09": lambda chance, body: bytes([body[0], 0x89, chance.choice((1, 2))]),
 }
 
-# ---- damaged as a line does it ----
+# ---- damaged as on a line ----
 
 
 def _text_damaged(chance: random.Random, frame: bytes) -> bytes:
@@ -185,14 +185,14 @@ TEXT: dict[str, Change] = {
 
 
 def frames(seed: int, framing: Framing, number: int, *, replies: bool) -> list[Said]:
-    """Requests or replies: whole, damaged under a good checksum, damaged by the line, of another's."""
+    """Return requests or replies: whole, damaged with a correct checksum, damaged on the line, or foreign."""
     chance = random.Random(seed)
     left = LEFT if framing is Framing.RTU else LEFT | TEXT
     found = []
     while len(found) < number:
         request = random_request(chance)
         if replies and request.address == 0:
-            continue  # nobody answers
+            continue  # a request without a reply
         body = reply_body(random_reply(chance, request)) if replies else request_body(request)
         damage = chance.choice(("", "repaired", "left"))
         if replies and chance.random() < 0.1:

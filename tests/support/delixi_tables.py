@@ -1,4 +1,4 @@
-"""The table of readings that both protocols of Delixi share."""
+"""The table of readings that both Delixi protocols share."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Differences of our framing from libmodbus's and pymodbus's, with their reasons.
+"""Differences of our framing from libmodbus's and pymodbus's, with reasons.
 
-A difference that no rule explains fails, and so does a rule that explains nothing any more.
+A difference without a rule fails, and so does a rule without a difference.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PYMODBUS = (PYMODBUS_RTU, PYMODBUS_ASCII)
 ALL = (LIBMODBUS, *PYMODBUS)
 
 
-# ---- what the rules are about ----
+# ---- conditions of the rules ----
 
 
 def count_of(said: Said) -> int:
@@ -28,7 +28,7 @@ def start_of(said: Said) -> int:
 
 
 def contradicts_itself(said: Said) -> bool:
-    """A write of several whose byte count is not that of its count, or with more than there may be."""
+    """Return True for a multiple write whose byte count contradicts its count, or is above the limit."""
     function, count = said.function, count_of(said)
     return function in (0x0F, 0x10) and (
         said.octet(6) != data_bytes(function, count) or count > MOST[function]
@@ -72,7 +72,9 @@ def has_other_data(said: Said) -> bool:
 
 @dataclass(frozen=True)
 class Rule:
-    """Refuse what others take (stricter), take what they refuse (looser), or read it otherwise."""
+    """A known difference: we reject what others accept (stricter), or the reverse (looser), or decode it
+    otherwise.
+    """
 
     kind: str
     judges: tuple[str, ...]
@@ -198,7 +200,7 @@ REPLIES = [
 ]
 
 
-# ---- held to the truth ----
+# ---- check the rules ----
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ class Difference:
 
 
 def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) -> None:
-    """Every difference has its rule, and every rule its difference."""
+    """Fail unless every difference has a rule and every rule a difference."""
     rules = [rule for rule in rules if judge in rule.judges]
     stale = list(rules)
     for difference in differences:
@@ -229,7 +231,7 @@ def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) ->
 
 
 def compare(said: Said, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
-    """Nothing where both refuse, or both take it for the same."""
+    """Return no difference if both reject the frame, or both decode it identically."""
     if (isinstance(ours, str) and isinstance(theirs, str)) or ours == theirs:
         return []
     return [Difference(said, ours, theirs)]

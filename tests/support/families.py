@@ -1,4 +1,4 @@
-"""Family files for tests: a meter with every kind of entry, and the class that says the same in Python."""
+"""Family files for tests: a meter with every kind of entry, and its equivalent Python class."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Alarms(IntFlag):
 
 
 class Meter(Drive):
-    """The same meter in Python."""
+    """The same meter as a Python class."""
 
     model = "meter"
     title = "Meter M-1"

@@ -1,9 +1,9 @@
-"""A master of several lines that is forked, polls while its lease is renewed, and is stopped by others.
+"""Poll several lines in a forked process whose lease is renewed, and which others suspend.
 
-Each line of standard input is a life: FD LEASE GUARD BEYOND PORT... FD is a socket, inherited, on which it
-asks for each renewal by a byte and has it by another. LEASE and GUARD are in s. BEYOND is how long, in s, it
-may send beyond its lease: 0 but where the test wants to see what the look is for. The id of each life is
-printed.
+Each line of standard input starts one process: FD LEASE GUARD BEYOND PORT... FD is an inherited socket: the
+process requests each renewal with one byte and receives it as one byte. LEASE and GUARD are in s. BEYOND is
+how many seconds it may send after its lease expired: 0, except to test without the check before each write.
+The process id is printed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from multidrop.drive.register import HOLDING, reading
 
 
 class Counted(Drive):
-    """A drive of one register, which answers at once."""
+    """A drive with one register and an immediate reply."""
 
     framings = (Framing.RTU,)
     baudrates = (115_200,)
@@ -44,7 +44,7 @@ def live(
     observer: socket.socket, lease: float, guard: float, timer: float, beyond: float, ports: list[str]
 ) -> None:
     mastership = Mastership(guard)
-    mastership.guard_s = timer  # for the kernel's timer alone: lines are listened to for the guard
+    mastership.guard_s = timer  # only for the kernel's timer: claiming a line listens for the guard time
     drives = [
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]
@@ -58,14 +58,14 @@ def live(
             observer.send(b"?")
             if not observer.recv(1):
                 return
-            with suppress(ValueError):  # it stood still since it asked, and the answer is worth nothing
+            with suppress(ValueError):  # a renewal that arrives after suspension is void
                 mastership.extend(asked_ns + round((lease + beyond) * 1e9))
             poller.take()
             time.sleep(lease / 3)
 
 
 def main() -> None:
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system buries them
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system reaps child processes
     faulthandler.register(signal.SIGUSR1)
     for words in map(str.split, sys.stdin):
         fd, lease, guard, timer, beyond, *ports = words

@@ -1,7 +1,7 @@
-"""Drills in a network of namespaces, whose cables are cut: each gateway and each node has one of its own.
+"""Drills in network namespaces whose cables are cut; each gateway and each node has its own.
 
-The lines are reached on their own way, unless a gateway is cut off as a whole. Then the same with machines
-that have a gateway and a node each, and die or are cut off with both.
+The lines have their own network, and are cut only if a gateway is cut off completely. A second drill has
+machines with one gateway and one node each, which die or are cut off together.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ NODES = 3
 
 
 class Cuts:
-    """Cuts of a drill's cables; all of them heal after 1 to 8 s."""
+    """Cuts of a drill's cables; every cut heals after 1 to 8 s."""
 
     def __init__(self, drill: FleetDrill) -> None:
         self.drill = drill
@@ -36,7 +36,7 @@ class Cuts:
         self._lost(others, some)
 
     def gateway(self) -> None:
-        """Its lines too: what it was about to send is in its buffers."""
+        """Cut a gateway and its lines, which leaves unsent frames in its buffers."""
         self.dice.choice(self.gateways).cut()
 
     def gateway_from_nodes(self) -> None:
@@ -58,7 +58,7 @@ class Cuts:
         self._lost([*self.nodes, *self.gateways], [self.dice.choice(self.nodes)])
 
     def gateway_and_node(self) -> None:
-        """They see each other, and nobody else of the fleet."""
+        """Cut off a gateway with one node: they reach only each other."""
         inside = [self.dice.choice(self.gateways), self.dice.choice(self.nodes)]
         self._part(inside, [one for one in (*self.gateways, *self.nodes) if one not in inside])
 
@@ -76,7 +76,7 @@ CUTS: dict[str, Callable[[Cuts], None]] = {
 
 
 def cut(drill: FleetDrill, name: str, seconds: float = 0.0) -> None:
-    """Cut as this name says, and heal it after so long; 0 for 1 to 8 s."""
+    """Cut by this name, and heal after this long; 0 means 1 to 8 s."""
     cuts = Cuts(drill)
     CUTS[name](cuts)
     time.sleep(seconds or drill.random.uniform(1, 8))
@@ -86,7 +86,7 @@ def cut(drill: FleetDrill, name: str, seconds: float = 0.0) -> None:
 
 @contextmanager
 def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill]:
-    """A fleet as `drilled` makes it, in namespaces; where there can be none, as `network` says."""
+    """Give a fleet like `drilled` in namespaces; `network` skips or fails if there are none."""
     with (
         network(NODES + len(GATEWAYS)) as made,
         cluster(folder / "nats", places=made.namespaces[:NODES]) as nats,
@@ -100,7 +100,7 @@ def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator
 
 
 class MachineDrill(FleetDrill):
-    """Machines with a gateway and a node each."""
+    """Machines with one gateway and one node each."""
 
     def kill_machine(self) -> None:
         name = self.random.choice(GATEWAYS)
@@ -110,7 +110,7 @@ class MachineDrill(FleetDrill):
         self.gateways[name].wait()
 
     def kill_gateway_and_another_node(self) -> None:
-        """Kill a gateway, and in the same instant a node on another machine."""
+        """Kill a gateway, and at the same moment a node on another machine."""
         name = self.random.choice(GATEWAYS)
         others = [node for node in self.nats.nodes if node.place is not self.places[name]]
         self.random.choice(others).kill()
@@ -130,7 +130,7 @@ MACHINES: dict[str, Callable[[MachineDrill], None]] = {
 
 @contextmanager
 def drilled_on_machines(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[MachineDrill]:
-    """A fleet on three machines; where there can be no namespaces, as `network` says."""
+    """Give a fleet on three machines; `network` skips or fails without namespaces."""
     with (
         network(NODES) as made,
         cluster(folder / "nats", places=made.namespaces) as nats,

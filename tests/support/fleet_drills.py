@@ -1,4 +1,4 @@
-"""Drills: gateways as processes, three NATS nodes, and a hall of lines that judges who sent what when."""
+"""Drills: gateways as processes, three NATS nodes, and a hall of lines that records who sent when."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from multidrop.fleet.servers.connections import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-JUDGED_S = 11.0  # an election comes up to 9 s after a death
+JUDGED_S = 11.0  # an election may come 9 s after a death
 
 
 class FleetDrill:
-    """A fleet of processes; each round does something to it, and tells what the lines saw."""
+    """A fleet of processes; each round performs an action and measures its effect on the lines."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class FleetDrill:
     ) -> None:
         self.nats = nats
         self.hall = SerialHall(lines, host)
-        self.places = places or {}  # of gateways; the others run here
+        self.places = places or {}  # namespaces of gateways; the others run here
         self.random = random.Random(seed)
         self._folder = folder
         self._environment = {
@@ -78,14 +78,14 @@ class FleetDrill:
                     stdout=subprocess.DEVNULL,
                     stderr=log,
                     text=True,
-                    preexec_fn=partial(signal.signal, signal.SIGHUP, signal.SIG_DFL),  # under nohup too
+                    preexec_fn=partial(signal.signal, signal.SIGHUP, signal.SIG_DFL),  # undoes nohup
                 )
 
     def log(self, name: str) -> str:
         return (self._folder / f"{name}.log").read_text()
 
     def settle(self) -> None:
-        """Start what died, and wait until each gateway polls lines, and leases, paths, leaders are whole."""
+        """Restart dead processes, and wait until gateways, leases, paths and leaders are complete."""
         for node in self.nats.nodes:
             with suppress(ProcessLookupError):
                 node.go_on()
@@ -114,14 +114,14 @@ class FleetDrill:
         time.sleep(1.0)
 
     def _start_what_died(self) -> None:
-        """Start gateways that are not there: the kernel kills one that a busy machine lets stand still."""
+        """Start missing gateways: the kernel kills those that a busy machine suspends."""
         for name in GATEWAYS:
             running = self.gateways.get(name)
             if running is None or running.poll() is not None:
                 self.start(name)
 
     def are_leaders_home(self) -> bool:
-        """Say whether each node leads one bucket of each group: else one deed does what two would do."""
+        """Return True if each node leads one bucket of each group; otherwise one action would act as two."""
         leads = [node.leads() for node in self.nats.nodes]
         return all(
             sum(f"KV_{bucket}" in found for bucket in group) == 1
@@ -137,17 +137,17 @@ class FleetDrill:
         return time.monotonic() - begun
 
     def judge(self, deed: Callable[[], object], seconds: float = JUDGED_S) -> dict[str, float]:
-        """Do it, and return each line's longest gap (s) in the seconds that follow."""
+        """Perform the action; return each line's longest gap (s) in the following seconds."""
         self.hall.reset()
         deed()
         time.sleep(seconds)
         self.wait(lambda: self.hall.are_polled(1.0), "all lines are polled again")
         return self.hall.gaps()
 
-    # ---- deeds ----
+    # ---- actions ----
 
     def do_nothing(self) -> None:
-        """Show what this machine does to the gaps by itself."""
+        """Do nothing, which shows this machine's usual gaps."""
 
     def kill_gateway(self) -> None:
         self._kill(self.random.choice(GATEWAYS))
@@ -161,7 +161,7 @@ class FleetDrill:
         self.kill_node()
 
     def stop_gateway(self) -> subprocess.Popen[str]:
-        """Let one stand still for longer than a lease, and return it; the kernel kills it meanwhile."""
+        """Suspend a gateway for longer than its lease, so the kernel kills it; return its process."""
         running = self.gateways[self.random.choice(GATEWAYS)]
         running.send_signal(signal.SIGSTOP)
         time.sleep(self.random.uniform(3.5, 6.0))
@@ -178,7 +178,7 @@ class FleetDrill:
         self.random.choice(self.nats.nodes).kill()
 
     def end_one_record(self) -> None:
-        """End one of a lease's records, as another gateway does that is late by an instant."""
+        """Delete one record of a lease, as a slightly late gateway does."""
         asyncio.run(_end_record(self.nats, self.random.choice(GATEWAYS), self.random.choice(names.LEASES)))
 
     def stop_node(self) -> None:
@@ -188,7 +188,7 @@ class FleetDrill:
         node.go_on()
 
     def leader_alone(self, group: Sequence[str], others: Sequence[str]) -> Node:
-        """Return a node that leads one of this group of buckets, and none of the others'."""
+        """Return a node that leads one bucket of this group and none of the others."""
         bucket = self.random.choice(group)
         while True:
             leads = {node.name: node.leads() for node in self.nats.nodes}
@@ -230,7 +230,7 @@ async def _make_leader(node: Node, buckets: Sequence[str]) -> None:
     path = ServerPath([node.url])
     await path.open()
     for bucket in buckets:
-        with suppress(FleetError):  # it is asked again
+        with suppress(FleetError):  # the caller retries
             await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", {"placement": {"preferred": node.name}})
     await path.close()
 
@@ -241,7 +241,7 @@ async def _end_record(nats: Cluster, gateway: str, bucket: str) -> None:
     other = LeaseBucket(bucket, lambda: path, "another")
     while True:
         record = await other.get(gateway)
-        with suppress(Conflict):  # it was renewed meanwhile
+        with suppress(Conflict):  # renewed by its gateway in between
             await other.put(gateway, {**record.value, "ended": True}, record.revision)
             break
     await path.close()

@@ -1,4 +1,4 @@
-"""A large fleet: gateways' state machines in several processes, a real cluster, lines that are not there."""
+"""A large fleet: gateway state machines in several processes, a real cluster, and fake lines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PATIENCE_S = 240.0
 
 
 class MemberProcess:
-    """One process, and how many lines each of its gateways polls since when."""
+    """A process, and the number of lines of each of its gateways with the time of the last change."""
 
     def __init__(self, urls: Sequence[str], gateways: Sequence[str]) -> None:
         self.gateways = list(gateways)
@@ -53,7 +53,7 @@ class MemberProcess:
                 self.counts[said["gateway"]] = said["lines"]
 
     def ask(self) -> dict[str, list[str]]:
-        """Return the lines that each of its gateways polls."""
+        """Return the lines that each gateway polls."""
         self.polled = {}
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
@@ -87,7 +87,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 class LargeFleet:
-    """So many lines, shared by the gateways of all processes."""
+    """A number of lines, shared by the gateways of all processes."""
 
     def __init__(self, nats: Cluster, lines: dict[str, Any]) -> None:
         self.nats = nats
@@ -103,14 +103,14 @@ class LargeFleet:
             await path.close()
 
     def start(self, *groups: Sequence[str]) -> float:
-        """Start a process for each group of gateways; return when they were all ready (CLOCK_MONOTONIC)."""
+        """Start a process for each group of gateways; return when all were ready (CLOCK_MONOTONIC)."""
         started = [MemberProcess(self.nats.urls, group) for group in groups]
         self.processes += started
         until(lambda: all(process.is_ready for process in started), "the processes are ready")
         return time.monotonic()
 
     def cpu_s(self) -> float:
-        """Return the CPU time (s) of its gateways and servers."""
+        """Return the CPU time (s) of gateways and servers."""
         servers = sum(cpu_s_of(node.process.pid) for node in self.nats.nodes)
         return servers + sum(process.cpu_s() for process in self.processes)
 
@@ -118,19 +118,19 @@ class LargeFleet:
         return sum(sum(process.counts.values()) for process in self.processes)
 
     def settled(self, since_s: float) -> float:
-        """Wait until all lines are polled; return how long after `since_s` the last one was."""
+        """Wait until all lines are polled; return the seconds from `since_s` to the last one."""
         until(lambda: self.polled() == len(self.lines), "all lines are polled")
         return max(process.changed_s for process in self.processes) - since_s
 
     def kill(self, process: MemberProcess) -> float:
-        """Kill it, and return how long it took until others polled all its lines (s)."""
+        """Kill a process; return the seconds until others poll all its lines."""
         self.processes.remove(process)
         begun = time.monotonic()
         process.kill()
         return self.settled(begun)
 
     def check(self) -> None:
-        """Wait until each line has one gateway, by name: none has two, and none is left out."""
+        """Wait until each line has exactly one gateway."""
         wanted = sorted(self.lines)
 
         def found() -> list[str]:
@@ -148,13 +148,13 @@ class LargeFleet:
 
 
 def nowhere(lines: int) -> dict[str, Any]:
-    """Return a plant of so many lines that are not there."""
+    """Return a plant of this many fake lines."""
     return {f"line-{at}": {"line": {"name": f"line-{at}"}, "files": {}} for at in range(lines)}
 
 
 @contextmanager
 def large_fleet(nats: Cluster, lines: dict[str, Any]) -> Iterator[LargeFleet]:
-    """Return a fleet with this plant, and no gateway yet."""
+    """Give a fleet with this plant and no gateway."""
     fleet = LargeFleet(nats, lines)
     try:
         yield fleet
@@ -163,6 +163,6 @@ def large_fleet(nats: Cluster, lines: dict[str, Any]) -> Iterator[LargeFleet]:
 
 
 def groups(gateways: int, processes: int) -> list[list[str]]:
-    """Return the names of gateways, as many for each process."""
+    """Return the names of gateways, split evenly among the processes."""
     found = [f"gw-{at:02}" for at in range(gateways)]
     return [found[at::processes] for at in range(processes)]

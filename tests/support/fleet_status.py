@@ -1,4 +1,4 @@
-"""The state of a fleet as `multidrop fleet status` says it, for tests that wait until it says something."""
+"""The state that `multidrop fleet status` prints, for tests that wait for a state."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from unittest.mock import patch
 
 from multidrop.cli import main
 
-LOOK_S = 0.25  # before each look, which takes as much of the processor as seconds of a gateway
+LOOK_S = 0.25  # between queries, each of which costs as much CPU as seconds of a gateway
 
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
-    """Return the state of a fleet in a moment, an empty one while its servers give none, as amid an election.
+    """Return the present state of a fleet, or an empty one if its servers give none, as during an election.
 
-    It is asked for in this process, because tests do so again and again.
+    The query runs in this process, because tests repeat it often.
     """
     time.sleep(LOOK_S)
     with patch.dict(os.environ, environment), redirect_stdout(StringIO()) as out:

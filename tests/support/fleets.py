@@ -1,4 +1,4 @@
-"""A fleet in a test: records in memory, lines and a mastership that note what is done with them."""
+"""Fakes of a fleet: records in memory, lines and a mastership that record their calls."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multidrop.fleet.servers.buckets import Record, WriteAnswers
 
 
 class HandClock:
-    """A clock that a test sets, in ns."""
+    """A clock in ns that a test sets."""
 
     def __init__(self, now: int = 1000 * SECOND) -> None:
         self.now = now
@@ -25,16 +25,16 @@ class HandClock:
 
 
 class MemoryBucket:
-    """A bucket that decides by the revision, as the servers do, and fails as a test wants."""
+    """A bucket that compares revisions like the servers, and fails as a test sets."""
 
     def __init__(self, name: str = "lease") -> None:
         self.name = name
         self.records: dict[str, Record] = {}
         self.last = 0
-        self.asked = 0  # times that `newest` was
+        self.asked = 0  # calls of `newest`
         self.is_down = False
         self.loses_answers = False
-        self.before_put: Callable[[str], object] = lambda key: None  # called when a put arrives
+        self.before_put: Callable[[str], object] = lambda key: None  # called before each put
 
     async def put(self, key: str, value: Any, revision: int) -> int:
         self.before_put(key)
@@ -86,7 +86,7 @@ class MemoryBucket:
 
 
 class GatedBucket(MemoryBucket):
-    """A bucket that holds puts up from `shut` until `open`: before they are stored, or only their answers."""
+    """A bucket that blocks puts from `shut` until `open`, before or after it stores them."""
 
     def __init__(self, name: str = "lease", *, answers: bool = False) -> None:
         super().__init__(name)
@@ -96,7 +96,7 @@ class GatedBucket(MemoryBucket):
         self._holds_answers = answers
 
     def shut(self) -> None:
-        """Hold up the next put alone."""
+        """Block only the next put."""
         self._gate = asyncio.Event()
 
     def open(self) -> None:
@@ -115,7 +115,7 @@ class GatedBucket(MemoryBucket):
 
 
 class NotedMastership:
-    """Notes until when the engine may send, and refuses what the engine refuses."""
+    """A mastership that records its deadline, and raises the engine's errors."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.clock = clock
@@ -145,7 +145,7 @@ class NotedMastership:
 
 
 class NotedLines:
-    """Lines that are not there: who has which when, and whether two ever had one at a time."""
+    """Fake lines: which gateway had which line when, and whether two ever had one at a time."""
 
     def __init__(self, name: str, mastership: NotedMastership, hall: Hall) -> None:
         self.name = name
@@ -165,12 +165,12 @@ class NotedLines:
 
 
 class Hall:
-    """All gateways' lines, seen from the drives' side."""
+    """The lines of all gateways, as the drives see them."""
 
     def __init__(self) -> None:
         self.gateways: list[NotedLines] = []
         self.overlaps: list[str] = []
-        self.at: dict[str, float] = {}  # when each line was taken last
+        self.at: dict[str, float] = {}  # time of each line's last claim
 
     def add(self, name: str, mastership: NotedMastership) -> NotedLines:
         lines = NotedLines(name, mastership, self)

@@ -1,6 +1,6 @@
-"""The meaning of the documents' frames, typed by hand from them; tests/data/frames.csv has the bytes.
+"""Decoded frames of the documents, typed from them manually; tests/data/frames.csv has the bytes.
 
-Errata are named as in their notes: E1 to E14 of ERMAN ER-G-220, protocol description v1.4.
+Errata are numbered as in their notes: E1 to E14 of ERMAN ER-G-220, protocol description v1.4.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _line(text: str) -> str:
     return f":{text}\\r\\n"
 
 
-# request as printed: what it says, and what each printed reply to it says; "same" is its copy
+# printed request: its message, and the message of each printed reply; "same" is a copy of the request
 MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
     "01 01 00 00 00 0C 3C 0F": (
         Message(1, 0x01, 0, 12),
@@ -42,7 +42,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
             "01 83 03 01 31": Message(1, 0x03, exception=3),
         },
     ),
-    "01 04 00 01 00 05 61 C9": (  # E1: the checksum is corrected
+    "01 04 00 01 00 05 61 C9": (  # E1: corrected checksum
         Message(1, 0x04, 1, 5),
         {
             "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03": FrameFault.BAD_LENGTH,  # E2
@@ -56,7 +56,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x05, 0, data=ON),
         {"same": Message(1, 0x05, 0, data=ON), "01 85 03 02 91": Message(1, 0x05, exception=3)},
     ),
-    "01 06 00 01 01 1D 19 93": (  # E3: a frame like any other, but no drive of ours may send it
+    "01 06 00 01 01 1D 19 93": (  # E3: valid frame, which our drives must not send
         Message(1, 0x06, 1, data=words(285)),
         {},
     ),
@@ -79,7 +79,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x08, 0, data=words(0xA537)),
         {
             "same": Message(1, 0x08, 0, data=words(0xA537)),
-            "01 89 01 86 50": Message(1, 0x08, exception=1),  # E13: 89H stands for 88H
+            "01 89 01 86 50": Message(1, 0x08, exception=1),  # E13: 89H is a misprint of 88H
             "01 88 01 87 C0": Message(1, 0x08, exception=1),
         },
     ),
@@ -132,7 +132,7 @@ for _text, _k, _p, _d in (
 
 @dataclass(frozen=True)
 class Printed:
-    """One row of frames.csv, with its meaning; for a reply also the request that it answers."""
+    """A row of frames.csv with its message; a reply also has its request."""
 
     framing: Framing
     direction: str

@@ -1,7 +1,7 @@
-"""Users of a gateway, all at once, in a process of their own, which counts what they get.
+"""Concurrent users of a gateway in their own process, which counts their results.
 
-Viewers that take each frame, stalled ones that read nothing, a scraper, questions to the history, Modbus
-masters, and a listener of an MQTT broker.
+Viewers that receive each frame, stalled viewers, a scraper, history queries, Modbus masters, and a listener
+of an MQTT broker.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from simulated_pumps import FIRST_READING, POLLED, UNPOLLED
 VIEWERS, STALLED, MASTERS = 5, 10, 2
 SCRAPE_S = QUERY_S = 1.0
 MASTER_S = 0.02  # between a master's requests
-PASS_EVERY = 10  # of the second master's requests one is for what is not polled
-ASKED_ONES = 200  # requests that a stalled viewer sends before it stops reading
+PASS_EVERY = 10  # the second master reads an unpolled register in one of ten requests
+ASKED_ONES = 200  # a stalled viewer's requests before it stops reading
 PATIENCE_S = 30.0
-ROUND_S = 1.0  # before a user whose connection broke comes again
-WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # what masters read
+ROUND_S = 1.0  # before a user reconnects
+WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # the registers that masters read
 
 SERVE = """[serve]
 listen = "127.0.0.1:{http}"
@@ -48,31 +48,31 @@ units = {{ {units} }}
 
 
 class Place(NamedTuple):
-    """The places of a gateway, and what is asked of it."""
+    """Ports of a gateway, and the requests to it."""
 
     http: int
     modbus: int
     broker: int
     drives: int
-    first: int  # address of the words that are polled
-    unpolled: int  # address of one that is not
+    first: int  # first address of the polled words
+    unpolled: int  # an unpolled address
     series: list[str]
 
 
 def place_of(drives: int, http: int, modbus: int, broker: int) -> Place:
-    """Return the place of a gateway of so many simulated pumps, with these ports."""
+    """Return the ports and requests of a gateway with this many simulated pumps."""
     series = [f"pump-{number}.{name}" for number in range(1, drives + 1) for name in POLLED]
     return Place(http, modbus, broker, drives, FIRST_READING, UNPOLLED, series)
 
 
 def serve_tables(place: Place, rotate: str) -> str:
-    """Return the tables `[serve]` of its plant file, with all parts."""
+    """Return the tables `[serve]` of a plant file with all parts of the gateway."""
     units = ", ".join(f"pump-{number} = {number}" for number in range(1, place.drives + 1))
     return SERVE.format(http=place.http, modbus=place.modbus, broker=place.broker, units=units, rotate=rotate)
 
 
 class Users:
-    """All users; `counts` has what they got, and `failures` what they should not have got."""
+    """All users; `counts` has their results, and `failures` the unexpected ones."""
 
     def __init__(self, place: Place) -> None:
         self.place = place
@@ -110,7 +110,7 @@ class Users:
     # ---- HTTP ----
 
     async def _viewer(self) -> None:
-        """Take each frame as soon as it is there, and look at its number."""
+        """Read frames without delay and check their numbers."""
         reader, writer = await asyncio.open_connection("127.0.0.1", self.place.http)
         with closing(writer):
             newest = -1
@@ -128,7 +128,7 @@ class Users:
                 self.count("frames")
 
     async def _stalled(self) -> None:
-        """Ask for many frames, and read nothing, until it is let go."""
+        """Request many frames without reading until released."""
         with closing(socket.socket()) as peer:
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             peer.setblocking(False)
@@ -137,7 +137,7 @@ class Users:
             while True:
                 await asyncio.sleep(ROUND_S)
                 info = peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)
-                if info[0] != 1:  # no longer established
+                if info[0] != 1:  # not established
                     self.count("stalled, let go")
                     return
 
@@ -176,11 +176,11 @@ class Users:
     # ---- Modbus TCP ----
 
     async def _cached_master(self) -> None:
-        """Read the polled words of one drive after another."""
+        """Read the polled words of each drive in turn."""
         await self._master(lambda turn: (self.place.first, WORDS), "reads")
 
     async def _passing_master(self) -> None:
-        """Read the common block of one drive after another, and now and then what is not polled."""
+        """Read the common block of each drive in turn, and occasionally an unpolled register."""
 
         def wanted(turn: int) -> tuple[int, int]:
             return (COMMON, COMMON_WORDS) if turn % PASS_EVERY else (self.place.unpolled, 1)
@@ -215,7 +215,7 @@ def _request(path: str) -> bytes:
 
 
 async def _get(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path: str) -> tuple[int, bytes]:
-    """Return status and body of a request on a connection that stays."""
+    """Return status and body of a request on a persistent connection."""
     writer.write(_request(path))
     head = (await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)).decode("latin-1").lower()
     length = re.search(r"content-length: (\d+)", head)
@@ -228,7 +228,7 @@ async def _get(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path:
 
 
 class GatewayUsers:
-    """The running process, as its parent sees it."""
+    """The users' process, seen from its parent."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -238,7 +238,7 @@ class GatewayUsers:
         return self._process.pid
 
     def counts(self) -> tuple[Mapping[str, float], Mapping[str, int]]:
-        """Return what they got so far, and what they should not have got."""
+        """Return the results so far, and the unexpected ones."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(file=self._process.stdin, flush=True)
@@ -248,7 +248,7 @@ class GatewayUsers:
 
 @contextmanager
 def gateway_users(place: Place) -> Iterator[GatewayUsers]:
-    """Let them come, in a process of their own; the MQTT listener is mosquitto_sub."""
+    """Start the users in their own process; the MQTT listener is mosquitto_sub."""
     words = [sys.executable, __file__, json.dumps(place)]
     with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -266,7 +266,7 @@ async def _live(place: Place) -> None:
 
     def tell() -> None:
         if not sys.stdin.readline():
-            loop.remove_reader(sys.stdin)  # our parent is gone
+            loop.remove_reader(sys.stdin)  # the parent process ended
             task.cancel()
             return
         print(json.dumps([users.counts, users.failures]), flush=True)

@@ -1,4 +1,4 @@
-"""A gateway that polls a simulated plant in a thread, and requests to it as others send them."""
+"""A gateway that polls a simulated plant in a thread, and HTTP requests to it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from multidrop.gateway.live import frames
 from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-for module, name in (  # a busy machine is slow, and no disk hangs
+for module, name in (  # longer timeouts for a busy machine, whose disks do not hang
     *((parts, "START_S"), (parts, "BUILD_S"), (reload, "READ_S")),
     *((settings_module, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
 ):
@@ -40,7 +40,7 @@ POLL = '["status", "output_frequency", "output_current", "fault"]'
 
 
 class Answer(NamedTuple):
-    """A response."""
+    """An HTTP response."""
 
     status: int
     headers: Mapping[str, str]
@@ -52,7 +52,7 @@ class Answer(NamedTuple):
 
 
 class Served:
-    """A gateway that runs, the simulated drives by name, and a secret for each right."""
+    """A running gateway, its simulated drives by name, and a secret for each right."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class Served:
         self._loop = loop
         self.sims = sims
         self.secrets = secrets
-        self._seen = -1  # the newest frame that was asked for
+        self._seen = -1  # the newest frame requested
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
@@ -74,7 +74,7 @@ class Served:
         return self._loop
 
     def request(self, method: str, path: str, body: object = None, **headers: str) -> Answer:
-        """Send one request on a connection of its own; a header's _ is a -."""
+        """Send a request on a new connection; in a header's name, _ becomes -."""
         connection = http.client.HTTPConnection("127.0.0.1", self.gateway.port, timeout=PATIENCE)
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
         data = None
@@ -95,11 +95,11 @@ class Served:
         return self.request("POST", path, body, **headers)
 
     def command(self, path: str, body: Mapping[str, object], **headers: str) -> Answer:
-        """Send a write or a verb, as one who has seen the newest frame."""
+        """Send a write or a verb as a user who has seen the newest frame."""
         return self.post(path, {**body, "seen": self.frame_number()}, **headers)
 
     def frame_number(self) -> int:
-        """Return the number of a frame that it never returned before."""
+        """Return a frame number that was not returned before."""
         writer = {"authorization": self.bearer(Right.WRITE)}
         self._seen = int(self.get(f"/api/frame?after={self._seen}", **writer).json["n"])
         return self._seen
@@ -116,7 +116,7 @@ class Served:
 
 
 def certificate(folder: Path, name: str) -> None:
-    """A certificate and its key, as openssl makes them."""
+    """Make a certificate and its key with openssl."""
     subprocess.run(
         [
             *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"),
@@ -130,7 +130,7 @@ def certificate(folder: Path, name: str) -> None:
 
 
 def tokens() -> tuple[dict[Right, str], tuple[Token, ...]]:
-    """A token for each right."""
+    """Return a secret and a token for each right."""
     made = {right: new_token(name, right) for right, name in NAMES.items()}
     return {right: secret for right, (secret, _) in made.items()}, tuple(token for _, token in made.values())
 
@@ -146,7 +146,7 @@ def plant_text(port: str, drives: Sequence[str], serve: str = "") -> str:
 
 
 def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUSB0") -> Plant:
-    """A plant from a file with this table `[serve]`; nothing is opened."""
+    """Return a plant from a file with this table `[serve]`, without opening a port."""
     path = folder / "plant.toml"
     path.write_text(plant_text(port, drives or ("pump-1", "pump-2"), serve))
     return Plant.load(path)
@@ -156,7 +156,7 @@ def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUS
 def served(
     folder: Path, serve: str = "", *drives: str, environment: Mapping[str, str] | None = None, **settings: Any
 ) -> Iterator[Served]:
-    """A gateway of simulated INVT CHE drives, with tokens; `settings` replace those of the file."""
+    """Run a gateway of simulated INVT CHE drives with tokens; `settings` override the file's."""
     names = drives or ("pump-1", "pump-2")
     sims = {name: simulated(InvtCHE(n, name=name, baudrate=38400)) for n, name in enumerate(names, 1)}
     secrets, known = tokens()
@@ -175,7 +175,7 @@ def served(
 
 @contextmanager
 def running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
-    """Run a gateway in a thread, with ten times the frames of a page; its failure is raised at the end.
+    """Run a gateway in a thread with ten times the frame rate of a page; raise its failure at the end.
 
     Gives its loop.
     """
@@ -225,7 +225,7 @@ def _running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
 
 @contextmanager
 def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
-    """A plant file whose line is simulated while the context lasts."""
+    """Write a plant file and simulate its line until the context ends."""
     drives = [simulated(InvtCHE(address, name=f"pump-{address}", baudrate=38400)) for address in (1, 2)]
     with Simulator([Wire(drives, unpaced=True)]) as simulator:
         path = folder / "plant.toml"
@@ -235,7 +235,7 @@ def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
 
 @contextmanager
 def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command, once it is ready, and the address that it prints."""
+    """Run the command; give it with its printed address when it is ready."""
     words = [*MULTIDROP, "serve", str(path), *options]
     with BoundProcess(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment

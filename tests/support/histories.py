@@ -1,4 +1,4 @@
-"""Histories for tests: made of segments, and reckoned with by plain Python."""
+"""Histories for tests, made of segments, and their expected buckets computed in plain Python."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METADATA = {"plant": "завод.toml", "drives": {"pump-1": {"registers": {"spe
 def batch(names: Names, drive: int, numbers: Iterable[int], begin: int, step: int) -> Batch:
     """Make a row of each number in the core's memory, as a poll does; each tenth is a miss.
 
-    It was sent at `number * step` of the monotonic clock, which is `begin` later as UTC.
+    Its request was sent at `number * step` of the monotonic clock, which is UTC minus `begin`.
     """
     numbers = list(numbers)
     columns = Columns(len(numbers))
@@ -46,7 +46,7 @@ _SPEED = Names(["speed"])
 
 
 def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> list[Row]:
-    """Make rows of six series at uneven times; each seventh or so is a miss."""
+    """Make rows of six series at irregular times; about one in seven is a miss."""
     dice = random.Random(seed)
     rows, time = [], begin
     for _ in range(count):
@@ -56,7 +56,7 @@ def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> l
             Row(
                 time,
                 time - NOON + 10 * DAY,
-                None if is_miss else 1 << dice.randrange(10, 24),  # exact as a float of 24 bits
+                None if is_miss else 1 << dice.randrange(10, 24),  # exact in a float's 24 bits
                 f"pump-{dice.randrange(3)}",
                 ("speed", "current")[dice.randrange(2)],
                 None if is_miss else dice.uniform(-50, 50),
@@ -81,7 +81,7 @@ def rows_in(history: History, *of: object) -> list[Row]:
 
 
 def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
-    """Compare with what plain Python makes of the rows."""
+    """Compare the buckets with the same computation in plain Python."""
     drive, _, register = series.rpartition(".")
     mine: dict[int, list[float | None]] = {}
     for row in rows:

@@ -1,7 +1,7 @@
 """Record into a history until killed: `python history_recorder.py FOLDER RUN`.
 
-Each line of its output is the number of rows that were written so far. Row `n` of run `r` has the drive
-`run-r` and was sent at `n * 10 ms` of the monotonic clock; a run begins 9 hours after the one before.
+Each output line is the number of rows written so far. Row `n` of run `r` has the drive `run-r` and was sent
+at `n * 10 ms` of the monotonic clock; each run starts 9 hours after the previous one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from multidrop.history.writer import HistoryWriter
 
 STEP = SECOND // 100
 RUN = 9 * 3600 * SECOND
-ROWS = 30  # of a batch
+ROWS = 30  # per batch
 
 
 def main(folder: Path, run: int) -> None:

@@ -1,4 +1,4 @@
-"""Files of other programs, as small as shows what each can say, for the importers' tests and fuzzer."""
+"""Minimal files of other programs with all their features, for the importers' tests and fuzzer."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ select:
 output:
   - { platform: modbus_controller, id: speed, address: 60, register_type: holding, value_type: U_WORD }
 """
-FILES = {  # by the suffix by which an importer knows them
+FILES = {  # by the suffix that selects the importer
     ".tsv": (IOBROKER,),
     ".csv": (MODPOLL, NEURON, OWN),
     ".toml": (TELEGRAF,),
@@ -194,19 +194,19 @@ def only(folder: Path, name: str, contents: str | dict[str, Any]) -> ImportedDev
 
 
 def told(device: ImportedDevice) -> list[str]:
-    """Return the sentences on what was not carried over."""
+    """Return the importer's sentences about omitted entries."""
     return [str(lost) for lost in device.lost]
 
 
 def entries(device: ImportedDevice) -> dict[str, Any]:
-    """Return what the family file says, as TOML reads it; it never has a verb, nor anything that writes."""
+    """Return the family file as parsed TOML; fail if it has a verb or a writable entry."""
     document = tomllib.loads(family_text(device, "source"))
     assert document.keys() <= {"family", "reading", "text"}
     return {**document.get("reading", {}), **document.get("text", {})}
 
 
 def gaps(device: ImportedDevice, name: str) -> list[str]:
-    """Return the gaps of a register or a text, as its family file marks them."""
+    """Return the gaps of a register or a text that its family file marks."""
     mark = f"# gap: {name}: "
     lines = family_text(device, "source").splitlines()
     return [line.removeprefix(mark) for line in lines if line.startswith(mark)]

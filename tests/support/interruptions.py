@@ -1,4 +1,4 @@
-"""Interruptions: Ctrl-C, or any failure, before any chosen line or bytecode of the code under test."""
+"""Raise Ctrl-C or another failure before any chosen line or bytecode of the code under test."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PACKAGE = str(Path(multidrop.__file__).parent)
 
 
 def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractContextManager[list[str]]:
-    """Raise KeyboardInterrupt before the nth line that counts; not at all where there are fewer."""
+    """Raise KeyboardInterrupt before the nth line that counts, if there are so many."""
     return failing_at(nth, counts, KeyboardInterrupt())
 
 
 def failing_at(
     nth: int, counts: Callable[[FrameType], bool], failure: BaseException
 ) -> AbstractContextManager[list[str]]:
-    """Raise this before the nth line that counts; give a list, which then has the line."""
+    """Raise `failure` before the nth line that counts; give a list that receives the line."""
 
     def fail() -> None:
         raise failure
@@ -35,7 +35,7 @@ def failing_at(
 def calling_at(
     nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object], event: str = "opcode"
 ) -> Iterator[list[str]]:
-    """Call this before the nth opcode, or line, that counts; give a list, which then has its place."""
+    """Call `call` before the nth opcode, or line, that counts; give a list that receives its place."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 
@@ -61,12 +61,12 @@ def calling_at(
 
 
 class Interruption(BaseException):
-    """Raised where KeyboardInterrupt may be: unlike that one it ends no test run."""
+    """Raised in place of KeyboardInterrupt, which would end the test run."""
 
 
 @contextmanager
 def interrupted_before(nth: int, failure: type[BaseException] = Interruption) -> Iterator[list[str]]:
-    """Raise before the nth bytecode of the package on this thread; give a list, which then says where."""
+    """Raise before the nth bytecode of the package on this thread; give a list that receives its place."""
     left = nth
     found: list[str] = []
 
@@ -91,7 +91,9 @@ def interrupted_before(nth: int, failure: type[BaseException] = Interruption) ->
 
 
 def every(step: int, act: Callable[[int], bool]) -> int:
-    """Call this with 1, 1 + step and so on until it was not interrupted; return how often that was."""
+    """Call `act` with 1, 1 + step and so on until it is not interrupted; return the number of interrupted
+    calls.
+    """
     for times in count():
         if not act(1 + times * step):
             return times

@@ -1,12 +1,12 @@
-"""A client that polls, records and writes, and says what it has on disk, until it is killed.
+"""Poll, record and write in a forked process until killed, and report what is on disk.
 
-A line of standard input is a life: PORT DIRECTORY LIFE NUMBER. Each is a process of its own, forked
-from this one, which has imported everything; its id is printed, and what it died of. A life records
-into DIRECTORY/LIFE.arrows and .csv, writes NUMBER and the numbers after it to the drive, and appends
-to DIRECTORY/LIFE.told, each as soon as the call has returned:
-    rows N      so many rows are in both recordings
+Each line of standard input starts one: PORT DIRECTORY LIFE NUMBER. It is forked from this process, which has
+imported everything; its id and its exit status are printed. It records into DIRECTORY/LIFE.arrows and .csv,
+and writes NUMBER and the following numbers to the drive. It appends to DIRECTORY/LIFE.told as soon as the
+call has returned:
+    rows N      both recordings have N rows
     wrote N     the number N was written
-Ledger and audit log are those of DIRECTORY, for all lives.
+Ledger and audit log are in DIRECTORY, for all lives.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NAME = "counted"
 
 
 class Counted(Drive):
-    """A drive that counts how often it was read; nobody knows where it keeps the number."""
+    """A drive that counts its reads; the memory of its writable number is unknown."""
 
     framings = (Framing.RTU,)
     baudrates = (115_200,)

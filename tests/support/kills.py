@@ -1,4 +1,4 @@
-"""Kills of what a test started."""
+"""Kill the processes of a test."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, AnyStr
 
 
 class BoundProcess(subprocess.Popen[AnyStr]):
-    """A process that is killed where its block fails: `Popen` waits for its end, which may never come."""
+    """A process that is killed if its block fails: `Popen` would wait for its end."""
 
     def __exit__(
         self,
@@ -23,7 +23,7 @@ class BoundProcess(subprocess.Popen[AnyStr]):
 
 
 def kill_all(processes: Iterable[subprocess.Popen[Any]]) -> None:
-    """End processes, those that stand still too, and wait until they are gone."""
+    """Kill processes, suspended ones too, and wait for their end."""
     killed = list(processes)
     for process in killed:
         process.kill()

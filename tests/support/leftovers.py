@@ -1,4 +1,4 @@
-"""Counts of what a process holds: compared before and after, they show what was left behind."""
+"""Count a process's threads and descriptors: comparing before and after shows leaks."""
 
 import threading
 from pathlib import Path
@@ -9,5 +9,5 @@ def descriptors() -> int:
 
 
 def threads() -> int:
-    """Count the threads, without the one that logs: it begins with the process's first entry, and stays."""
+    """Count the threads except the logging thread, which starts with the first entry and stays."""
     return sum(thread.name != "multidrop log" for thread in threading.enumerate())

@@ -1,4 +1,4 @@
-"""One line's state machine on a clock that the test sets. No descriptor, no waiting."""
+"""One line's state machine on a clock that the test sets, without a descriptor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MS = 1_000_000
 
 
 class LineDriver:
-    """Carries exchanges out on a struct md_line; `now` is in ns and moves only when told."""
+    """Runs exchanges on a struct md_line; `now` is in ns and advances only by calls."""
 
     def __init__(self, transactions: Transactions = Transactions.NONE) -> None:
         self.now = 1000 * MS
@@ -19,7 +19,7 @@ class LineDriver:
         lib.md_line_init(self._line, self.now)
         self._line.transactions = transactions
         self.found = new_completion()
-        self._exchanges: list[Exchange] = []  # the line holds on to them
+        self._exchanges: list[Exchange] = []  # the line holds references to them
 
     @property
     def want(self) -> str:
@@ -29,7 +29,7 @@ class LineDriver:
 
     @property
     def listens(self) -> bool:
-        """True while it wants no more than time or bytes."""
+        """Return True while the line needs only time or bytes."""
         return self.want in ("wait", "read")
 
     @property
@@ -38,12 +38,12 @@ class LineDriver:
 
     @property
     def state(self) -> int:
-        """The present state (enum md_line_state)."""
+        """Return the present state (enum md_line_state)."""
         return int(self._line.state)
 
     @property
     def echo(self) -> int:
-        """The adapter's echo as far as it is known (enum md_echo)."""
+        """Return what is known about the adapter's echo (enum md_echo)."""
         return int(self._line.echo)
 
     @echo.setter
@@ -51,12 +51,12 @@ class LineDriver:
         self._line.echo = known
 
     def tell_echo(self, known: int) -> None:
-        """Set the echo as its user does."""
+        """Set the echo, as a line's user does."""
         self.echo, self._line.echo_is_told = known, known == lib.MD_ECHO
 
     @property
     def is_out_of_step(self) -> bool:
-        """True once what came was no header of Modbus TCP: the engine then loses the port."""
+        """Return True after bytes that are not a Modbus TCP header: the engine then drops the port."""
         return bool(self._line.is_out_of_step)
 
     @property
@@ -65,7 +65,7 @@ class LineDriver:
 
     @property
     def still_open(self) -> int:
-        """Bytes that may yet turn out to be the beginning of the reply."""
+        """Return the number of received bytes that may be the start of the reply."""
         return int(self._line.rx_len - self._line.rx_from)
 
     def begin(self, exchange: Exchange) -> None:
@@ -73,7 +73,7 @@ class LineDriver:
         lib.md_line_begin(self._line, exchange.c, self.found, self.now)
 
     def take(self, most: int = 513, held_up: int = 0) -> bytes:
-        """The port takes up to `most` bytes of what the line wants written, and comes back so much later."""
+        """Write up to `most` bytes of the line's request, and return from the port after `held_up`."""
         tx = bytes(ffi.buffer(self._line.tx, self._line.tx_len))[self._line.tx_at :][:most]
         begun = self.now
         self.now += held_up
@@ -91,7 +91,7 @@ class LineDriver:
         lib.md_line_abandon(self._line, result, error)
 
     def wait_until_write(self) -> bytes:
-        """Let the silence pass, as the engine does, and send the request."""
+        """Wait for the silence like the engine, and send the request."""
         for _ in range(8):
             if self.want == "write":
                 return self.take()
@@ -99,7 +99,7 @@ class LineDriver:
         raise AssertionError("the line never wants to write")
 
     def wait_for_look(self) -> None:
-        """Let time pass until the line wants to read."""
+        """Advance time until the line wants to read."""
         while self.want == "wait":
             self.now = self.wake
 

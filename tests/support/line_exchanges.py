@@ -1,4 +1,4 @@
-"""Exchanges of one drive on a line whose clock the test sets."""
+"""Exchanges with one drive on a line whose clock the test sets."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def reply(value: int = 0) -> bytes:
 
 
 def ask(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Send the request; when its last bit has left."""
+    """Send the request; return when its last bit has left."""
     line.begin(exchange(request, drive))
     line.wait_until_write()
     return line.now + 8 * CHARACTER
 
 
 def answer(line: LineDriver, drive: Peer, delay: int) -> None:
-    """A whole exchange, whose reply comes character by character, the first after `delay`."""
+    """Run a whole exchange; its reply arrives by character, the first after `delay`."""
     left = ask(line, drive)
     for at, character in enumerate(reply()):
         line.now = left + delay + (at + 1) * CHARACTER

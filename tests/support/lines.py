@@ -1,4 +1,4 @@
-"""Simulated lines to poll and command: in a process of their own, and what their values prove."""
+"""Simulated lines in another process, and values that prove their register and time."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
-ANY_PORT = "socket://127.0.0.1:0"  # for lines that are simulated where there are no pseudo-terminals, too
-PATIENCE = 120.0  # s, for what comes at once but on a machine that has much else to do
-# What a machine that has much else to do may add to what a test is about.
+ANY_PORT = "socket://127.0.0.1:0"  # also works without pseudo-terminals
+PATIENCE = 120.0  # s, for events that are immediate on an idle machine
+# Delays that a busy machine may add, whatever the test is about.
 HOST_LATE = {
     str(status)
     for status in (
@@ -35,20 +35,20 @@ HOST_LATE = {
         Status.POLL_ENDED,
     )
 }
-patient = pytest.mark.usefixtures("_patient")  # drives are waited for as long as it takes
+patient = pytest.mark.usefixtures("_patient")  # waits for drives as long as they need
 
 
 def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:
-    """Wait for a condition; the test fails when it is not met at last."""
+    """Wait for a condition; fail if it is not met in time."""
     end, pause_s = monotonic() + patience, 0.002
     while not met():
         assert monotonic() < end, f"not met within {patience:g} s"
         sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.04)  # to look may cost more than what is waited for
+        pause_s = min(1.2 * pause_s, 0.04)  # a check may be costly
 
 
 class Faulty(Wire):
-    """A wire on which every reply has the fate that it is given."""
+    """A wire that applies a given fault to each reply."""
 
     def __init__(
         self, drives: Sequence[SimulatedDrive], fate: Callable[[bytes], bytes], **details: Any
@@ -60,11 +60,11 @@ class Faulty(Wire):
         return self.fate(reply)
 
 
-# ---- in a process of their own ----
+# ---- in another process ----
 
 
 class LateWire(Wire):
-    """Replies that `distort` holds up come later, beside all else."""
+    """A wire that delivers the replies delayed by `distort` at their time."""
 
     def __init__(self, drives: Sequence[SimulatedDrive], **details: Any) -> None:
         super().__init__(drives, **details)
@@ -72,7 +72,7 @@ class LateWire(Wire):
         self._now = 0.0
 
     def hold_up(self, reply: bytes, seconds: float) -> bytes:
-        """Keep the reply back, and return what is left of it by now: nothing."""
+        """Queue the reply for later, and return no bytes for now."""
         heapq.heappush(self._late, (self._now + seconds, reply))
         return b""
 
@@ -95,7 +95,7 @@ class LateWire(Wire):
 
 @contextmanager
 def served(make: Callable[[], Sequence[Wire]]) -> Iterator[list[str]]:
-    """The paths of wires that another process runs; `make` is a function that it can import."""
+    """Give the paths of wires that another process runs; it must be able to import `make`."""
     ours, theirs = multiprocessing.Pipe()
     context = multiprocessing.get_context("spawn")
     process = context.Process(target=_serve, args=(make, theirs), daemon=True)
@@ -134,18 +134,18 @@ def plant(*lines: PlantLine) -> Plant:
 
 
 def rows_of(poller: Poller) -> list[Row]:
-    """All that waits to be taken."""
+    """Return all rows that the poller has."""
     found: list[Row] = []
     while batch := poller.take():
         found += batch
     return found
 
 
-# ---- what a value proves ----
+# ---- values that identify their register ----
 
 
 def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:
-    """The same for all that is polled, by the names of drive and register."""
+    """Return the proofs of all polled registers, by drive and register name."""
     return {
         (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
         for drive in drives

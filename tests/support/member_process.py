@@ -1,9 +1,9 @@
-"""A process with several gateways' state machines, whose lines are not there.
+"""Run several gateways' state machines on fake lines.
 
     python member_process.py URLS NAME...
 
-Each line that it prints is JSON: {"gateway": ..., "at": CLOCK_MONOTONIC in s, "lines": how many it polls}
-when that changes; {"gateway": ..., "polled": [...]} of each at every line of its input.
+Each output line is JSON. When a gateway's number of lines changes: {"gateway": ..., "at": CLOCK_MONOTONIC
+in s, "lines": number}. For each input line, of every gateway: {"gateway": ..., "polled": [...]}.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LOOK_S = 0.02
 
 
 class NoLines:
-    """Lines that are taken and let go at once."""
+    """Lines that open and close immediately."""
 
     async def take(self, line: str, description: Any) -> None:
         pass
@@ -33,7 +33,7 @@ class NoLines:
 
 
 class NoMastership:
-    """Refuses what the engine refuses, and sends nothing."""
+    """A mastership that raises the engine's errors and sends nothing."""
 
     def extend(self, until_ns: int) -> None:
         if until_ns <= boottime_ns():

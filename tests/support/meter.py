@@ -30,7 +30,7 @@ ADDRESSES = {
 
 
 def floats() -> dict[str, Register[float]]:
-    """Return registers of their own for each class."""
+    """Return new registers for each class."""
     return {
         name: reading(address, table=INPUT, number_format=NumberFormat.F32)
         for name, address in ADDRESSES.items()

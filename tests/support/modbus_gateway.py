@@ -1,4 +1,4 @@
-"""A Modbus server in a thread, with rows and commands that a test gives it, and a client of plain sockets."""
+"""A Modbus server in a thread with fake rows and commands, and a client of plain sockets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
-PATIENCE = 30.0  # s, for what must come
+PATIENCE = 30.0  # s, for required events
 
 
 class FakeRow(NamedTuple):
@@ -30,7 +30,7 @@ class FakeRow(NamedTuple):
 
 
 class FakeHub:
-    """Rows by drive and register, each as old as the test says; without one it was never asked."""
+    """Rows by drive and register, of an age that the test sets; other registers were never polled."""
 
     def __init__(self) -> None:
         self.values: dict[tuple[str, str], float | None] = {}
@@ -60,7 +60,7 @@ DONE = CommandResult(CommandOutcome.DONE, "done")
 
 
 class FakeCommands:
-    """Notes what it is told to do, and says of it what the test wants."""
+    """Commands that record their calls and return what the test sets."""
 
     def __init__(self) -> None:
         self.told: CommandResult | Callable[[], Awaitable[CommandResult]] = DONE
@@ -87,7 +87,7 @@ class FakeCommands:
 
 
 class FakeLine:
-    """Answers what is asked past the cache: each address with itself, or as the test says."""
+    """A line that answers uncached reads: each address with its number, or as the test sets."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, int, int, int]] = []
@@ -103,9 +103,9 @@ class FakeLine:
 
 
 def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
-    """A plant of drives, each with the name of its line, that polls all readable registers without a rate.
+    """Return a plant of drives with their lines' names, which polls all readable registers without a rate.
 
-    What rates come to is reckoned for each server that is made, and would take most of a short test.
+    Each server computes the rates of a plant, which would take most of a short test.
     """
     lines: dict[str, list[PolledDrive]] = {}
     for line, drive in drives:
@@ -119,7 +119,7 @@ def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
 
 @contextmanager
 def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
-    """Run a server, made in its own loop, in a thread until the block is left."""
+    """Run a server, created in its own loop, in a thread until the block ends."""
     ready: list[ModbusServer] = []
     failures: list[BaseException] = []
     begun = threading.Event()
@@ -164,7 +164,7 @@ def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
 
 
 class Gateway(NamedTuple):
-    """A server with all that a test gives it."""
+    """A server with its fakes."""
 
     server: ModbusServer
     hub: FakeHub
@@ -177,14 +177,14 @@ class Gateway(NamedTuple):
 
 @contextmanager
 def serving(plant: Plant, settings: ModbusSettings) -> Iterator[Gateway]:
-    """A server of this plant over fakes."""
+    """Run a server of this plant over fakes."""
     hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
     with in_thread(lambda: ModbusServer(plant, hub, commands, settings, line.ask)) as server:
         yield Gateway(server, hub, commands, line)
 
 
 def request(transaction: int, unit: int, function: int, *words: int, data: bytes = b"") -> bytes:
-    """The frame of a request, packed as the messaging guide prints it."""
+    """Return a request's frame, packed as in the messaging guide."""
     body = struct.pack(f">BB{len(words)}H", unit, function, *words) + data
     return struct.pack(">HHH", transaction, 0, len(body)) + body
 
@@ -197,7 +197,7 @@ class RawReply(NamedTuple):
 
     @property
     def code(self) -> int | None:
-        """The exception's code; None for a good reply."""
+        """Return the exception code, or None for a normal reply."""
         return self.data[0] if self.function & 0x80 else None
 
     @property
@@ -206,7 +206,7 @@ class RawReply(NamedTuple):
 
 
 class RawClient:
-    """A client of Modbus TCP that sends any bytes."""
+    """A Modbus TCP client that sends any bytes."""
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
@@ -224,7 +224,7 @@ class RawClient:
         self.socket.sendall(data)
 
     def receive(self) -> RawReply | None:
-        """The next reply; None where the connection is closed."""
+        """Return the next reply, or None if the connection is closed."""
         try:
             header = self._stream.read(8)
             if len(header) < 8:
@@ -236,7 +236,7 @@ class RawClient:
             return None
 
     def ask(self, unit: int, function: int, *words: int, data: bytes = b"") -> RawReply:
-        """The reply to one request."""
+        """Return the reply to one request."""
         self.send(request(7, unit, function, *words, data=data))
         reply = self.receive()
         assert reply is not None

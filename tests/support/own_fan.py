@@ -1,4 +1,4 @@
-"""A drive of a user's own, as one would declare it: what starts and stops its motor is one plain setting."""
+"""A user's own drive, whose start and stop are one plain setting."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Run(IntEnum):
 
 
 class Fan(Drive):
-    """A fan controller of a user's own, whose start and stop are one plain setting."""
+    """A fan controller of a user's own."""
 
     model = "fan"
     speed = reading(0x0010, "rpm", step=1)

@@ -1,4 +1,4 @@
-"""A path that holds everything up and keeps the order: a modem, a gateway, a stalled network."""
+"""A path that delays everything and keeps the order: a modem, a gateway, a stalled network."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from multidrop.errors import BusError
 from multidrop.sim import SimulatedDrive
 from multidrop.transport import clock, peers
 
-Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
+Delay = Callable[[float], float]  # delay in s by the time in s at which bytes enter the path
 
 S = 1_000_000_000
-SECONDS = 150.0  # of a story: what is outstanding is remembered for 120 s
-TAIL = 20.0  # s at its end, and TURNS times the delay, in which every drive must have answered
+SECONDS = 150.0  # of a story: pending requests are kept for 120 s
+TAIL = 20.0  # every drive must answer in these last seconds plus TURNS times the delay
 TURNS = 20
 
 
 class PathWire(ClockedWire):
-    """A hostile wire at the far end of a path that delays what the drives say."""
+    """A faulty wire at the end of a path that delays the drives' replies."""
 
     delay: Delay
 
@@ -67,25 +67,25 @@ def jittering(seconds: float) -> Delay:
 
 
 def stalling(longest: float) -> Delay:
-    """Twelve stalls of up to so many seconds, in which everything waits for the end."""
+    """Return twelve stalls of up to this many seconds, each of which delays everything to its end."""
     random = Random(2)
     begins = [random.uniform(2.0, SECONDS) for _ in range(12)]
     stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
 
     def delay(now: float) -> float:
-        now -= 1000.0  # when clocked lines begin
+        now -= 1000.0  # the time at which clocked lines start
         return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
 
     return delay
 
 
 class Path(Story):
-    """A line behind such a path."""
+    """A line at the end of such a path."""
 
     wires = PathWire
 
     def tell_of(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
-        """Judge every row; the drives of which values came in the end."""
+        """Check every row; return the drives with values at the end."""
         self.wire.delay = delay
         with self.clocked:
             self.run(SECONDS)
@@ -95,14 +95,14 @@ class Path(Story):
 
 
 class PathLine:
-    """A bus's view of a line behind such a path; time passes only while it waits."""
+    """A line at the end of such a path, with the interface that `Bus` uses; only its waits let time pass."""
 
     def __init__(self, wire: PathWire) -> None:
         self.port = self.identity = wire.where if speaks_tcp(wire.where) else "test line"
         self.now = BEGIN_NS
         self.wire = wire
         self.has_echo = self.is_lost = False
-        self.may_send = True  # it has no mastership
+        self.may_send = True  # has no mastership
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
         self.queue = ClockedPort(self, transactions_of(self))
 
@@ -135,7 +135,7 @@ class PathLine:
         self._pass_until(self.now + 1000 * S)
         granted = self.queue.granted
         assert granted
-        granted.c.late_until_ns = late_until_ns  # as md_port_carry_out() does
+        granted.c.late_until_ns = late_until_ns  # like md_port_carry_out()
         return granted
 
     def _pass_until(self, end_ns: int) -> None:
@@ -151,12 +151,12 @@ class PathLine:
 def bus_over(
     wire: PathWire, delay: Delay, sims: Sequence[SimulatedDrive], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Bus, PathLine]:
-    """Open a bus over such a path, with the drives of these simulations."""
+    """Open a bus over such a path to these simulated drives."""
     wire.delay = delay
     wire.open()
     line = PathLine(wire)
     monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
-    monkeypatch.setattr(peers, "_former", {})  # they are another clock's
+    monkeypatch.setattr(peers, "_former", {})  # earlier peers belong to another clock
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "boottime_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)
@@ -167,7 +167,7 @@ def bus_over(
 
 
 def read_truly(opened: Bus, line: PathLine, drives: Sequence[Drive]) -> None:
-    """Read four registers of each drive in turn, again and again: each value is the register's own."""
+    """Read four registers of each drive in turn, repeatedly; check that each value is the register's."""
     asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
     read: Counter[str] = Counter()
     with opened:

@@ -1,6 +1,6 @@
-"""Wait for every drive and every turn however busy the machine is; not for tests in which one is silent.
+"""Wait for every drive and every write on a busy machine; not for tests with silent drives.
 
-`python patient.py PROGRAM ARGUMENTS` runs a program so.
+`python patient.py PROGRAM ARGUMENTS` runs a program like this.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ PATIENCE = 60.0  # s
 
 
 def patient_peer(*, interval: float, **timeouts: float) -> Peer:
-    """Return what the library makes for a drive, with longer time-outs."""
+    """Return the library's peer for a drive with longer timeouts."""
     return Peer(interval=interval, **{name: max(one, PATIENCE) for name, one in timeouts.items()})
 
 
 def be_patient(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
-    """Wait for every drive, and for every write's turn: the given functions change what the library has."""
+    """Lengthen the timeouts of drives and writes with these setter functions."""
     set_attribute(peers, "Peer", patient_peer)
     await_turns(set_attribute, set_item)
 
 
 def await_turns(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
-    """Wait for every write's turn alone: for tests in which a drive may be silent."""
+    """Lengthen only the expiry of writes: for tests with silent drives."""
     defaults: dict[str, Any] = bus.Bus.__init__.__kwdefaults__
     set_attribute(bus, "EXPIRY", PATIENCE)
     set_item(defaults, "expiry", PATIENCE)

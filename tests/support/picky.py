@@ -1,4 +1,4 @@
-"""Simulated devices that do not answer every request as a whole."""
+"""Simulated devices that reject or ignore some requests."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from multidrop.sim.protocol import Reason, Refusal
 
 
 def family(registers: int, **declared: Any) -> type[Drive]:
-    """Return a class with so many registers side by side, r0 and so on, that states nothing else."""
+    """Return a class with this many adjacent registers, named r0 and so on, and no other declaration."""
     readings = {f"r{at}": reading(at) for at in range(registers)}
     return type("Plain", (Drive,), {"__doc__": "Of this test.", **readings, **declared})
 
 
 def right(addresses: Iterable[int]) -> dict[str, float]:
-    """Return what a picky device holds at these addresses, by the registers' names."""
+    """Return a picky device's values at these addresses, by register name."""
     return {f"r{at}": 100 + at for at in addresses}
 
 
 class Picky(SimulatedDrive):
-    """Refuses reads of some addresses; refuses or ignores those of more than so many registers."""
+    """Rejects reads of some addresses; rejects or ignores reads of too many registers."""
 
     def __init__(
         self, drive: Drive, refused: Collection[int] = (), most: int = 125, silent_beyond: int = 125

@@ -1,4 +1,4 @@
-"""Throw-away clusters of PostgreSQL in a temporary folder, owned by the user postgres."""
+"""Temporary PostgreSQL clusters in a temporary folder, owned by the user postgres."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROGRAMS = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
 
 
 class Postgres:
-    """A cluster that can be killed and started again; without a password, for this machine alone."""
+    """A cluster that can be killed and restarted, without a password, only for this machine."""
 
     def __init__(self) -> None:
         self._programs = PROGRAMS[0] if PROGRAMS else Path(require_program("postgres")).parent
@@ -39,7 +39,7 @@ class Postgres:
 
     @staticmethod
     def _owner() -> pwd.struct_passwd | None:
-        """Return who may run it: PostgreSQL refuses root."""
+        """Return the user to run it as: PostgreSQL rejects root."""
         if os.geteuid():
             return None
         try:
@@ -77,7 +77,7 @@ class Postgres:
                 return
 
     def kill(self) -> None:
-        """Kill it with all its children, as a power cut does."""
+        """Kill it with all its children, like a power cut."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 

@@ -1,4 +1,4 @@
-"""A family of each profile, declared in Python, with the addresses that its public manual prints."""
+"""A family of each profile, declared in Python, with the addresses printed in its public manual."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _word(request: Message) -> int:
     return int.from_bytes(request.data[:2])
 
 
-# What turns the motor, of each family, by address and word, in the manuals' words; written by hand.
+# Writes that start the motor, by address and word, in the manuals' words; typed manually.
 STARTS: dict[str, Callable[[Message], bool]] = {
     "abb-acs355": lambda each: each.start == 0 and _word(each) & 0x09 == 0x09,
     "siemens-v20": lambda each: each.start == 99 and _word(each) & 0x09 == 0x09,
@@ -147,7 +147,7 @@ STARTS: dict[str, Callable[[Message], bool]] = {
     "optidrive-e3": lambda each: each.start == 0 and bool(_word(each) & 0x01),
 }
 
-# The families that ship as files, with the one above whose words they share.
+# The families that ship as files, each with the class above that has the same words.
 SHIPPED_AS = {
     "abb-acs355": "abb-acs355",
     "danfoss-fc51": "danfoss-fc51",

@@ -1,4 +1,4 @@
-"""Two ptys joined back to back, as a null-modem cable joins two serial ports."""
+"""Two ptys joined like serial ports with a null-modem cable."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 
 @contextmanager
 def linked_ptys() -> Iterator[tuple[str, str]]:
-    """Paths of two ports; what is written to the one is read from the other."""
+    """Give the paths of two ports, each of which receives what is written to the other."""
     masters, slaves = zip(*(os.openpty() for _ in range(2)), strict=True)
     for slave in slaves:
         tty.setraw(slave)

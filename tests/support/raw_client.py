@@ -1,4 +1,4 @@
-"""A client of bytes: it opens ports and knows nothing of the simulator."""
+"""A client that sends and receives raw bytes, independent of the simulator."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from contextlib import contextmanager
 
 from multidrop.core import set_settings
 
-PATIENCE = 60.0  # s until a reply that should come is given up; never waited for when all is well
+PATIENCE = 60.0  # s to wait for a required reply
 
 
 @contextmanager
 def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
-    """A descriptor, as a client has it."""
+    """Give a descriptor, opened and configured like a client's."""
     if path.startswith("socket://"):
         host, _, port = path.removeprefix("socket://").partition(":")
         with socket.create_connection((host, int(port))) as client:

@@ -1,4 +1,4 @@
-"""Responders behind ports, kept by one thread: ptys that may vanish, and sockets."""
+"""Responders behind ports, run by one thread: ptys that may vanish, and sockets."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ __all__ = ["ReceivedFrame", "Responder", "ResponderLine"]
 
 
 class Responder:
-    """Responders behind ports, kept by one thread; `ports` are what a client opens.
+    """Responders behind ports, run by one thread; `ports` are the names that a client opens.
 
-    A pty is opened under a link in `directory`, so that it can vanish and come back. Instead there may
-    be sockets that listen, one a line, on which Telnet's serial port option is spoken or nothing but bytes.
+    A pty is opened under a link in `directory`, so that it can vanish and come back. Alternatively each line
+    has
+    a listening socket, with raw bytes or with Telnet's serial port option.
     """
 
     def __init__(
@@ -108,7 +109,7 @@ class Responder:
         connection.close()
 
     def lose(self, line: ResponderLine) -> None:
-        """Take the port away, as when an adapter is unplugged."""
+        """Remove the port, as when an adapter is unplugged."""
 
         def unplug() -> None:
             self._links[self.lines.index(line)].unlink()
@@ -138,10 +139,10 @@ class Responder:
 
         self._jobs.append(do_and_tell)
         os.write(self._waker, b"\0")
-        done.wait()  # a signal's handler may end this wait, and the job is done all the same
+        done.wait()  # a signal handler may interrupt this wait, and the job still completes
 
     def release(self, line: ResponderLine) -> None:
-        """Give the replies that were held back."""
+        """Send the replies that were held back."""
 
         def give() -> None:
             for said in line.release():

@@ -1,6 +1,6 @@
-"""Drives of a responder, which knows nothing of the library: registers, and the writes that start motors.
+"""Drives of a responder, independent of the library: registers, and the writes that start motors.
 
-Typed from the documents. A write that takes a stop back is counted among those that move a motor.
+Typed from the documents. A write that revokes a stop also counts as one that moves a motor.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ COIL_ON = 0xFF00
 
 
 class Asked(NamedTuple):
-    """One request: `value` is a read's count, or what a write writes."""
+    """A request: `value` is a read's count or a write's value."""
 
     address: int
     function: int
@@ -28,19 +28,19 @@ Judge = Callable[[Asked], bool]
 
 @dataclass(frozen=True)
 class Kind:
-    """A family: its memory at rest, what is read while the motor turns, and its writes that matter."""
+    """A family: its memory at rest and while the motor turns, and the writes that start or stop it."""
 
     name: str
     moves: Judge
     stops: Judge
-    memory: Mapping[int, int]  # by register; the same for all functions that read
-    turning: Mapping[int, int]  # instead, while the motor turns
-    mark: str  # a register that no verb reads
+    memory: Mapping[int, int]  # by register, for all read functions
+    turning: Mapping[int, int]  # replaces entries while the motor turns
+    mark: str  # a register that verbs do not read
     protocol: str = STANDARD
-    makes: Mapping[str, Any] = field(default_factory=dict)  # options that its class needs
+    makes: Mapping[str, Any] = field(default_factory=dict)  # options of its class
     halts: tuple[str, ...] = ("stop",)
-    own_address: int | None = None  # where it holds its address
-    live: int = 3  # the function that reads what `turning` has
+    own_address: int | None = None  # register of its own address
+    live: int = 3  # the function that reads `turning`
 
 
 def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
@@ -48,7 +48,7 @@ def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
 
 
 def _erman_moves(asked: Asked) -> bool:
-    """START on, or STOP or EMERGENCY STOP off (section 10, commands)."""
+    """Return True for START on, or STOP or EMERGENCY STOP off (section 10, commands)."""
     start = (asked.start, asked.value) == (0, COIL_ON)
     return asked.function == 15 or (
         asked.function == 5 and (start or (asked.start in (1, 2) and asked.value == 0))
@@ -67,7 +67,7 @@ KINDS = {
             "erman-er-g-220",
             _erman_moves,
             _erman_stops,
-            {2: 200, 3: 500, 4: 0, 0x0C: 10, 0x0D: 1},  # of functions 03 and 04; no address has both
+            {2: 200, 3: 500, 4: 0, 0x0C: 10, 0x0D: 1},  # functions 03 and 04 share no address
             {0x0401: 1, 1: 200, 3: 15},
             "braking_threshold",
             halts=("stop", "emergency_stop"),
@@ -125,29 +125,29 @@ KINDS = {
             own_address=0x0802,
         ),
         Kind(
-            "fan",  # a user's own: its declaration is in the test
+            "fan",  # a user's own family, declared in the test
             _writes(6, 0x0030, lambda value: value == 1),
             _writes(6, 0x0030, lambda value: value == 0),
             {},
             {0x0010: 900},
             "current",
-            makes={"confirmed": 1},  # by its owner: nothing that it answers tells it from others
+            makes={"confirmed": 1},  # by its owner: its replies do not identify it
         ),
     )
 }
 
 
 class ResponderDrive:
-    """One drive: what it holds, and whether its motor turns.
+    """One drive: its registers, and whether its motor turns.
 
-    `ramp` is how many seconds the motor takes to stand after a stop.
+    After a stop the motor takes `ramp` seconds to halt.
     """
 
     def __init__(self, kind: Kind, address: int, ramp: float = 0.0) -> None:
         self.kind = kind
         self.address = address
         self.ramp = ramp
-        self.runs = False  # as it was commanded last
+        self.runs = False  # the last command
         self._stands_at = 0.0
         self.switch_on()
 
@@ -156,20 +156,20 @@ class ResponderDrive:
         return self.runs or time.monotonic() < self._stands_at
 
     def switch_on(self) -> None:
-        """Lose power and get it back: the motor stands, and all is as from the factory."""
+        """Restart after a power failure: the motor halts, and registers have their factory values."""
         self.runs = False
         self._memory = dict(self.kind.memory)
         if self.kind.own_address is not None:
             self._memory[self.kind.own_address] = self.address
-        self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's
+        self._coils = {0: 0, 1: 0, 2: 0}  # of ERMAN
 
     def turn(self) -> None:
-        """Start as if somebody had done it by hand."""
+        """Start the motor as if manually."""
         self.runs = True
         self._coils[0] = COIL_ON
 
     def hold(self, address: int, value: int) -> None:
-        """Keep this value where it is read, whatever the family has there."""
+        """Keep this value at every place where the address is read."""
         self._memory[address] = value
 
     def word(self, address: int, function: int) -> int:
@@ -178,7 +178,7 @@ class ResponderDrive:
         return self._memory.get(address, 0) if turning is None else turning
 
     def state(self) -> int:
-        """Return the state that function 03 of Delixi's own protocol reads."""
+        """Return the state for function 03 of Delixi's own protocol."""
         return 2 if self.turns else 1
 
     def write(self, asked: Asked) -> None:

@@ -1,6 +1,6 @@
-"""One line of responders: it splits, checks and answers frames by itself, and notes each with its time.
+"""A line of responders that splits, checks and answers frames, and records each with its time.
 
-Nothing in it is the library's: checksums are those of checksums.py.
+It shares no code with the library: checksums are those of checksums.py.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ LENGTHS = dict.fromkeys((*READS, 5, 6, 8), 8)
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """One frame as it came; `what` is moves, stops, writes, reads or damaged."""
+    """A received frame; `what` is moves, stops, writes, reads or damaged."""
 
-    at: int  # ns, CLOCK_MONOTONIC, when it was read from the port
-    connection: int  # counted anew whenever the port came back
+    at: int  # ns, CLOCK_MONOTONIC, when it was read
+    connection: int  # increases each time the port comes back
     frame: bytes
     what: str
     asked: Asked | None
@@ -37,7 +37,9 @@ class ReceivedFrame:
 
 
 def split(buffer: bytes) -> tuple[bytes, Asked | None, bytes]:
-    """The first frame, what it asks (None when its checksum is wrong), and the rest; no frame: b""."""
+    """Return the first frame, its request (None if its checksum is wrong), and the rest; without a frame,
+    b"".
+    """
     if buffer[:1] == b":":
         end = buffer.find(b"\n") + 1
         frame, rest = buffer[:end], buffer[end:]
@@ -71,7 +73,7 @@ def _standard(body: bytes) -> Asked:
 
 
 def reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: int = 0) -> bytes:
-    """The drive's reply to a request; writes are carried out before."""
+    """Execute a request; return the drive's reply."""
     if drive.kind.protocol == DELIXI:
         return _delixi_reply(drive, asked, frame, exception)
     head = f"{asked.address:02X}"
@@ -99,11 +101,13 @@ def _delixi_reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: 
 
 
 class ResponderLine:
-    """One port's line of responders, with its faults.
+    """The line of a port, with its faults.
 
-    A trouble befalls the next requests, one each, and is given by name: "mute" carries out and says
-    nothing, "deaf" does nothing, "late" answers when the next request has come, and a number answers
-    with that exception. `deaf_until` and `delay` (s) last.
+    Each entry of the list of troubles affects one of the next requests: "mute" executes without a reply,
+    "deaf"
+    ignores, "late" replies after the following request, and a number replies with that exception.
+    `deaf_until`
+    and `delay` (s) stay in effect.
     """
 
     def __init__(self, drives: Sequence[ResponderDrive]) -> None:
@@ -113,22 +117,22 @@ class ResponderLine:
         self.deaf_until = 0.0  # s, CLOCK_MONOTONIC
         self.delay = 0.0
         self.connection = 0
-        self.mangle: Callable[[bytes], bytes] = lambda said: said  # what becomes of a reply on its way
-        self.held = threading.Event()  # the request that `hold` waits for has come
-        self._hold_in = 0  # requests
+        self.mangle: Callable[[bytes], bytes] = lambda said: said  # changes a reply on its way
+        self.held = threading.Event()  # set when `hold` has its request
+        self._hold_in = 0  # requests until then
         self._is_holding = False
-        self._kept: list[bytes] = []  # replies, while it holds
+        self._kept: list[bytes] = []  # held replies
         self._late = b""
         self._buffer = b""
-        self._last = 0.0  # s, when the latest bytes came
+        self._last = 0.0  # s, time of the latest bytes
 
     def hold(self, requests: int) -> None:
-        """Answer nothing from the request after so many on, until `release`."""
+        """Hold replies, after this many requests, until `release`."""
         self.held.clear()
         self._hold_in, self._is_holding = requests + 1, False
 
     def release(self) -> list[bytes]:
-        """The replies that were held back."""
+        """Return the replies that were held back."""
         self._hold_in, self._is_holding = 0, False
         kept, self._kept = self._kept, []
         return kept
@@ -139,9 +143,9 @@ class ResponderLine:
         self.connection += 1
 
     def hear(self, received: bytes) -> list[bytes]:
-        """The replies to what came."""
+        """Return the replies to these bytes."""
         now = time.monotonic()
-        if now - self._last > 0.05:  # the rest of what was cut short does not come any more
+        if now - self._last > 0.05:  # the rest of a truncated frame will not come
             self._buffer = b""
         self._last = now
         self._buffer += received

@@ -1,22 +1,22 @@
-"""Telnet with the serial port option (RFC 2217), for a responder that takes any settings."""
+"""Telnet with the serial port option (RFC 2217), for a responder that accepts any settings."""
 
 from __future__ import annotations
 
 IAC, DONT, DO, WONT, WILL, SB, SE = 255, 254, 253, 252, 251, 250, 240
 BINARY, SUPPRESS_GO_AHEAD, COM_PORT = 0, 3, 44
 ANSWERS = {WILL: DO, DO: WILL}
-SERVER = 100  # a server's answer to an option has the client's number and this
+SERVER = 100  # server's answer = client's command + 100
 
 
 class Telnet:
-    """One connection's state: options that were agreed, and what was cut in the middle."""
+    """A connection's state: agreed options, and an incomplete command."""
 
     def __init__(self) -> None:
         self._buffer = b""
         self._agreed: set[tuple[int, int]] = set()
 
     def decode(self, received: bytes) -> tuple[bytes, bytes]:
-        """The data in what came, and what is to be answered to the rest."""
+        """Return the received data, and the answer to the commands between it."""
         self._buffer += received
         data, answer = b"", b""
         while self._buffer:
@@ -40,7 +40,7 @@ class Telnet:
         return data.replace(bytes([IAC]), bytes([IAC, IAC]))
 
     def _length(self) -> int:
-        """That of the command at the front; 0 while it is not whole."""
+        """Return the length of the first command, or 0 if it is incomplete."""
         if len(self._buffer) < 2:
             return 0
         if self._buffer[1] == SB:

@@ -1,4 +1,4 @@
-"""A connection to NATS servers that have an empty stream of samples."""
+"""A connection to NATS servers with an empty stream of samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Carries out verbs without a bus: reads are answered from a table, writes become frames."""
+"""Run verbs without a bus: a table answers reads, and writes become frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.drive.register import COIL, Carrier, Register
 
 
 def frame(drive: Drive, register: Register[Any], value: Any) -> str:
-    """The frame that writes this value, as documents print it; not the library's own way to it."""
+    """Return the frame that writes this value, in the documents' notation, computed without the library."""
     raw = (
         value.value if isinstance(value, Enum) else round(Fraction(str(value)) / Fraction(str(register.step)))
     )
@@ -34,12 +34,14 @@ def frame(drive: Drive, register: Register[Any], value: Any) -> str:
 
 
 class Wire:
-    """A drive that says what the test tells it to.
+    """A drive whose replies the test sets.
 
-    `says` has a value for each register's name, or a list of them for one read after another (the
-    last one stays); an exception is raised instead. `loses` has the exceptions of the first writes of
-    a frame, and `turns` what it says after a frame. What is written is held, unless `says` has another
-    value. The rules of registers hold as on a bus; what they look at is not counted in `reads`.
+    `says` has a value for each register's name, or a list of values for successive reads, whose last one
+    stays; an
+    exception in it is raised. `loses` has the exceptions of the first writes of a frame, and `turns` updates
+    `says` after a frame. Later reads return a written value unless `says` has another. Register rules hold as
+    on
+    a bus; their reads are not counted in `reads`.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class Wire:
         drive.perform = self.run
 
     def say(self, says: Mapping[str, Any]) -> None:
-        """From now on."""
+        """Replace the values from now on."""
         self.says |= {name: list(each) if isinstance(each, list) else [each] for name, each in says.items()}
 
     def run(self, script: Script[Any]) -> Any:
@@ -118,7 +120,7 @@ class Wire:
 
 
 def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
-    """Every register as (table, address, name, unit or enumeration, step)."""
+    """Return every register as (table, address, name, unit or enumeration, step)."""
     return {
         (
             f"{each.table.read or 0:02X}/{each.table.write or 0:02X}",
@@ -132,7 +134,7 @@ def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
 
 
 def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
-    """The same from a table typed by hand; a step is "-" where there is none, "?" where it is not stated."""
+    """Return the same from a typed table; a step is "-" if there is none, "?" if it is not stated."""
     found = set()
     for line in table.strip().splitlines():
         functions, address, name, step, *unit = line.split()

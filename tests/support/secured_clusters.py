@@ -1,4 +1,4 @@
-"""NATS servers with the very configuration that `fleet rights` writes, with TLS, in a temporary folder."""
+"""NATS servers with the configuration that `fleet rights` writes, with TLS, in a temporary folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from multidrop.fleet.servers.files import ROUTE_PORTS, TlsFiles, write_files
 from multidrop.fleet.servers.rights import STORE
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
-Change = Callable[[str], str]  # of rights.conf
+Change = Callable[[str], str]  # edits rights.conf
 
 
 def _as_written(rights: str) -> str:
@@ -29,14 +29,14 @@ def _as_written(rights: str) -> str:
 
 
 def in_one_account(rights: str) -> str:
-    """Return the rights of the same users in the account that has the streams, as it is without accounts."""
+    """Return the same users' rights in the streams' account, as without separate accounts."""
     users = re.findall(r"\{ # .*?\n        \}\n      \}", rights, re.DOTALL)
     assert users
     return f"accounts {{ {STORE} {{ jetstream: enabled, users: [\n" + "\n".join(users) + "\n] } }\n"
 
 
 def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
-    """Make a certificate authority, and a certificate for this address that it has signed."""
+    """Make a certificate authority, and a certificate that it signed for this address."""
     openssl = require_program("openssl")
     folder.mkdir(parents=True, exist_ok=True)
     own = ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
@@ -53,7 +53,7 @@ def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
 
 
 def ports_with_routes(number: int) -> list[int]:
-    """Return free ports whose ports of routes are free too."""
+    """Return free ports whose cluster ports are also free."""
     found: list[int] = []
     while len(found) < number:
         with closing(socket.socket()) as one, closing(socket.socket()) as other:
@@ -70,7 +70,7 @@ def _reloads(log: str) -> int:
 
 
 class SecuredNode(Node):
-    """One server's process, with a file that was written for it."""
+    """A server process with its own configuration file."""
 
     def __init__(self, folder: Path, name: str, port: int, monitor: int) -> None:
         self.name, self.port, self.monitor = name, port, monitor
@@ -106,12 +106,12 @@ class SecuredCluster(Cluster):
         return self.folder / "keys" / f"{user}.key"
 
     def give_rights_to(self, gateways: Sequence[str]) -> None:
-        """Write the rights of these gateways alone, and let the servers read them."""
+        """Write the rights of only these gateways, and reload the servers."""
         write_files(self.folder, gateways, self.urls, self.tls, self.folder)
         self.reload()
 
     def reload(self) -> None:
-        """Let the servers read their files again, and wait until they have."""
+        """Reload the servers' configuration, and wait for it."""
         done = [_reloads(node.log()) for node in self.nodes]
         for node in self.nodes:
             node.process.send_signal(signal.SIGHUP)
@@ -121,11 +121,11 @@ class SecuredCluster(Cluster):
             time.sleep(0.02)
 
     def options(self, user: str) -> dict[str, Any]:
-        """Return the options of a connection as this user."""
+        """Return the options of this user's connection."""
         return connect_options(self.urls, self.key(user), self.tls.ca)
 
     def environment(self, user: str) -> dict[str, str]:
-        """Return the environment of a command of this user."""
+        """Return the environment of this user's commands."""
         return {
             **os.environ,
             "MULTIDROP_NATS": ",".join(self.urls),

@@ -1,4 +1,4 @@
-"""A whole fleet with rights: gateways as processes, each with its own key, and lines that judge them."""
+"""A whole fleet with rights: gateway processes with their own keys, and lines that check their requests."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 class SecuredFleet:
-    """Gateways on six lines; each keeps what it has in the folder of its name."""
+    """Gateways on six lines; each has a folder of its name."""
 
     def __init__(self, folder: Path, servers: SecuredCluster) -> None:
         self.servers = servers
@@ -50,7 +50,7 @@ class SecuredFleet:
         assert made.returncode == 0, made.stderr
 
     def start(self, name: str, kept: str = "", **environment: str) -> None:
-        """Start a gateway; `kept` names another folder than that of its name."""
+        """Start a gateway; `kept` names another folder."""
         kept = kept or name
         words = ["fleet", "serve", name, "--folder", str(self._folder / kept)]
         with (self._folder / f"{kept}.log").open("ab") as log:
@@ -82,7 +82,7 @@ def secured_fleet(
     gateways: Sequence[str] = GATEWAYS,
     environments: Mapping[str, Mapping[str, str]] | None = None,
 ) -> Iterator[SecuredFleet]:
-    """Begin a fleet on so many servers, with all gateways started."""
+    """Give a fleet on this many servers, with all gateways started."""
     with secured_cluster(folder / "nats", number, gateways) as servers:
         fleet = SecuredFleet(folder, servers)
         try:

@@ -1,7 +1,7 @@
-"""Serial servers of many lines, which see who sends what when: each new connection is another master.
+"""Serial servers of many lines that record who sends when: each new connection is a new master.
 
-A request of an older connection that comes after the first request of a newer one is an overlap. Old
-connections are not closed, so that it would be seen.
+A request on an older connection after the first one on a newer connection is an overlap. Old connections stay
+open to make it visible.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ REQUEST = 8  # bytes of a Modbus RTU read
 
 @dataclass
 class LineSeen:
-    """A line's requests so far, and its masters in the order in which they first sent."""
+    """A line's requests so far, and its masters in the order of their first request."""
 
     name: str
     port: int
     masters: list[int] = field(default_factory=list)
     last_s: float = 0.0
-    longest_s: float = 0.0  # between two requests, since `reset`
+    longest_s: float = 0.0  # longest gap between requests since `reset`
     requests: int = 0
     overlaps: int = 0
 
@@ -41,9 +41,9 @@ class LineSeen:
 
 
 class SerialHall:
-    """Listens on a port for each line; answers Modbus RTU reads with zeros, and says that it took each write.
+    """Listens on a port for each line; answers Modbus RTU reads with zeros, and confirms each write.
 
-    So its motors stand. A line whose name is in `refusing` takes no write.
+    So its motors are stopped. A line whose name is in `refusing` rejects writes.
     """
 
     def __init__(self, number: int, host: str = "127.0.0.1", names: Sequence[str] = ()) -> None:
@@ -75,10 +75,10 @@ class SerialHall:
             for line in self.lines.values()
         )
 
-    # ---- what was seen ----
+    # ---- measurements ----
 
     def reset(self) -> None:
-        """Measure gaps from now on."""
+        """Restart the measurement of gaps."""
         with self._lock:
             for line in self.lines.values():
                 line.longest_s = 0.0
@@ -92,7 +92,7 @@ class SerialHall:
             return sum(line.requests for line in self.lines.values())
 
     def gaps(self) -> dict[str, float]:
-        """Return the longest gap of each line (s), the present one included."""
+        """Return the longest gap (s) of each line, including the present one."""
         now = time.monotonic()
         with self._lock:
             return {line.name: max(line.longest_s, now - line.last_s) for line in self.lines.values()}
@@ -164,11 +164,11 @@ def _answer(client: socket.socket, request: bytes, *, takes_writes: bool) -> Non
     try:
         client.sendall(body + _crc(body))
     except OSError:
-        return  # it has gone
+        return  # the connection is closed
 
 
 def _crc(data: bytes) -> bytes:
-    """Return the checksum as the standard says it (Modbus over serial line V1.02, 6.2.2)."""
+    """Return the standard's checksum (Modbus over serial line V1.02, 6.2.2)."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte

@@ -14,9 +14,9 @@ from serial import rfc2217
 
 
 class SerialServer:
-    """A port at the far end of a network (RFC 2217), behind which is a simulated line.
+    """A port behind a network (RFC 2217) with a simulated line.
 
-    Its settings are only kept here, where a test can see them.
+    Its settings are only recorded, for tests to check.
     """
 
     def __init__(self, path: str) -> None:
@@ -37,7 +37,7 @@ class SerialServer:
         manager = rfc2217.PortManager(self.port, SimpleNamespace(write=client.sendall))
         back = threading.Thread(target=self._copy_back, args=(client, manager), daemon=True)
         back.start()
-        with suppress(OSError):  # whoever is connected may leave while it is spoken to
+        with suppress(OSError):  # the client may disconnect in between
             while received := client.recv(1024):
                 self._wire.sendall(b"".join(manager.filter(received)))
         with suppress(OSError):
@@ -60,9 +60,9 @@ pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is dep
 
 
 def vanishing_pty() -> tuple[str, Callable[[], None]]:
-    """A pty that hangs up, as an adapter does that is pulled, when it has heard a request.
+    """Give a pty that hangs up after its first request, like an unplugged adapter.
 
-    Its other end stays open: else another program could get its number, and be what is opened again.
+    Its other end stays open: otherwise another program could get its number, and be reopened instead.
     """
     master, slave = os.openpty()
     path = os.ttyname(slave)

@@ -1,4 +1,4 @@
-"""A device as a user declares it, for the servers that we did not write."""
+"""A device as a user declares it, for servers by other authors."""
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, Framing
@@ -22,6 +22,6 @@ class Device(Drive):
 
 
 class Mistaken(Device):
-    """The same, with a register that it does not have."""
+    """The same device, with a register that the server lacks."""
 
     absent = reading(300, "A")

@@ -1,4 +1,4 @@
-"""Two clients and their drives on one pair: each hears all the others, and who speaks at once spoils it."""
+"""Two clients and their drives on one pair: each receives all others, and simultaneous frames collide."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from time import sleep
 
 from multidrop.core import set_settings
 
-SLOT = 2e-3  # s; what is said within it is said at once
+SLOT = 2e-3  # s; frames within one slot collide
 
 Collision = Callable[[random.Random, Sequence[bytes]], bytes]
 
 
 def interleaved(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """The characters of both, one of each in turn."""
+    """Return the characters of both in alternation."""
     columns = zip_longest(*chance.sample(said, len(said)))
     return bytes(character for column in columns for character in column if character is not None)
 
 
 def overlaid(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """A 0 wins when both drive the pair: it begins a character, and the bias is weak."""
+    """Return both at once: a 0 wins, because it starts a character and the bias is weak."""
     shorter, longer = sorted(said, key=len)
     at = chance.randint(0, len(longer) - len(shorter))
     middle = bytes(one & other for one, other in zip(shorter, longer[at:], strict=False))
@@ -34,14 +34,14 @@ def overlaid(chance: random.Random, said: Sequence[bytes]) -> bytes:
 
 
 def cut_off(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """One is heard until the other is louder."""
+    """Return the first until the other is louder."""
     first, second = chance.sample(said, 2)
     at = chance.randint(0, len(first))
     return first[:at] + second[chance.randint(0, at) if at else 0 :]
 
 
 def one_after_another(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """Both whole, without a silence between them."""
+    """Return both whole, without a silence between them."""
     return b"".join(chance.sample(said, len(said)))
 
 
@@ -49,10 +49,11 @@ COLLISIONS: Sequence[Collision] = (interleaved, overlaid, cut_off, one_after_ano
 
 
 class SharedPair:
-    """`ours` and `theirs` are the clients' ports; `sent` is what left ours, whatever became of it.
+    """A pair with the clients' ports `ours` and `theirs`; `sent` is what our client sent, before any
+    collision.
 
-    `holds(said)` says whether what our client said is lost, as in a collision that nobody survives, and
-    `says` is what the others are to be heard to say then.
+    If `holds(said)` returns True for our client's bytes, a collision destroys them, and our client receives
+    `says`.
     """
 
     def __init__(self, drives: str, baudrate: int, seed: int) -> None:
@@ -66,7 +67,7 @@ class SharedPair:
             tty.setraw(fd)
         for fd in self._sides:
             os.set_blocking(fd, False)
-        self._spoke = self._our_side  # which client did last
+        self._spoke = self._our_side  # the last client that spoke
         self.sent = b""
         self.collisions = 0
         self.holds: Callable[[bytes], bool] = lambda said: False
@@ -93,7 +94,7 @@ class SharedPair:
                 self._exchange({fd: said for fd in self._sides if (said := _read(fd))})
 
     def _exchange(self, said: dict[int, bytes]) -> None:
-        """Everyone hears what the others said in this slot, as it was spoilt."""
+        """Deliver this slot's frames to all others, with their collision."""
         ours = said.get(self._our_side)
         if ours:
             self.sent += ours
@@ -104,7 +105,7 @@ class SharedPair:
         self._spoke = next((side for side in self._sides[:2] if side in said), self._spoke)
         for listener in sorted(self._sides, key=lambda side: side == self._spoke):
             if listener == self._spoke and self._drives in said:
-                sleep(SLOT)  # a pty is slow: who is answered may act before the other has heard the answer
+                sleep(SLOT)  # ptys are slow: else the sender acts before the other client hears the reply
             others = [each for speaker, each in said.items() if speaker != listener]
             received = self._mixed(others)
             if received:

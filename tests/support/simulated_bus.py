@@ -1,4 +1,4 @@
-"""A bus whose line is simulated drives in this very thread, at a time that only the test lets pass."""
+"""A bus whose line is simulated drives in the same thread, at simulated time."""
 
 from __future__ import annotations
 
@@ -29,34 +29,34 @@ EXCHANGE_TIME = 0.02  # s
 TIMEOUT = 0.3
 
 READING = {1, 2, 3, 4}
-QUERYING = {3, 7}  # of Delixi's own protocol
+QUERYING = {3, 7}  # functions of Delixi's own protocol that read
 
 
 def text(frame: bytes) -> str:
-    """Return the frame as documents print it."""
+    """Return the frame in the documents' notation."""
     return frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
 
 
 class SimulatedBus:
-    """Drives that are simulated, and a bus to them; every frame that was sent is kept.
+    """Simulated drives and a bus to them; every sent frame is recorded.
 
-    `loses(request)` says whether the reply to it is lost, `deafens(request)` whether it never arrives.
+    `loses(request)` returns True to lose the reply, `deafens(request)` to lose the request.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *sims: SimulatedDrive, **details: Any) -> None:
         self.sims = sims
         self.seconds = 1000.0
-        self.slept = 0.0  # s; the machine, and with it CLOCK_MONOTONIC
+        self.slept = 0.0  # s; suspend time, which CLOCK_MONOTONIC does not count
         self.frames: list[tuple[Message, str]] = []
         self.loses: Callable[[Message], bool] = lambda request: False
         self.deafens: Callable[[Message], bool] = lambda request: False
-        self.answers: Callable[[Message], bytes | None] = lambda request: None  # instead of the drives
-        self.queue_time = 0.0  # until an exchange's turn comes
+        self.answers: Callable[[Message], bytes | None] = lambda request: None  # replaces the drives' replies
+        self.queue_time = 0.0  # s until an exchange's turn
         self.queue = object()  # the open port
         self.has_echo = False
         self.port = self.identity = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
-        monkeypatch.setattr(peers, "_former", {})  # they are another clock's
+        monkeypatch.setattr(peers, "_former", {})  # earlier peers belong to another clock
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
         monkeypatch.setattr(clock, "boottime_ns", lambda: round((self.seconds + self.slept) * 1e9))
@@ -68,7 +68,7 @@ class SimulatedBus:
 
     is_lost = is_tcp = False
     why_closing = ""
-    may_send = True  # it has no mastership
+    may_send = True  # has no mastership
 
     def open(self) -> SimulatedBus:
         return self
@@ -77,7 +77,7 @@ class SimulatedBus:
         pass
 
     def regain(self) -> None:
-        """Whatever stands in the way of that is the test's."""
+        """Reopen the port; tests replace this with failures."""
 
     def overruns(self) -> None:
         return None
@@ -124,7 +124,7 @@ class SimulatedBus:
         return self._completion(used or int(Failure.CUT_SHORT), message, reply, exchange.values)
 
     def _note_answer(self, exchange: Exchange) -> None:
-        """Note when the drive was heard, as the core does."""
+        """Record the time of a reply as the core does."""
         drive, at_ns = exchange.c.drive, round(self.seconds * 1e9)
         if drive.answered_ns and at_ns - drive.answered_ns >= PAUSE_NS:
             drive.history.pauses += 1
@@ -141,12 +141,12 @@ class SimulatedBus:
 
     @property
     def written(self) -> list[str]:
-        """The frames that were no reads."""
+        """Return the frames that are not reads."""
         return [frame for request, frame in self.frames if is_write(request)]
 
 
 def is_write(request: Message) -> bool:
-    if len(request.data) == 4:  # Delixi's own
+    if len(request.data) == 4:  # Delixi's own protocol
         return request.function not in QUERYING
     return request.function not in READING
 
@@ -154,7 +154,7 @@ def is_write(request: Message) -> bool:
 def one(
     monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any
 ) -> tuple[SimulatedBus, Any, MotorDrive]:
-    """Return a simulated bus, and its one drive with its simulation."""
+    """Return a simulated bus, and its only drive with its simulation."""
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
     bus = SimulatedBus(monkeypatch, sim, **details)

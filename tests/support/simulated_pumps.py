@@ -1,7 +1,7 @@
-"""A simulated plant of pumps on several lines, in a process of its own, which notes each drive's stop.
+"""A simulated plant of pumps on several lines in another process, which records each drive's stop.
 
-The pumps have Delta's words and ten readings side by side, at 115200 bit/s: one request reads all ten. Their
-lines are sockets: what goes through a pty waits for a thread of the kernel, which a busy machine holds up.
+The pumps have Delta's words and ten adjacent readings at 115200 bit/s: one request reads all ten. Their lines
+are sockets, because a pty depends on a kernel thread, which a busy machine delays.
 """
 
 from __future__ import annotations
@@ -69,19 +69,19 @@ POLLED = (
     "heatsink_temperature",
 )
 FIRST_READING, UNPOLLED = 0x2100, 0x0900  # addresses
-RAMP_S = 0.2  # of a motor that stops: short, for a stop's answer waits for it
+RAMP_S = 0.2  # deceleration time, short because a stop's answer waits for it
 WAVE_S = 0.1  # between changes of load and speed
 
 
 def free_ports(count: int) -> list[int]:
-    """Return TCP ports that nobody listens on."""
+    """Return free TCP ports."""
     with ExitStack() as stack:
         found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
         return [one.getsockname()[1] for one in found]
 
 
 def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str = "100 ms") -> Path:
-    """Write a plant file of so many drives on each line, with this table `[serve]`; return its path."""
+    """Write a plant file with this many drives on each line and this table `[serve]`; return its path."""
     (folder / "pump.toml").write_text(FAMILY)
     tables, number = [], 0
     for line, (count, port) in enumerate(zip(drives, free_ports(len(drives)), strict=True), 1):
@@ -98,7 +98,7 @@ def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str
 
 
 class SimulatedPumps:
-    """The running process, as its parent sees it."""
+    """The simulator process, seen from its parent."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -114,26 +114,26 @@ class SimulatedPumps:
         return json.loads(self._process.stdout.readline())
 
     def run(self) -> None:
-        """Let all motors run, and forget all stops."""
+        """Start all motors and forget all stops."""
         self._ask("run")
 
     def late_s(self) -> float:
-        """Return the longest time, since the last call, for which the process stood still."""
+        """Return the longest suspension (s) of the process since the last call."""
         return float(self._ask("late"))
 
     def stops(self) -> dict[str, tuple[float | None, bool]]:
-        """Return for each drive when the first frame of a stop had come, in s of CLOCK_MONOTONIC.
+        """Return for each drive the time (CLOCK_MONOTONIC, s) of a stop's first frame.
 
-        And True where its motor turns, or is to turn.
+        The second value is True if its motor turns or is commanded to.
         """
         return {name: (at, turns) for name, (at, turns) in self._ask("stops").items()}
 
 
 @contextmanager
 def simulated_pumps(plant: Path, *before: str) -> Iterator[SimulatedPumps]:
-    """Simulate the drives of a plant file in a process of its own, which ends with this context.
+    """Simulate the drives of a plant file in another process until the context ends.
 
-    `before` are words that the command begins with, such as `nice`.
+    `before` are words in front of the command, such as `nice`.
     """
     words = [*before, sys.executable, __file__, str(plant)]
     with BoundProcess(

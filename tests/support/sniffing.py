@@ -1,4 +1,4 @@
-"""`multidrop sniff` in a process of its own."""
+"""Run `multidrop sniff` in another process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lines import until
 
 
 class Sniffer:
-    """`multidrop sniff` under way; its objects are there when the block is left."""
+    """A running `multidrop sniff`; its objects are complete when the block ends."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.told: list[dict[str, Any]] = []
@@ -36,7 +36,7 @@ class Sniffer:
         return dict(self.told[-1]["summary"])
 
 
-# Where each request has its reply: on a busy machine that may come after the seconds that a master waits.
+# Checks the pairing of replies: on a busy machine they may come after the master's timeout.
 PATIENT = """
 import sys
 from multidrop.cli import main
@@ -69,7 +69,7 @@ def sniffing(port: str, *words: object, patient: bool = False) -> Iterator[Sniff
 
 
 def unread(port: str) -> int:
-    """Return the number of bytes that wait for the listener."""
+    """Return the number of bytes that the listener has not read."""
     count = array.array("i", [0])
     fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
     try:

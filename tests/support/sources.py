@@ -1,4 +1,4 @@
-"""The project's own text, parsed once: for the tests that keep its rules."""
+"""The project's sources, parsed once, for tests of its rules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BUILT = {"_build", "__pycache__", "corpus"}
 
 
 def files(*rooms: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:
-    """Return these rooms' files of these kinds, without what a build leaves there."""
+    """Return the files of these rooms with these suffixes, except build products."""
     return [
         path
         for room in rooms
@@ -34,13 +34,13 @@ def place(path: Path, line: int) -> str:
 
 
 def run_time_imports(path: Path) -> set[str]:
-    """Return the modules that a file imports when it runs, in functions too."""
+    """Return the modules that a file imports at run time, in functions too."""
     at_run_time, for_types = _imports(path)
     return at_run_time - for_types
 
 
 def type_imports(path: Path) -> set[str]:
-    """Return the modules that a file imports for its annotations alone."""
+    """Return the modules that a file imports only for annotations."""
     return _imports(path)[1]
 
 
@@ -58,7 +58,7 @@ def _imports(path: Path) -> tuple[set[str], set[str]]:
 
 
 def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Yield imports with a mark of those that only a type checker sees; they are never in an expression."""
+    """Yield each import with True if only a type checker sees it; expressions have none."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import | ast.ImportFrom):
             yield child, for_types
@@ -81,7 +81,7 @@ def loop_variables(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def comments(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield each comment of a C file with its line; lines of // one below the other are one comment."""
+    """Yield each comment of a C file with its line; consecutive // lines are one comment."""
     before = -1
     text = path.read_text("utf-8")
     for match in re.finditer(r"/\*+(.*?)\*/|//+([^\n]*)", text, re.DOTALL):

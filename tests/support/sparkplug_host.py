@@ -1,4 +1,4 @@
-"""A Sparkplug host: it decodes what a node says by the messages' own definitions, and commands it."""
+"""A Sparkplug host that decodes a node's messages by their definitions, and sends it commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOT = "spBv1.0/works/{}/line"
 
 
 class Host:
-    """A host: it checks that the sequence numbers of a node go up by one."""
+    """A host that checks that a node's sequence numbers increase by one."""
 
     def __init__(self, broker: Broker) -> None:
         self._listener = Listener(broker, "spBv1.0/#")

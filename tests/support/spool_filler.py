@@ -1,6 +1,6 @@
 """Fill a spool until killed: `python spool_filler.py FOLDER FIRST`.
 
-Each line of its output is the number of exchanges, from FIRST on, of which it was told that they are stored.
+Each output line is the number of exchanges, from FIRST on, that are stored.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from spooled import numbered
 
 from multidrop.fleet.samples.spool import Spool
 
-EXCHANGES = 20  # of a batch
+EXCHANGES = 20  # per batch
 
 
 def main(folder: Path, first: int) -> None:

@@ -1,4 +1,4 @@
-"""Batches of a plant, and what a spool or a stream has of them."""
+"""Batches of a plant, and their rows in a spool or a stream."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NOON = 1_795_262_400_000_000_000  # 2026-11-21 12:00 UTC
 STEP = 10_000_000  # ns between requests
 DRIVES = Names([f"pump-{number}" for number in range(1, 5)])
 REGISTERS = Names([f"value_{number}" for number in range(1, 11)])
-MISSED = 9  # the rest of numbers whose request was not answered, modulo 10
+MISSED = 9  # exchanges with this remainder modulo 10 are misses
 
 
 def numbered(first: int, count: int, drives: Names = DRIVES) -> Batch:
@@ -52,7 +52,7 @@ def rows_of(table: Any) -> list[tuple[Any, ...]]:
     )
 
 
-@lru_cache(maxsize=16)  # tests that damage one file look at the others again and again
+@lru_cache(maxsize=16)  # tests that damage one file read the others repeatedly
 def _rows_of_file(data: bytes) -> list[tuple[Any, ...]]:
     return rows_of(unpack(data))
 
@@ -67,7 +67,7 @@ def rows_in(folder: Path) -> list[tuple[Any, ...]]:
 
 
 def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
-    """Return the numbers of the exchanges, each of which has all its rows."""
+    """Return the numbers of the exchanges; fail unless each has all its rows."""
     found = [row[1] // STEP for row in rows]
     assert found == [number for number in found[::10] for _ in range(10)]
     return found[::10]

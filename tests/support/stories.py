@@ -1,4 +1,4 @@
-"""A line in health, under a fault, and afterwards, on a clock of its own."""
+"""Run a line without faults, under a fault, and afterwards, on a simulated clock."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, simulated
 
 S = 1_000_000_000
-REGISTERS = 5  # of each drive
-EVERY = 0.5  # s, of the first of them; the others as fast as the line allows
+REGISTERS = 5  # per drive
+EVERY = 0.5  # s, for the first register; the others as fast as possible
 HEALTHY, FAULTY = 4.0, 8.0  # s
-CYCLES = 10  # in which the rate must be back, but for what one of them holds
+CYCLES = 10  # within which the rate must recover
 UNASKED = {str(each) for each in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
 
 
 class PieceWire(ClockedWire):
-    """A hostile wire whose bytes come as they do from a serial port, a few at a time."""
+    """A faulty wire whose bytes come in small pieces, as from a serial port."""
 
     chunk = 4e-3
 
 
 class Story:
-    """A line in health, under a fault, and afterwards; all its rows are kept and judged."""
+    """A line before, during and after a fault; all its rows are kept and checked."""
 
     wires: type[ClockedWire] = PieceWire
 
@@ -61,21 +61,21 @@ class Story:
         return self.rows[first:]
 
     def run_motor(self, seconds: float) -> None:
-        """So many seconds, in each of which the motor starts and stops."""
+        """Run for this many seconds, in each of which the motor starts and stops."""
         for _ in range(round(seconds)):
             for command in (START, STOP):
                 self.clocked.command(self.motor, command)
                 self.run(0.5)
 
     def tell(self, faults: Faults) -> None:
-        """Health, the fault, and its end, after which the rate must be back."""
+        """Run before, during and after the fault; check that the rate recovers."""
         with self.clocked:
             cycle = _longest_gap([row for row in self.run(HEALTHY) if row.value is not None])
             healthy = [row for row in self.run(CYCLES * cycle) if row.value is not None]
             self.wire.faults = faults
             self.run_motor(FAULTY)
             self.wire.faults = Faults()
-            self.run(2 * faults.late)  # what is on its way comes
+            self.run(2 * faults.late)  # let delayed replies arrive
             begin = self.back_off_is_over() + round(cycle * S)
             end = begin + round(CYCLES * cycle * S)
             self.run((end - self.clocked.now) / S)
@@ -86,11 +86,11 @@ class Story:
         self.judge()
 
     def back_off_is_over(self) -> int:
-        """Let time pass until every drive was asked again; when that was.
+        """Run until every drive was polled again; return that time.
 
-        It takes until the port is opened again, and silent drives have rested for their share of the line.
+        First the port must reopen and the rests of silent drives end.
         """
-        cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
+        cost = sum(drive.response_timeout for drive in self.drives) / 2  # on average, and rarely more
         longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
         ended = self.clocked.now
@@ -134,7 +134,7 @@ def _polls(drive: Drive, every: float | None) -> PolledDrive:
 
 
 def _longest_gap(rows: Sequence[Row]) -> float:
-    """The bus cycle in s: the longest time between two values of one register."""
+    """Return the bus cycle in s: the longest time between two values of one register."""
     times: dict[tuple[str, str], list[int]] = {}
     for row in rows:
         times.setdefault((row.drive, row.register), []).append(row.monotonic_ns)

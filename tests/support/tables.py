@@ -1,7 +1,7 @@
-"""Tables whose rows need nothing of their own: a test walks them all, and tells of every row that fails.
+"""Table tests: one test runs a function with every row, and reports every row that fails.
 
-A row costs what its check costs. As a test of its own (`pytest.mark.parametrize`) it costs some milliseconds
-more in each process that runs tests. What needs a fixture anew, or may be skipped, stays a test of its own.
+A row costs only its check, while a test (`pytest.mark.parametrize`) costs some milliseconds more in each test
+process. Rows that need their own fixture, or may be skipped, stay tests.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 Test = Callable[..., None]
-FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a row that is skipped proves nothing
+FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # skipping a row is a failure
 
 
 def table(
     names: str | Sequence[str], rows: Iterable[Any], ids: Iterable[object] | None = None
 ) -> Callable[[Test], Test]:
-    """Have a test called with each row, under these names; one that fails is told by its id, or as it is."""
+    """Call a test with each row under these names, and report failing rows by id or value."""
     columns = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
     several = not isinstance(names, str) or len(columns) > 1
     values = [tuple(row) if several else (row,) for row in rows]

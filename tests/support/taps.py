@@ -1,4 +1,4 @@
-"""A line with someone who only listens: what master and drives say is copied to a third port."""
+"""A line with a passive listener: a third port receives what master and drives send."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from multidrop.core import set_settings
 
 @contextmanager
 def tapped(drives: str, baudrate: int, hear: Callable[[bytes], bytes] = bytes) -> Iterator[tuple[str, str]]:
-    """Paths of the master's port and of the listener's; behind `drives` is the port that is mastered.
+    """Give the paths of the master's port and of the listener's; `drives` is the port of the drives.
 
-    `hear` tells what the listener hears of what was said.
+    `hear(said)` returns the bytes that the listener receives for these.
     """
     behind = os.open(drives, os.O_RDWR | os.O_NOCTTY)
     set_settings(behind, baudrate, "8N1")
@@ -45,5 +45,5 @@ def _copy(behind: int, master: int, tap: int, stop: int, hear: Callable[[bytes],
                     return
                 with suppress(OSError):
                     said = os.read(key.fd, 1024)
-                    os.write(tap, hear(said))  # first, so that it hears a request before its reply
+                    os.write(tap, hear(said))  # first, to deliver a request before its reply
                     os.write(master if key.fd == behind else behind, said)

@@ -1,4 +1,4 @@
-"""Commands on a terminal of their own, and what stands on it."""
+"""Commands on their own terminal, and its screen."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from commands import MULTIDROP
 
 
 class Terminal:
-    """A pty on which a command runs, and all that it wrote."""
+    """A pty with a running command, and all its output."""
 
     def __init__(self, words: list[str], size: tuple[int, int], **environment: str) -> None:
         self.fd, slave = pty.openpty()
@@ -54,13 +54,13 @@ class Terminal:
 
 
 class ClosingTerminal(Terminal):
-    """The terminal of a session of its own, which is hung up when it is closed."""
+    """A terminal of a separate session, which gets SIGHUP when it closes."""
 
     def _begin(self, words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
         slave = self.slave
 
         def take_terminal() -> None:
-            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were begun with
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # restores the default
             fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
 
         process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""A family that no document describes, as a user would declare one: for tests of what is common to all."""
+"""An undocumented family as a user would declare it, for tests of all families' common behaviour."""
 
 from enum import IntEnum, IntFlag
 
@@ -45,7 +45,7 @@ class Toy(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Take it for a toy: there is nothing else on a test's line."""
+        """Accept any drive: a test's line has only toys."""
         yield from ()
 
     @verb
@@ -72,13 +72,13 @@ class Toy(Drive):
 
 
 class PatientToy(Toy):
-    """One that is waited for however busy the machine is, and however soon it answered before."""
+    """A toy with long timeouts for busy machines, even if it answered fast before."""
 
     response_timeout = 60.0
-    response_delay = 15.0  # a learnt time-out is never less than four of them
+    response_delay = 15.0  # a learned timeout is at least four times this
 
 
 class Unsure(Toy):
-    """It cannot tell its drives from others."""
+    """A toy that cannot identify its drives."""
 
     identify = Drive.identify

@@ -7,7 +7,7 @@ from multidrop.drive import Drive
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Wire
 
-VARIANTS = (  # family, framing, baud rate of the fast line
+VARIANTS = (  # family, framing, and baud rate of the fast line
     (ErmanERG220, Framing.RTU, 1_000_000),
     (InvtCHE, Framing.RTU, 500_000),
     (InnovertIBD, Framing.RTU, 500_000),
@@ -18,7 +18,7 @@ VARIANTS = (  # family, framing, baud rate of the fast line
     (YD1000, Framing.RTU, 1_000_000),
 )
 REASONS = {str(each) for each in Status} - {str(Status.OK)}
-TIMEOUT = 0.02  # s: the shortest there is, which drives that mostly answer at once come to have
+TIMEOUT = 0.02  # s, the minimum, which drives reach that mostly answer at once
 LATEST = 3 * TIMEOUT
 
 
@@ -30,7 +30,7 @@ def real_drives() -> list[Drive]:
 
 
 def fast_drives() -> list[Drive]:
-    """The same, on a line where characters and silences take next to no time."""
+    """Return the same drives on a line with almost no character and silence times."""
     return [
         type(family.__name__, (family,), {"baudrates": (baudrate,), "needed_silence": lambda drive: 0.0})(
             address, name=f"{family.model} {framing}", framing=framing
@@ -44,7 +44,7 @@ def real_wires() -> list[Wire]:
 
 
 def of_one_variant(number: int) -> list[Drive]:
-    """Two drives of one family and framing."""
+    """Return two drives of one family and framing."""
     family, framing, _ = VARIANTS[number]
     return [family(address, name=f"drive-{address}", framing=framing) for address in (1, 2)]
 

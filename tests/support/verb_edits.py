@@ -1,7 +1,6 @@
-"""Edits of documents with verbs: one at a time, each with a name, everywhere where it can be made.
+"""Edits of documents with verbs: one at a time, each with a name, at every possible place.
 
-Addresses, and the numbers of bits and values, are left as they are: that these are the manual's, only the
-manual can tell.
+Addresses and the numbers of bits and values stay, because only the manual can verify them.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Path = tuple[str | int, ...]
 
 class Edit(NamedTuple):
     name: str
-    document: Callable[[], Document]  # makes it, each time anew: most edits are only counted
+    document: Callable[[], Document]  # creates it on demand: most edits are only counted
 
 
 def at(document: Any, path: Path) -> Any:
@@ -27,7 +26,7 @@ def at(document: Any, path: Path) -> Any:
 
 
 def edited(document: Document, path: Path, change: Callable[[Any, Any], None]) -> Document:
-    """Return a copy in which `change(parent, key)` was called for the place."""
+    """Return a copy on which `change(parent, key)` was called for this place."""
     made = copy.deepcopy(document)
     change(at(made, path[:-1]), path[-1])
     return made
@@ -59,7 +58,7 @@ def shown(path: Path) -> str:
 
 
 def steps_of(document: Document) -> Iterator[Path]:
-    """Yield the paths of all steps, also of those in an else."""
+    """Yield the paths of all steps, including those in else branches."""
     for verb, table in document["verb"].items():
         for number, step in enumerate(table["steps"]):
             yield ("verb", verb, "steps", number)
@@ -74,7 +73,7 @@ def words_of(value: Any) -> list[Any]:
 
 
 def all_words(document: Document) -> list[Any]:
-    """Return each word that any verb sends, once."""
+    """Return every word that any verb sends, once each."""
     found: list[Any] = []
     for path in steps_of(document):
         for word in words_of(at(document, path).get("value", ())):

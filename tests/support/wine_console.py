@@ -1,4 +1,4 @@
-"""Programs for Windows by Wine, each on a terminal of its own, which is its console."""
+"""Run Windows programs with Wine, each on a pty as its console."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PATIENCE_S = 300.0  # a busy machine takes a minute to begin Python by Wine
-SIZE = 50, 400  # rows and columns: no sentence is broken
+PATIENCE_S = 300.0  # a busy machine needs a minute to start Python in Wine
+SIZE = 50, 400  # rows and columns: no sentence wraps
 NOWHERE = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
 ESCAPES = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|\][^\x07]*\x07)")
 
 
 class Console:
-    """A program of Windows, and what it has said on its console."""
+    """A Windows program and its console output."""
 
     def __init__(self, folder: Path, words: list[str], environment: dict[str, str]) -> None:
         self._heard = b""
@@ -32,11 +32,11 @@ class Console:
             os.execvpe("wine", ["wine", str(folder / "python" / "python.exe"), *words], environment)
 
     def _hear(self) -> None:
-        """Take in what has been said: a program whose terminal is full waits."""
+        """Read the output: a program whose terminal is full would block."""
         while select.select([self._terminal], [], [], 0.01)[0]:
             try:
                 self._heard += os.read(self._terminal, 4096)
-            except OSError:  # a terminal's end
+            except OSError:  # end of the terminal
                 time.sleep(0.01)
                 return
 
@@ -52,7 +52,7 @@ class Console:
         return self._status is not None
 
     def until(self, met: Callable[[], object]) -> None:
-        """Wait for this."""
+        """Wait for a condition."""
         end = time.monotonic() + PATIENCE_S
         while not met():
             self._hear()
@@ -65,13 +65,13 @@ class Console:
         os.write(self._terminal, b"\x03")
 
     def status(self) -> int:
-        """Wait for its end, and return its status."""
+        """Wait for the program's end; return its exit status."""
         self.until(lambda: self.is_over)
         assert self._status is not None
         return self._status
 
     def kill(self) -> None:
-        """End it as `kill -9` does."""
+        """Kill the program like `kill -9`."""
         if not self.is_over:
             os.kill(self._pid, signal.SIGKILL)
             self.status()
@@ -101,13 +101,13 @@ class Wine:
         return str(self._port(name).readlink())
 
     def link(self, name: str, terminal: str) -> None:
-        """Make a terminal the COM port of this name."""
+        """Assign a terminal to the COM port of this name."""
         port = self._port(name)
         port.unlink(missing_ok=True)
         port.symlink_to(terminal)
 
     def begin(self) -> None:
-        """Begin its services, which keep what they inherit: a pipe would never end."""
+        """Start Wine's services without pipes, because services inherit them and keep them open."""
         line = ["wine", str(self.folder / "python" / "python.exe"), "-c", ""]
         subprocess.run(line, env=self.environment, check=True, timeout=PATIENCE_S, **NOWHERE)
 
@@ -118,7 +118,7 @@ class Wine:
         return subprocess.run(line, env=self.environment, check=False, timeout=PATIENCE_S, **pipes)
 
     def type_line(self, line: str, folder: Path) -> int:
-        """Type this to Windows' own shell, after Python's name, and return the status."""
+        """Type this after Python's name in the Windows shell; return the exit status."""
         typed = folder / "typed.bat"
         program = f"Z:{self.folder}/python/python.exe".replace("/", "\\")
         typed.write_text(f"@{program} {line}\r\n", "ascii")
@@ -130,7 +130,7 @@ class Wine:
 
     @contextmanager
     def console(self, *words: object) -> Iterator[Console]:
-        """Begin Python on a console."""
+        """Start Python on a console."""
         console = Console(self.folder, list(map(str, words)), self.environment)
         try:
             yield console

@@ -17,7 +17,7 @@ class Own(Drive):
 
 
 def timeline(wire: Wire, until: float) -> list[tuple[float, bytes]]:
-    """Every piece that the client hears, at the wake that brings it."""
+    """Return every piece that the client receives, with its time."""
     received = []
     for _ in range(10_000):
         wake = wire.wake

@@ -1,4 +1,4 @@
-"""A plugin: test as where pandas, polars and DuckDB are not installed.
+"""A pytest plugin that hides pandas, polars and DuckDB.
 
 `PYTHONPATH=tests/support pytest -p without`
 """
@@ -14,7 +14,7 @@ _find_spec = importlib.util.find_spec
 
 
 class Hiding:
-    """A finder that finds that they are not there."""
+    """An import finder that does not find them."""
 
     @staticmethod
     def find_spec(name: str, *place: object) -> None:

@@ -1,9 +1,9 @@
-/* A client that we did not write: libmodbus asks a server on 127.0.0.1, whose port is the argument.
+/* A client by another author: libmodbus reads a server on 127.0.0.1; the argument is its port.
  *
- * A line of standard input is a request, a line of standard output what came of it:
- *   "UNIT FUNCTION START COUNT"   reads by 1, 2, 3 or 4: "words W W W", or bits
+ * Each line of standard input is a request, each line of standard output its result:
+ *   "UNIT FUNCTION START COUNT"   function 1 to 4: "words W W W", or bits
  *   "UNIT 5|6|16 START VALUE"     writes one coil or register: "written"
- * or "error N", with the exception's code where it is one, else -1. */
+ * or "error N" with the exception code, or -1 for other errors. */
 #include <errno.h>
 #include <modbus.h>
 #include <stdint.h>

@@ -1,8 +1,7 @@
-/* A driver of serial ports with RTS, for a library put before the system's: pseudo-terminals have none. What
- * it is told of RTS, and what is written to a port that has been told, stands line by line in the file
- * RS485_LOG: time in ns, what, how many bytes. A UART tells when its last bit has left, at
- * RS485_CHARACTER_NS each. After RS485_CALLS calls RTS is broken; 0: there is none. RS485_FLAGS: it has an
- * RS-485 mode of its own, with these flags. */
+/* Simulates RTS and RS-485 modes on pseudo-terminals, which have neither; used with LD_PRELOAD.
+ * The file RS485_LOG has a line for each RTS change and for each later write: time in ns, kind, bytes.
+ * The simulated UART is empty RS485_CHARACTER_NS per byte after a write. RTS fails after RS485_CALLS
+ * calls; 0: the port has no RTS. With RS485_FLAGS the driver has its own RS-485 mode, with these flags. */
 #define _GNU_SOURCE
 #include <asm/ioctls.h>
 #include <errno.h>
@@ -85,7 +84,7 @@ int ioctl(int fd, unsigned long request, ...)
     if (request == TIOCGRS485 || request == TIOCSRS485)
         return own_mode(request, argument);
     if (request == TIOCMBIS || request == TIOCMBIC)
-        return 0; /* DTR: pyserial gives up RTS where it is refused */
+        return 0; /* DTR: if it fails, pyserial does not set RTS */
     if (request == TIOCSERGETLSR) {
         *(unsigned *)argument = now_ns() >= end_ns ? TIOCSER_TEMT : 0;
         return 0;

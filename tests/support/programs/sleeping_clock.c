@@ -1,5 +1,5 @@
-/* Clocks of a machine that has slept for eight hours once the file SLEPT is there: CLOCK_MONOTONIC stood
- * still meanwhile. For a library that is put before the system's. */
+/* Simulates eight hours of suspend as soon as the file SLEPT exists: all clocks but CLOCK_MONOTONIC
+ * advance. Used with LD_PRELOAD. */
 #define _GNU_SOURCE
 #include <stdlib.h>
 #include <sys/syscall.h>

@@ -1,5 +1,5 @@
-/* A server that we did not write: libmodbus answers at ADDRESS on PORT (9600 8N1) until killed.
- * Holding register n and input register n hold 1000 + n at first, coil n is n % 2.
+/* A server by another author: libmodbus answers at ADDRESS on PORT (9600 8N1) until killed.
+ * Holding register n and input register n start as 1000 + n, coil n as n % 2.
  * Usage: libmodbus_server PORT ADDRESS */
 #include <errno.h>
 #include <modbus.h>

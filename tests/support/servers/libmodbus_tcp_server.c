@@ -1,5 +1,5 @@
-/* A server that we did not write: libmodbus answers over Modbus TCP, whatever the unit, until killed.
- * Registers and coils are those of libmodbus_server.c. Its port is any free one, said as "ready PORT". */
+/* A server by another author: libmodbus answers every unit over Modbus TCP until killed.
+ * Registers and coils are those of libmodbus_server.c. It prints its free port as "ready PORT". */
 #include <arpa/inet.h>
 #include <errno.h>
 #include <modbus.h>

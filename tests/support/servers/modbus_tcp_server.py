@@ -1,6 +1,6 @@
-"""A server that we did not write: pymodbus answers at ADDRESS over Modbus TCP until killed.
+"""A server by another author: pymodbus answers at ADDRESS over Modbus TCP until killed.
 
-Registers and coils are those of pymodbus_server.py. Its port is any free one, said as "ready PORT".
+Registers and coils are those of pymodbus_server.py. It prints its port, a free one, as "ready PORT".
 Usage: modbus_tcp_server.py ADDRESS
 """
 
@@ -13,7 +13,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 
 async def silent(*_: object) -> None:
-    """Make pymodbus leave requests to other units unanswered."""
+    """Make pymodbus ignore requests to other units."""
     raise NoSuchIdException("not here")
 
 

@@ -1,8 +1,8 @@
-"""A meter that we did not write: pymodbus answers at ADDRESS on PORT (9600 8N1) until killed.
+"""A meter by another author: pymodbus answers at ADDRESS on PORT (9600 8N1) until killed.
 
-VALUES is a file of JSON with its floats by the address of their input register, and its serial number, at
-holding register FC00H. pymodbus makes the words of both. Addresses that are not in it hold 0 up to 17FH, as
-in the meter; with `refusing` they are refused.
+VALUES is a JSON file with its floats by input register address, and its serial number at holding register
+FC00H. pymodbus converts both to words. Other addresses up to 17FH hold 0, as in the meter; with `refusing`
+they are rejected.
 Usage: pymodbus_meter.py PORT ADDRESS VALUES [refusing]
 """
 

@@ -1,6 +1,6 @@
-"""A server that we did not write: pymodbus answers at ADDRESS on PORT (9600 8N1) until killed.
+"""A server by another author: pymodbus answers at ADDRESS on PORT (9600 8N1) until killed.
 
-Holding register n and input register n hold 1000 + n at first, coil n is n % 2.
+Holding register n and input register n start as 1000 + n, coil n as n % 2.
 Usage: pymodbus_server.py PORT ADDRESS rtu|ascii
 """
 
@@ -14,7 +14,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 
 async def silent(*_: object) -> None:
-    """Make pymodbus leave requests to other addresses unanswered."""
+    """Make pymodbus ignore requests to other addresses."""
     raise NoSuchIdException("not here")
 
 
