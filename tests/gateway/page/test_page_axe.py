@@ -122,7 +122,7 @@ def test_axe_finds_nothing_in_rare_states(
     gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
     page.reload()
     page.evaluate(axe)
-    page.get_by_text("1 drive, no fault known").wait_for()
+    page.get_by_text("1 drive, no known fault").wait_for()
     look("one drive")
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
