@@ -107,7 +107,7 @@ def test_the_plan_of_its_39_floats_at_9600(
 
 
 @pytest.mark.parametrize(
-    ("stated", "most"), [(True, "80 at most"), (False, "125 at most, as the standard has it")]
+    ("stated", "most"), [(True, "at most 80"), (False, "at most 125, the standard's limit")]
 )
 def test_models_says_how_many_registers_one_request_reads(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, most: str

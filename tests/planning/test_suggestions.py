@@ -106,12 +106,14 @@ def test_plan_and_models_say_it_of_a_user_s_own_class_alone(
     main(["models", f"{SUPPORT / 'meter.py'}:Meter"])
     told = " ".join(capsys.readouterr().out.split())
     assert "reading all readings in 5 requests with readable_gaps" in told
-    assert "read 04H, 125 at most, as the standard has it: the family states no limit" in told
+    assert "read 04H, at most 125, the standard's limit: the family states none" in told
     for model in (*MODELS, *SHIPPED):
         main(["models", model])
         told = " ".join(capsys.readouterr().out.split())
         assert "readable_gaps" not in told
-        assert "states no limit" not in told or model in SHIPPED  # not all of their documents state one
+        assert (
+            "the family states none" not in told or model in SHIPPED
+        )  # not all of their documents state one
 
 
 def test_a_group_and_an_interval_are_facts_of_a_family(
