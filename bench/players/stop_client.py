@@ -14,7 +14,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from own_fan import Fan
+from own_drives import Fan
 from responder_drives import KINDS
 
 from multidrop.bus import Bus

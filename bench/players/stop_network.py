@@ -15,7 +15,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from network_changes import changing_network
+from namespaces import changing_network
 from responder import Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 

@@ -30,8 +30,16 @@ def main() -> None:
     parser.add_argument("--deed", action="append", help="only this one; may be given again")
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT / "tests" / "support"))
-    from fleet_cuts import CUTS, MACHINES, cut, drilled_in_network, drilled_on_machines
-    from fleet_drills import DEEDS, FleetDrill, drilled
+    from fleet_drills import (
+        CUTS,
+        DEEDS,
+        MACHINES,
+        FleetDrill,
+        cut,
+        drilled,
+        drilled_in_network,
+        drilled_on_machines,
+    )
     from namespaces import why_none
 
     tables.heading("How long is a line silent when something of its fleet dies, and do masters overlap?")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
-from own_fan import Fan
+from own_drives import Fan
 from tables import table
 from toy import Status, Toy
 
@@ -25,7 +25,7 @@ from multidrop.sim.wire import Wire
 
 pytestmark = pytest.mark.usefixtures("_turns_awaited")
 
-FAN = f"{Path(__file__).parents[1]}/support/own_fan.py:Fan"
+FAN = f"{Path(__file__).parents[1]}/support/own_drives.py:Fan"
 find_model(FAN)  # says that the file is run, once in a process: not in the midst of a test
 LINE = '[[line]]\nname = "{}"\nport = "{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'

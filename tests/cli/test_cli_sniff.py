@@ -19,8 +19,7 @@ from frames import PRINTED
 from lines import PATIENCE, until
 from recordings import recorded
 from serial_server import SerialServer, pyserials_own
-from sniffing import sniffing
-from taps import tapped
+from sniffing import sniffing, tapped
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.capture.pairing import Pairing

@@ -14,9 +14,8 @@ from typing import Any
 
 import pytest
 from peers import require_module
-from raw_client import opened, receive
-from sniffing import sniffing
-from taps import tapped
+from ptys import opened, receive
+from sniffing import sniffing, tapped
 
 from multidrop.core import FrameSpan, Framing, Kind, Message, Splitter, Stream, build_request, parse_reply
 from multidrop.drive import Drive

@@ -20,7 +20,7 @@ import pytest
 from examples import in_turn
 from interruptions import calling_at, failing_at, interrupted_at
 from motors import MAKE
-from own_fan import Fan
+from own_drives import Fan
 from profile_families import ALL
 from simulated_bus import SimulatedBus, is_write, one
 

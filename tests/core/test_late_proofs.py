@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 from frames import words
-from line_driver import MS, LineDriver
-from line_exchanges import LONGER, OTHER, READ, WRITE, ask, drive, exchange, line, reply
+from line_driver import LONGER, MS, OTHER, READ, WRITE, LineDriver, ask, drive, exchange, line, reply
 
 from multidrop.core import Exchange, Failure, Framing, Message, Peer, build_reply
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import pytest
 from frames import words
-from line_driver import MS, LineDriver
-from line_exchanges import (
+from line_driver import (
     CHARACTER,
     LEAST,
     LONGER,
     MOST,
+    MS,
     OTHER,
     READ,
     SILENCE,
     WRITE,
+    LineDriver,
     answer,
     ask,
     drive,

@@ -15,9 +15,8 @@ from frames import words
 from hypothesis import given
 from hypothesis import strategies as st
 from judges import Pymodbus
-from line_driver import MS, LineDriver
-from line_exchanges import CHARACTER, LEAST, MOST, READ, WRITE
-from line_exchanges import exchange as over_rtu
+from line_driver import CHARACTER, LEAST, MOST, MS, READ, WRITE, LineDriver
+from line_driver import exchange as over_rtu
 from tables import table
 
 from multidrop.core import (

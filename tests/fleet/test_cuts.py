@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fleet_cuts import cut, drilled_in_network
-from fleet_drills import FleetDrill
+from fleet_drills import FleetDrill, cut, drilled_in_network
 from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from fleet_cuts import MachineDrill, drilled_on_machines
+from fleet_drills import MachineDrill, drilled_on_machines
 from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]

@@ -148,8 +148,7 @@ def test_the_page_shows_a_real_fleet_and_a_missing_one(fleet: Cluster, tmp_path:
 @pytest.mark.long
 def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
     require_module("nkeys")
-    from secured_clusters import secured_cluster
-    from secured_fleets import multidrop
+    from secured_clusters import multidrop, secured_cluster
 
     plant = written(tmp_path, port="socket://127.0.0.1:4001")
     with secured_cluster(tmp_path / "nats", 1) as servers:
@@ -169,7 +168,7 @@ def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize("user", ["viewer", "commander"])
 def test_the_page_stops_the_fleet_with_a_commanders_key_alone(tmp_path: Path, user: str) -> None:
     require_module("nkeys")
-    from secured_fleets import secured_fleet
+    from secured_clusters import secured_fleet
 
     with secured_fleet(tmp_path / "fleet", 1) as fleet:
         fleet.start("gw-1")

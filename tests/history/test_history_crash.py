@@ -11,11 +11,10 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-import history_recorder
+import histories
 import pytest
 from examples import usually
-from histories import NOON
-from history_recorder import RUN, STEP
+from histories import NOON, RUN, STEP
 from kills import BoundProcess
 
 from multidrop.history.compact import main as compact
@@ -23,12 +22,12 @@ from multidrop.history.folder import listing
 from multidrop.history.history import History
 
 pytest.importorskip("duckdb", reason="needs duckdb")
-SUPPORT = Path(history_recorder.__file__).parent
+SUPPORT = Path(histories.__file__).parent
 
 
 def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
     """Let it record for a while, and kill it; return how many rows it said that it had written."""
-    words = [sys.executable, history_recorder.__file__, str(folder), str(run)]
+    words = [sys.executable, histories.__file__, str(folder), str(run)]
     here = {**os.environ, "PYTHONPATH": str(SUPPORT)}
     with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True) as child:
         assert child.stdout is not None

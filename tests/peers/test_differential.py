@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from damage import BITS, Said, frames
-from differences import LIBMODBUS, PYMODBUS_ASCII, PYMODBUS_RTU, REPLIES, REQUESTS, compare, explain
+from damage import BITS, COIL_VALUES, ECHOES, FUNCTIONS, MOST, READS, Said, data_bytes, frames, request_body
 from judges import UNKNOWN_CODE, Libmodbus, Pymodbus, Understood, Verdict, expected
 
 from multidrop.core import (
@@ -19,6 +19,232 @@ from multidrop.core import (
     parse_reply,
     parse_request,
 )
+
+LIBMODBUS, PYMODBUS_RTU, PYMODBUS_ASCII = "libmodbus", "pymodbus rtu", "pymodbus ascii"
+PYMODBUS = (PYMODBUS_RTU, PYMODBUS_ASCII)
+ALL = (LIBMODBUS, *PYMODBUS)
+
+
+# ---- conditions of the rules ----
+
+
+def count_of(said: Said) -> int:
+    return int.from_bytes(said.body[4:6])
+
+
+def start_of(said: Said) -> int:
+    return int.from_bytes(said.body[2:4])
+
+
+def contradicts_itself(said: Said) -> bool:
+    """Return True for a multiple write whose byte count contradicts its count, or is above the limit."""
+    function, count = said.function, count_of(said)
+    return function in (0x0F, 0x10) and (
+        said.octet(6) != data_bytes(function, count) or count > MOST[function]
+    )
+
+
+def has_other_length(said: Said, length: int) -> bool:
+    return len(said.body) != length
+
+
+def request_length(said: Said) -> int:
+    return 7 + said.octet(6) if said.function in (0x0F, 0x10) else 6
+
+
+def reply_length(said: Said) -> int:
+    if said.function & 0x80:
+        return 3
+    return 3 + said.octet(2) if said.function in READS else 6
+
+
+def is_lower_case(said: Said) -> bool:
+    return said.frame != said.frame.upper()
+
+
+def is_to_another_function(said: Said) -> bool:
+    return said.function & 0x7F != said.request.function
+
+
+def confirms_another_write(said: Said) -> bool:
+    is_write = said.function in (*ECHOES, 0x0F, 0x10)
+    return is_write and said.body[2:6] != request_body(said.request)[2:6]
+
+
+def has_other_data(said: Said) -> bool:
+    asked = data_bytes(said.request.function, said.request.count)
+    return said.function in READS and said.octet(2) != asked
+
+
+# ---- the rules ----
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A known difference: we reject what others accept (stricter), or the reverse (looser), or decode it
+    otherwise.
+    """
+
+    kind: str
+    judges: tuple[str, ...]
+    when: Callable[[Said], bool]
+    reason: str
+
+
+REQUESTS = [
+    Rule(
+        "stricter",
+        ALL,
+        contradicts_itself,
+        "the frame contradicts itself, and what its sender meant is not known: they answer with exception "
+        "03, or carry out a part of it",
+    ),
+    Rule(
+        "stricter",
+        (LIBMODBUS,),
+        lambda said: said.function not in FUNCTIONS or len(said.body) == 2,
+        "it gives unknown functions a length of its own, and answers with exception 01; what has no known "
+        "length cannot be told from noise",
+    ),
+    Rule(
+        "stricter",
+        PYMODBUS,
+        lambda said: bool(said.function & 0x80),
+        "another drive's exception reply, heard on the same line, is no request",
+    ),
+    Rule(
+        "stricter",
+        (PYMODBUS_ASCII,),
+        is_lower_case,
+        "the serial-line guide V1.02 (2.5.2) has the digits 0-9 and A-F, and a flipped bit makes A an a",
+    ),
+    Rule(
+        "stricter",
+        (PYMODBUS_ASCII,),
+        lambda said: said.function not in FUNCTIONS,
+        "no drive of ours has the function, so that we know no length of it",
+    ),
+    Rule(
+        "stricter",
+        (PYMODBUS_ASCII,),
+        lambda said: has_other_length(said, request_length(said)),
+        "the text is longer or shorter than its message: an eight-bit checksum overlooks one damage in 256, "
+        "the length finds it",
+    ),
+    Rule(
+        "looser",
+        (LIBMODBUS,),
+        lambda said: said.function == 0x08,
+        "it has no 08, which ERMAN's drives answer",
+    ),
+    Rule(
+        "looser",
+        (LIBMODBUS,),
+        lambda said: said.octet(0) > 247,
+        "its server cannot have such an address; a parser says what is there, and no drive of ours answers",
+    ),
+    Rule(
+        "looser",
+        PYMODBUS,
+        lambda said: said.function in READS and not 1 <= count_of(said) <= MOST[said.function],
+        "a count that cannot be answered is a good frame: the drive answers it with exception 03",
+    ),
+    Rule(
+        "looser",
+        (PYMODBUS_RTU,),
+        lambda said: said.function == 0x08 and start_of(said) != 0,
+        "a subfunction that it does not know; the drive's side answers it with an exception",
+    ),
+    Rule(
+        "other meaning",
+        PYMODBUS,
+        lambda said: said.function == 0x05 and said.body[4:6] not in COIL_VALUES,
+        "it takes every value but 0 for ON; ours goes to the drive's side as it is, which refuses it",
+    ),
+]
+REPLIES = [
+    Rule(
+        "stricter",
+        ALL,
+        confirms_another_write,
+        "a write confirmed with another address or value was not carried out as it was meant",
+    ),
+    Rule(
+        "stricter",
+        ALL,
+        lambda said: bool(said.function & 0x80) and said.octet(2) == 0,
+        "there is no exception 00",
+    ),
+    Rule(
+        "stricter",
+        PYMODBUS,
+        is_to_another_function,
+        "an answer to another function is a late one, or damaged",
+    ),
+    Rule(
+        "stricter",
+        PYMODBUS,
+        has_other_data,
+        "more or fewer data than were asked for are not the registers that were asked for",
+    ),
+    Rule("stricter", (PYMODBUS_ASCII,), is_lower_case, "as in requests"),
+    Rule(
+        "stricter",
+        (PYMODBUS_ASCII,),
+        lambda said: has_other_length(said, reply_length(said)),
+        "as in requests",
+    ),
+    Rule(
+        "looser",
+        (LIBMODBUS,),
+        lambda said: said.octet(2) > 0x0B,
+        "makes have codes of their own, such as CHE's 12H; it says only that the code is none of its own",
+    ),
+    Rule(
+        "other meaning",
+        PYMODBUS,
+        lambda said: said.request.function == 0x08 and said.function == 0x89,
+        "ERMAN's document (section 8) prints 89H for an exception to 08, where 88H was meant",
+    ),
+]
+
+
+# ---- check the rules ----
+
+
+@dataclass(frozen=True)
+class Difference:
+    said: Said
+    ours: Understood | Verdict
+    theirs: Understood | Verdict
+
+    @property
+    def kind(self) -> str:
+        if isinstance(self.ours, str):
+            return "stricter"
+        return "looser" if isinstance(self.theirs, str) else "other meaning"
+
+
+def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) -> None:
+    """Fail unless every difference has a rule and every rule a difference."""
+    rules = [rule for rule in rules if judge in rule.judges]
+    stale = list(rules)
+    for difference in differences:
+        found = next(
+            (rule for rule in rules if rule.kind == difference.kind and rule.when(difference.said)), None
+        )
+        assert found is not None, f"{judge} differs without a rule ({difference.kind}): {difference}"
+        if found in stale:
+            stale.remove(found)
+    assert not stale, f"{judge} does not differ any more: {[rule.reason for rule in stale]}"
+
+
+def compare(said: Said, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
+    """Return no difference if both reject the frame, or both decode it identically."""
+    if (isinstance(ours, str) and isinstance(theirs, str)) or ours == theirs:
+        return []
+    return [Difference(said, ours, theirs)]
+
 
 NUMBER = 3000  # of frames in each comparison
 RTU, ASCII = Framing.RTU, Framing.ASCII

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from examples import examples
-from leftovers import descriptors, threads
+from kills import descriptors, threads
 from lines import PATIENCE, line, plant, polled, until
 from serial.urlhandler import protocol_socket
 from toy import Toy

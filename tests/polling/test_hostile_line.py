@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
 from examples import usually
-from leftovers import descriptors, threads
+from kills import descriptors, threads
 from lines import polled, rows_of
 from stories import HEALTHY, Story
 from tables import table

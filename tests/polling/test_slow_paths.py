@@ -12,7 +12,7 @@ import pytest
 from examples import every_fourth, usually
 from lines import proof
 from motors import MAKE, ReceivedRequests
-from paths import (
+from stories import (
     TAIL,
     TURNS,
     Delay,

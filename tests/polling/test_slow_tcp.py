@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import pytest
 from examples import every_fourth, usually
 from motors import MAKE, ReceivedRequests
-from paths import (
+from stories import (
     TAIL,
     TURNS,
     Delay,

@@ -9,9 +9,8 @@ from typing import Any
 
 import checksums
 import pytest
-from lines import until
+from lines import timeline, until
 from toy import Toy
-from wire_time import timeline
 
 from multidrop.cli import main
 from multidrop.core import STATUSES, Message, Peer

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import checksums
 import pytest
-from leftovers import descriptors, threads
-from raw_client import PATIENCE, opened, receive
+from kills import descriptors, threads
+from ptys import PATIENCE, opened, receive
 from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings

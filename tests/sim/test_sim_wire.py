@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import checksums
 import pytest
+from lines import Own, timeline
 from tables import table
-from wire_time import Own, timeline
 
 from multidrop.drive import Drive
 from multidrop.families.delixi_modbus import DelixiModbus

@@ -9,9 +9,8 @@ import time
 from typing import Any
 
 import pytest
-from lines import until
+from lines import Own, until
 from toy import Toy
-from wire_time import Own
 
 from multidrop import Bus, NoReply
 from multidrop.sim import EncodedDrive, Simulator, Wire, serve, simulated

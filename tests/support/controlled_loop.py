@@ -1,4 +1,4 @@
-"""An asyncio loop with simulated time: timers take no real time."""
+"""Time that tests set: an asyncio loop whose timers take no real time, and a clock."""
 
 from __future__ import annotations
 
@@ -36,3 +36,13 @@ def run_controlled(main: Coroutine[Any, Any, R]) -> R:
     """Run a coroutine to its end on a loop with simulated time."""
     with asyncio.Runner(loop_factory=ControlledLoop) as runner:
         return runner.run(main)
+
+
+class Clock:
+    """A clock of monotonic seconds."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now

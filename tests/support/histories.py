@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import random
+import sys
+import time
 from collections.abc import Iterable, Sequence
+from itertools import count
 from math import isclose
 from pathlib import Path
 
@@ -11,8 +14,10 @@ from completions import add_miss, add_rows, new_completion
 
 from multidrop.core import Columns, Field, NumberFormat, RowLayout, Status
 from multidrop.core.columns import Names
+from multidrop.history import writer as writer_module
 from multidrop.history.buckets import Buckets
 from multidrop.history.history import History
+from multidrop.history.writer import HistoryWriter
 from multidrop.polling.batch import Batch, Row
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
@@ -97,3 +102,29 @@ def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
             assert isclose(found.mean[number] or 0.0, sum(values) / len(values), rel_tol=1e-9, abs_tol=1e-9)
         else:
             assert (found.least[number], found.mean[number], found.most[number]) == (None, None, None)
+
+
+# ---- a process that records: `python histories.py FOLDER RUN` ----
+
+STEP = SECOND // 100
+RUN = 9 * 3600 * SECOND
+ROWS = 30  # per batch
+
+
+def main(folder: Path, run: int) -> None:
+    """Record into a history until killed; print the number of rows written so far.
+
+    Row `n` of run `r` has the drive `run-r` and was sent at `n * 10 ms` of the monotonic clock; each run
+    starts 9 hours after the previous one.
+    """
+    writer_module.WRITING_S = 0.01
+    names = Names([f"run-{run}"])
+    writer = HistoryWriter(folder, METADATA, rotate=0.25)
+    for number in count():
+        writer.take(batch(names, 0, range(number * ROWS, (number + 1) * ROWS), NOON + run * RUN, STEP))
+        print(writer.state().rows, flush=True)
+        time.sleep(0.005)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))

@@ -1,9 +1,11 @@
-"""Kill the processes of a test."""
+"""Kill the processes of a test; count what a process holds, to find leaks."""
 
 from __future__ import annotations
 
 import subprocess
+import threading
 from collections.abc import Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Any, AnyStr
 
@@ -29,3 +31,12 @@ def kill_all(processes: Iterable[subprocess.Popen[Any]]) -> None:
         process.kill()
     for process in killed:
         process.wait()
+
+
+def descriptors() -> int:
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+def threads() -> int:
+    """Count the threads except the logging thread, which starts with the first entry and stays."""
+    return sum(thread.name != "multidrop log" for thread in threading.enumerate())

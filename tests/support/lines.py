@@ -1,4 +1,4 @@
-"""Simulated lines in another process, and values that prove their register and time."""
+"""Simulated lines in another process or on the test's clock; values that prove register and time."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from multidrop.core import Status
+from multidrop.core import Framing, Status
 from multidrop.drive import Drive
-from multidrop.drive.register import Register
+from multidrop.drive.register import HOLDING, Register, setting
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
@@ -151,3 +151,24 @@ def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:
         for drive in drives
         for poll in drive.polls
     }
+
+
+class Own(Drive):
+    framings = (Framing.RTU, Framing.ASCII)
+    most_registers = {HOLDING: 10}
+    broadcasts = True
+    value = setting(0x01)
+    another = setting(0x02)
+
+
+def timeline(wire: Wire, until: float) -> list[tuple[float, bytes]]:
+    """Return every piece that the client receives, with its time."""
+    received = []
+    for _ in range(10_000):
+        wake = wire.wake
+        if wake is None or wake > until:
+            break
+        piece = wire.advance(wake)
+        if piece:
+            received.append((wake, piece))
+    return received

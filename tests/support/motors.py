@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from own_fan import Fan
+from own_drives import Fan
 
 from multidrop.core import Message
 from multidrop.drive import Drive

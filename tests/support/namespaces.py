@@ -1,16 +1,18 @@
-"""Network namespaces on one bridge, each with an address, whose cables can be cut one way or both ways."""
+"""Network namespaces on one bridge whose cables can be cut; a lock for network changes."""
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
-from network_changes import changing_network
 
 NOBODYS_CARD = "02:00:00:00:00:00"
 BRIDGES_CARD = "02:00:00:00:02:00"
@@ -132,3 +134,27 @@ def why_none() -> str:
     tried = subprocess.run(trial, check=False, capture_output=True, text=True)
     subprocess.run(["ip", "link", "del", trial[3]], check=False, capture_output=True)
     return f"this system makes no network of its own: {tried.stderr.strip()}" if tried.returncode else ""
+
+
+LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}"
+
+
+@contextmanager
+def _locked(how: int) -> Iterator[None]:
+    with LOCK.open("w") as file:
+        fcntl.flock(file, how)
+        yield
+
+
+@contextmanager
+def steady_network() -> Iterator[None]:
+    """Prevent network changes; any number of processes may hold this."""
+    with _locked(fcntl.LOCK_SH):
+        yield
+
+
+@contextmanager
+def changing_network() -> Iterator[None]:
+    """Allow network changes; one process at a time."""
+    with _locked(fcntl.LOCK_EX):
+        yield

@@ -1,13 +1,17 @@
-"""Two ptys joined like serial ports with a null-modem cable."""
+"""Two ptys joined like a null-modem cable, and a client that sends and receives raw bytes."""
 
 from __future__ import annotations
 
 import os
+import select
 import selectors
+import socket
 import threading
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+
+from multidrop.core import set_settings
 
 
 @contextmanager
@@ -38,3 +42,29 @@ def _copy(masters: tuple[int, ...], stop: int) -> None:
                     return
                 with suppress(OSError):
                     os.write(masters[1 - masters.index(key.fd)], os.read(key.fd, 1024))
+
+
+PATIENCE = 60.0  # s to wait for a required reply
+
+
+@contextmanager
+def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
+    """Give a descriptor, opened and configured like a client's."""
+    if path.startswith("socket://"):
+        host, _, port = path.removeprefix("socket://").partition(":")
+        with socket.create_connection((host, int(port))) as client:
+            yield client.fileno()
+        return
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        set_settings(fd, baudrate, "8N1")
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def receive(fd: int, length: int, patience: float = PATIENCE) -> bytes:
+    received = b""
+    while len(received) < length and select.select([fd], [], [], patience)[0]:
+        received += os.read(fd, 1024)
+    return received

@@ -1,4 +1,4 @@
-"""NATS servers with the configuration that `fleet rights` writes, with TLS, in a temporary folder."""
+"""NATS servers and whole fleets with the rights that `fleet rights` writes, with TLS."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nats_clusters import PATIENCE_S, Cluster, Node, begun, server_program
+from fleet_drills import fleet_status
+from kills import kill_all
+from nats_clusters import Cluster, Node, begun, server_program
 from peers import require_program
+from serial_hall import SerialHall
 
 from multidrop.fleet.servers.credentials import connect_options
 from multidrop.fleet.servers.files import ROUTE_PORTS, TlsFiles, write_files
 from multidrop.fleet.servers.rights import STORE
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
+PATIENCE_S = 120.0
 Change = Callable[[str], str]  # edits rights.conf
 
 
@@ -140,3 +145,78 @@ def secured_cluster(
 ) -> Iterator[SecuredCluster]:
     with begun(lambda attempt: SecuredCluster(folder / str(attempt), number, gateways, change)) as running:
         yield running
+
+
+def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command as this user."""
+    return subprocess.run(
+        [sys.executable, "-m", "multidrop", *words],
+        env=servers.environment(user),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    ends = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < ends, what
+        time.sleep(0.1)
+
+
+class SecuredFleet:
+    """Gateways on six lines; each has a folder of its name."""
+
+    def __init__(self, folder: Path, servers: SecuredCluster) -> None:
+        self.servers = servers
+        self.hall = SerialHall(6)
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self._folder = folder
+        (folder / "plant.toml").write_text(self.hall.plant())
+        made = multidrop(servers, "operator", "fleet", "init", str(folder / "plant.toml"))
+        assert made.returncode == 0, made.stderr
+
+    def start(self, name: str, kept: str = "", **environment: str) -> None:
+        """Start a gateway; `kept` names another folder."""
+        kept = kept or name
+        words = ["fleet", "serve", name, "--folder", str(self._folder / kept)]
+        with (self._folder / f"{kept}.log").open("ab") as log:
+            self.running[kept] = subprocess.Popen(
+                [sys.executable, "-m", "multidrop", *words],
+                env={**self.servers.environment(name), **environment},
+                stdout=log,
+                stderr=log,
+            )
+
+    def log(self, kept: str) -> str:
+        return (self._folder / f"{kept}.log").read_text()
+
+    def status(self, user: str = "viewer") -> dict[str, Any]:
+        return fleet_status(self.servers.environment(user))
+
+    def wait_for_polling(self) -> None:
+        until(lambda: self.hall.are_polled(0.5), "all lines are polled")
+
+    def close(self) -> None:
+        kill_all(self.running.values())
+        self.hall.close()
+
+
+@contextmanager
+def secured_fleet(
+    folder: Path,
+    number: int = 3,
+    gateways: Sequence[str] = GATEWAYS,
+    environments: Mapping[str, Mapping[str, str]] | None = None,
+) -> Iterator[SecuredFleet]:
+    """Give a fleet on this many servers, with all gateways started."""
+    with secured_cluster(folder / "nats", number, gateways) as servers:
+        fleet = SecuredFleet(folder, servers)
+        try:
+            for name in gateways:
+                fleet.start(name, **(environments or {}).get(name, {}))
+            yield fleet
+        finally:
+            fleet.close()

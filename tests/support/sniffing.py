@@ -1,4 +1,4 @@
-"""Run `multidrop sniff` in another process."""
+"""`multidrop sniff` in another process, and lines with a passive listener."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import array
 import fcntl
 import json
 import os
+import selectors
 import signal
 import subprocess
 import sys
 import termios
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from commands import MULTIDROP
 from kills import BoundProcess
 from lines import until
+
+from multidrop.core import set_settings
 
 
 class Sniffer:
@@ -77,3 +81,40 @@ def unread(port: str) -> int:
     finally:
         os.close(fd)
     return count[0]
+
+
+@contextmanager
+def tapped(drives: str, baudrate: int, hear: Callable[[bytes], bytes] = bytes) -> Iterator[tuple[str, str]]:
+    """Give the paths of the master's port and of the listener's; `drives` is the port of the drives.
+
+    `hear(said)` returns the bytes that the listener receives for these.
+    """
+    behind = os.open(drives, os.O_RDWR | os.O_NOCTTY)
+    set_settings(behind, baudrate, "8N1")
+    (master, master_port), (tap, tap_port) = os.openpty(), os.openpty()
+    for port in (master_port, tap_port):
+        tty.setraw(port)
+    reader, writer = os.pipe()
+    thread = threading.Thread(target=_copy, args=(behind, master, tap, reader, hear), daemon=True)
+    thread.start()
+    try:
+        yield os.ttyname(master_port), os.ttyname(tap_port)
+    finally:
+        os.write(writer, b"\0")
+        thread.join()
+        for fd in (behind, master, master_port, tap, tap_port, reader, writer):
+            os.close(fd)
+
+
+def _copy(behind: int, master: int, tap: int, stop: int, hear: Callable[[bytes], bytes]) -> None:
+    with selectors.DefaultSelector() as ready:
+        for fd in (behind, master, stop):
+            ready.register(fd, selectors.EVENT_READ)
+        while True:
+            for key, _ in ready.select():
+                if key.fd == stop:
+                    return
+                with suppress(OSError):
+                    said = os.read(key.fd, 1024)
+                    os.write(tap, hear(said))  # first, to deliver a request before its reply
+                    os.write(master if key.fd == behind else behind, said)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ from completions import add_miss, add_rows, new_completion
 
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.fleet.samples.message import unpack
+from multidrop.fleet.samples.spool import Spool
 from multidrop.polling.batch import Batch
 
 NOON = 1_795_262_400_000_000_000  # 2026-11-21 12:00 UTC
@@ -71,3 +75,23 @@ def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
     found = [row[1] // STEP for row in rows]
     assert found == [number for number in found[::10] for _ in range(10)]
     return found[::10]
+
+
+# ---- a process that fills a spool: `python spooled.py FOLDER FIRST` ----
+
+EXCHANGES = 20  # per batch
+
+
+def main(folder: Path, first: int) -> None:
+    """Fill a spool until killed; print the number of exchanges, from `first` on, that are stored."""
+    spool = Spool(folder, "gateway-1")
+    print(0, flush=True)
+    for number in count(1):
+        spool.append(numbered(first + (number - 1) * EXCHANGES, EXCHANGES))
+        if number % 3 == 0 and spool.sync(60.0):
+            print(number * EXCHANGES, flush=True)
+            time.sleep(0.001)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from paths import PathWire, bus_over, constant, read_truly
+from stories import PathWire, bus_over, constant, read_truly
 from tables import table
 from variants import LINES, of_one_variant
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from leftovers import descriptors, threads
+from kills import descriptors, threads
 from lines import PATIENCE, line, plant, polled, rows_of, until
 from serial import Serial
 from serial_server import SerialServer, pyserials_own, vanishing_pty

@@ -21,7 +21,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lines import PATIENCE, until
-from network_changes import changing_network
+from namespaces import changing_network
 from serial import SerialException, rfc2217
 from servers.network_server import END, manager
 from toy import Status, Toy

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from c_programs import ROOT, preloaded
-from leftovers import descriptors, threads
+from kills import descriptors, threads
 from lines import line, plant, polled
 from toy import Toy
 

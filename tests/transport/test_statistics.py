@@ -12,8 +12,7 @@ import pytest
 from checksums import rtu
 from hypothesis import given
 from hypothesis import strategies as st
-from line_driver import MS, LineDriver
-from line_exchanges import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
+from line_driver import CHARACTER, MS, READ, SILENCE, WRITE, LineDriver, answer, ask, drive, line, reply
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
 from multidrop._core import lib

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import spool_filler
+import spooled
 from disks import full_at, read_only_directory
 from examples import usually
 from kills import BoundProcess
@@ -196,10 +196,10 @@ def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch
 def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:
     """Each run has its own numbers; all reported rows are there once, in order, without a gap."""
     dice = random.Random(kills)
-    support = Path(spool_filler.__file__).parents[1]
+    support = Path(spooled.__file__).parents[1]
     told = []
     for run in range(kills):
-        words = [sys.executable, spool_filler.__file__, str(folder), str(run * 1_000_000)]
+        words = [sys.executable, spooled.__file__, str(folder), str(run * 1_000_000)]
         here = {**os.environ, "PYTHONPATH": str(support)}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             assert child.stdout is not None

@@ -22,15 +22,19 @@ require_module("nats")
 require_module("nkeys")
 require_module("pyarrow")
 
-from secured_clusters import (  # noqa: E402
+from secured_clusters import (  # noqa: E402  # noqa: E402
     GATEWAYS,
+    PATIENCE_S,
     SecuredCluster,
+    SecuredFleet,
     SecuredNode,
     certificates,
     in_one_account,
+    multidrop,
     secured_cluster,
+    secured_fleet,
+    until,
 )
-from secured_fleets import PATIENCE_S, SecuredFleet, multidrop, secured_fleet, until  # noqa: E402
 from spooled import numbered  # noqa: E402
 
 from multidrop.fleet.errors import Conflict  # noqa: E402

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from clocks import Clock
+from controlled_loop import Clock
 from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE, until

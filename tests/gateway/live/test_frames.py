@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from clocks import Clock
+from controlled_loop import Clock
 from gateways import written
 from hypothesis import given
 from hypothesis import strategies as st

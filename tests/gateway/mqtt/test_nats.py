@@ -9,11 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import PLAIN_FAN, Broker, Listener, Published, Running, inside, nats, publish
+from brokers import (
+    PLAIN_FAN,
+    ROOT,
+    Broker,
+    Host,
+    Listener,
+    Published,
+    Running,
+    command,
+    inside,
+    nats,
+    publish,
+)
 from lines import until
 from nats_clusters import old_server_program, server_program
 from peers import require_module
-from sparkplug_host import ROOT, Host, command
 
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings

@@ -9,10 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Running, inside, mosquitto, sparkplug_messages, without_fan
+from brokers import (
+    FAN,
+    ROOT,
+    Broker,
+    Host,
+    Running,
+    command,
+    inside,
+    mosquitto,
+    sparkplug_messages,
+    without_fan,
+)
 from peers import require_module
 from profile_families import VfdEl
-from sparkplug_host import ROOT, Host, command
 
 from multidrop import DelixiModbus, Drive, InvtCHE
 from multidrop.gateway.mqtt.broker import Outbox, Publication

@@ -9,7 +9,7 @@ from typing import Any
 import fake_plant
 import pytest
 from fake_gateway import FakeGateway
-from network_changes import steady_network
+from namespaces import steady_network
 from watching import LIVE, PATIENCE_S, SIZES, Opener, missing, until
 
 # The first is the same engine without windows: a test takes a third of the processor time.
