@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import tokenize
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sources import ROOMS, ROOT, comments, files, loop_variables, place
+from sources import ROOMS, ROOT, comments, files, loop_variables, parsed, place
 from tables import table
 
 import multidrop
@@ -15,9 +18,7 @@ import multidrop
 pytestmark = pytest.mark.long
 
 MOST_CHARACTERS = 110
-QUESTIONS = re.compile(r"(What|Whether|Of|As|How|Who|If|Where|When)\b")
 CLASS = re.compile(r"^ *class (\w+)", re.MULTILINE)
-DOCSTRING = re.compile(r'^ *r?"""(.*)', re.MULTILINE)
 TEXT = (".py", ".c", ".h", ".md", ".toml")
 PAGES = [path for path in ROOT.glob("*") if path.suffix in TEXT]
 
@@ -31,26 +32,74 @@ def test_no_class_name_stands_for_two_things() -> None:
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
 
 
-@pytest.mark.parametrize("room", ["src", "tests", "bench"])
-def test_no_docstring_begins_with_a_question(room: str) -> None:
-    """Nor any other text in three quotes that has its line to itself."""
-    found = [
-        f"{path.relative_to(ROOT)}: {begin[1]}"
-        for path in files(room)
-        for begin in DOCSTRING.finditer(path.read_text("utf-8"))
-        if QUESTIONS.match(begin[1])
-    ]
-    assert found == []
+# Constructions that readers stumble over, by what to write instead.
+CONSTRUCTIONS = {
+    "a noun": r"\bwhat (?:is|was|are|were|has|had|it|they|comes|came|leaves|may|must|can|cannot|else)\b",
+    "if or when": r", where |\bwhere (?:it|there|none|that|a|the|no|nothing|they|one|its|all|several)\b",
+    "the one who acts": r"\b(?:nobody|somebody|nothing)\b",
+    "its, or the noun": r"\b(?:of it|of them|of which|of these|of those|of whom)\b",
+    "start": r"\b(?:begin|begins|began|begun|beginning)\b",
+    "is not a": r"\b(?:is|are|was|were|be|as) no (?!longer\b|more\b)[a-z]+",
+    "report or say": r"\b(?:tell|tells|told|telling)\b",
+    "no longer": r"\b(?:any more|no more)\b",
+    "again, during, recently": r"\b(?:anew|amid|lately|meanwhile|in vain|beforehand)\b",
+    "be, or be at rest": r"\b(?:stand|stands|stood) (?!-|by\b)",
+    "check": r"\b(?:a look|looks|looked at|to look at)\b",
+    "the program": r"\b(?:whoever|who asks|who is|who has|he|him|his)\b",
+    "because": r", for (?:it|they|there|that|this|the|a|no|which)\b",
+}
+STUMBLES = re.compile("|".join(CONSTRUCTIONS.values()), re.IGNORECASE)
+MOST_STUMBLES = 6.0  # per 1,000 words of a room's text
+# Rooms whose text is older than this rule, with their present limit. Lower it when you rewrite one.
+OLDER_ROOMS = {"tests": 16.0, "bench": 19.0, "docs": 8.0}
+PROSE_ROOMS = sorted(
+    {path.name for path in (ROOT / "src" / "multidrop").iterdir() if path.is_dir() and path.name[0] != "_"}
+)
 
 
-def test_no_comment_of_a_header_begins_with_a_question() -> None:
-    found = [
-        f"{place(path, line)}: {text.splitlines()[0]}"
-        for path in files("csrc", suffixes=(".h",))
-        for line, text in comments(path)
-        if QUESTIONS.match(text)
-    ]
-    assert found == []
+def python_text(path: Path) -> Iterator[str]:
+    """Yield the docstrings and comments of a Python file."""
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+    with path.open("rb") as source:
+        yield from (
+            token.string for token in tokenize.tokenize(source.readline) if token.type == tokenize.COMMENT
+        )
+
+
+def text_of(path: Path) -> str:
+    if path.suffix == ".py":
+        return "\n".join(python_text(path))
+    if path.suffix == ".md":
+        return re.sub(
+            r"`[^`]*`", "", re.sub(r"^ *```.*?^ *```$", "", path.read_text("utf-8"), flags=re.M | re.S)
+        )
+    return "\n".join(text for _, text in comments(path))
+
+
+def stumbles(paths: list[Path]) -> float:
+    """Return the hits of CONSTRUCTIONS per 1,000 words of these files' text."""
+    texts = [text_of(path) for path in paths]
+    words = sum(len(re.findall(r"[A-Za-z']+", text)) for text in texts)
+    return 1000 * sum(len(STUMBLES.findall(text)) for text in texts) / max(words, 1)
+
+
+def room_files(room: str) -> list[Path]:
+    if room in PROSE_ROOMS:
+        return files(f"src/multidrop/{room}")
+    return files(room, suffixes=(".py", ".c", ".h", ".md"))
+
+
+@pytest.mark.parametrize("room", [*PROSE_ROOMS, *(room for room in ROOMS if room != "src")])
+def test_a_room_reads_at_the_first_time(room: str) -> None:
+    assert stumbles(room_files(room)) <= OLDER_ROOMS.get(room, MOST_STUMBLES)
+
+
+def test_stumbles_are_counted(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Nothing is told of it, where nobody looks at `what is` there.\n")
+    assert stumbles([page]) == pytest.approx(1000 * 6 / 10)
 
 
 @table("room", [*ROOMS, "."])
