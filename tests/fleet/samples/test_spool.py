@@ -285,8 +285,8 @@ def test_a_full_disk_is_logged_and_delays_no_poller(
     assert not list(folder.glob(".*.tmp"))
     told = [record.getMessage() for record in caplog.records]
     assert [told[0].partition(": ")[0], told[-1]] == [
-        f"the spool {folder} takes nothing",
-        f"the spool {folder} is written again; 5000 were lost so far",
+        f"the spool {folder} cannot be written",
+        f"the spool {folder} is written again; 5000 rows were lost so far",
     ]
 
 
