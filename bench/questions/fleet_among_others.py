@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0, help="of each run")
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT / "tests" / "support"))
-    from fleet_scale import cpu_s_of, groups, large_fleet, nowhere, until
+    from fleet_scale import cpu_s_of, groups, large_fleet, plant_of_fake_lines, until
     from nats_clusters import cluster
     from serial_hall import SerialHall
 
@@ -53,7 +53,7 @@ def main() -> None:
     _, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most_files, most_files))
     every = groups(arguments.gateways, 4)
-    everywhere = nowhere(arguments.lines)
+    everywhere = plant_of_fake_lines(arguments.lines)
     shares = assign(list(everywhere), [name for group in every for name in group])
     own = [line for line, gateway in shares.items() if gateway == REAL]
 

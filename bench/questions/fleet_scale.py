@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=3)
     arguments = parser.parse_args()
     sys.path.insert(0, str(ROOT / "tests" / "support"))
-    from fleet_scale import groups, large_fleet, nowhere
+    from fleet_scale import groups, large_fleet, plant_of_fake_lines
     from nats_clusters import cluster
 
     tables.heading("How soon has each line of a large fleet a gateway?")
@@ -41,7 +41,7 @@ def main() -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         cluster(Path(folder)) as nats,
-        large_fleet(nats, nowhere(arguments.lines)) as fleet,
+        large_fleet(nats, plant_of_fake_lines(arguments.lines)) as fleet,
     ):
         used = fleet.cpu_s()
         note("cold start", fleet.settled(fleet.start(*groups(arguments.gateways, 4))), arguments.lines, used)

@@ -625,7 +625,7 @@ def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> No
 def test_where_no_adapter_echoes_the_first_confirmation_is_believed_until_an_echo_shows(
     line: LineDriver,
 ) -> None:
-    line.tell_echo(lib.MD_NO_ECHO)
+    line.set_echo(lib.MD_NO_ECHO)
     for _ in range(2):
         ask(line, WRITE)
         answer(line, confirmation())
@@ -637,7 +637,7 @@ def test_where_no_adapter_echoes_the_first_confirmation_is_believed_until_an_ech
 
 
 def test_a_configured_echo_is_never_unlearnt(line: LineDriver) -> None:
-    line.tell_echo(lib.MD_ECHO)
+    line.set_echo(lib.MD_ECHO)
     for _ in range(3):
         ask(line)
         answer(line, reply_of(1))  # its echo was lost
@@ -649,7 +649,7 @@ def test_a_configured_echo_is_never_unlearnt(line: LineDriver) -> None:
 
 def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: LineDriver) -> None:
     query, value = Message(1, 0x07, 0x01F4, data=bytes(4)), b"\0\0\x13\x88"
-    line.tell_echo(lib.MD_ECHO)
+    line.set_echo(lib.MD_ECHO)
     line.begin(exchange(query, framing=Framing.DELIXI))
     line.wait_until_write()
     reply = build_reply(Framing.DELIXI, replace(query, data=value))

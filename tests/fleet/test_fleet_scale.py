@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from fleet_scale import groups, large_fleet, nowhere, until
+from fleet_scale import groups, large_fleet, plant_of_fake_lines, until
 from nats_clusters import Cluster
 from peers import require_module
 
@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 def test_each_of_a_thousand_lines_has_one_gateway_when_five_of_twenty_die_and_return(nats: Cluster) -> None:
-    with large_fleet(nats, nowhere(1000)) as fleet:
+    with large_fleet(nats, plant_of_fake_lines(1000)) as fleet:
         fleet.settled(fleet.start(*groups(20, 4)))
         fleet.check()
         until(lambda: 30 <= fleet.loads()[0] <= fleet.loads()[-1] <= 55, "each has its share")

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 from controlled_loop import run_controlled
-from fleets import Hall, HandClock, NotedMastership
+from fleets import Hall, HandClock, RecordingMastership
 from peers import require_module
 
 require_module("nats")
@@ -21,7 +21,7 @@ from multidrop.fleet.servers.connections import paths_of  # noqa: E402
 
 def a_member() -> Member:
     """Return a gateway with a session, and without a server."""
-    mastership = NotedMastership(boottime_ns)
+    mastership = RecordingMastership(boottime_ns)
     lines = Hall().add("a", mastership)
     member = Member("a", paths_of(["nats://nowhere.invalid:4222"]), lines, mastership)
     member.lease.session, member.lease.held = 1, [Held(1, 0)] * 3

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fleets import Hall, NotedMastership
+from fleets import Hall, RecordingMastership
 from nats_clusters import Cluster, cluster
 from peers import require_module
 from tables import table
@@ -200,7 +200,7 @@ def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.Mo
         await open_all(paths)
         await strew(path, "-before")
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
-        mastership = NotedMastership(boottime_ns)
+        mastership = RecordingMastership(boottime_ns)
         terms = USUAL._replace(lease=10 * SECOND)  # so that a busy machine costs it no session
         member = Member("gw-a", paths, Hall().add("gw-a", mastership), mastership, terms=terms)
         task = asyncio.create_task(member.run())
@@ -235,7 +235,7 @@ def test_a_session_that_another_ends_too_early_is_believed_when_it_must_be_over(
         for name in ("gw-p", "gw-q"):
             paths = paths_of(one.urls)
             await open_all(paths)
-            mastership = NotedMastership(boottime_ns)
+            mastership = RecordingMastership(boottime_ns)
             members[name] = Member(name, paths, hall.add(name, mastership), mastership)
             tasks[name] = asyncio.create_task(members[name].run())
         while not any(member.polled for member in members.values()):

@@ -54,17 +54,17 @@ NOT_RUN = {
     "tools/musl": "builds a Python: many minutes",
     "tools/wine": "needs Wine, and downloads a Python for Windows",
     ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
-    ".venv/bin/python -m sphinx": "is a test of its own, below",
-    ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares what does not change",
+    ".venv/bin/python -m sphinx": "has its own test below",
+    ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares the constant parts",
     "mbpoll": "is another program: tests/gateway/modbus_server/test_masters.py runs it",
     "tshark": "is another program: tests/capture/test_capture.py runs it",
-    "multidrop demo --web": "runs until it is told to end: tests/gateway/test_serve.py",
+    "multidrop demo --web": "runs until it is stopped: tests/gateway/test_serve.py",
     "multidrop demo": "takes ten seconds: tests/cli and .ci/run run it",
     "multidrop plot demo.arrows": "needs the demo's recording",
     "multidrop report demo.arrows": "needs the demo's recording",
     "multidrop serve --new-token": "prints a secret: tests/gateway/test_serve.py",
-    "multidrop serve --demo": "runs until it is told to end: tests/gateway/test_serve.py",
-    "multidrop serve plant.toml": "runs until it is told to end: tests/gateway/test_serve.py",
+    "multidrop serve --demo": "runs until it is stopped: tests/gateway/test_serve.py",
+    "multidrop serve plant.toml": "runs until it is stopped: tests/gateway/test_serve.py",
     "pip install 'multidrop[fleet]'": "installs",
     "multidrop fleet demo": "takes half a minute: tests/fleet/test_fleet_demo.py runs it",
     "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
@@ -76,7 +76,7 @@ NOT_RUN = {
     "start=$(echo": "the same",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",
-    "multidrop sniff /dev/ttyUSB1": "needs a line that somebody else masters: tests/cli/test_cli_sniff.py",
+    "multidrop sniff /dev/ttyUSB1": "needs a line with another master: tests/cli/test_cli_sniff.py",
 }
 COMPUTED = "multidrop plan"  # deterministic figures; those of other commands are measured
 STATUS = {"multidrop plan full.toml": 1}  # expected exit status, if not 0
@@ -194,7 +194,7 @@ class Session:
 
     def _run_command(self, command: str) -> str:
         words = shlex.split(self._with_ports(command), comments=True)
-        assert words[0] == "multidrop", f"{command!r} is neither run nor in the table of what is not"
+        assert words[0] == "multidrop", f"{command!r} is neither run nor listed in NOT_RUN"
         if words[1] == "simulate":
             return self._simulate(words[1:])
         printed = StringIO()
@@ -244,7 +244,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Session
 
 
 @pytest.mark.parametrize("page", usually(*RUN), ids=named)
-def test_a_page_runs_as_it_stands(page: Path, session: Session) -> None:
+def test_page_runs_as_printed(page: Path, session: Session) -> None:
     text = page.read_text("utf-8")
     for needs, module in NEEDED.items():
         if needs in text and find_spec(module) is None:
@@ -256,12 +256,12 @@ def test_a_page_runs_as_it_stands(page: Path, session: Session) -> None:
             raise AssertionError(f"{named(page)}, line {block.line}: {failure}") from failure
 
 
-def test_a_page_s_blocks_say_what_they_are() -> None:
+def test_blocks_name_a_known_language() -> None:
     found = {(named(page), block.line, block.language) for page in PAGES for block in blocks(page)}
     assert [each for each in found if each[2] not in LANGUAGES] == []
 
 
-def test_what_is_not_run_is_there() -> None:
+def test_commands_that_are_not_run_are_on_the_pages() -> None:
     text = "\n".join(block.text for page in PAGES for block in blocks(page))
     assert [begin for begin in NOT_RUN if begin not in text] == []
 
@@ -289,7 +289,7 @@ MENTIONED = sorted(
 
 
 @table("mentioned", MENTIONED)
-def test_a_command_that_is_mentioned_is_a_command(mentioned: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mentioned_commands_parse(mentioned: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [PLACEHOLDERS.get(word, word) for word in shlex.split(mentioned)]
     if words[0].startswith("--"):
         return
@@ -304,7 +304,7 @@ def test_a_command_that_is_mentioned_is_a_command(mentioned: str, monkeypatch: p
         assert main(words) == 0
 
 
-def test_a_page_s_links_lead_somewhere() -> None:
+def test_links_exist() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", prose(page)):
             is_there = target.startswith("https://") or (page.parent / target).exists()
@@ -319,7 +319,7 @@ def test_no_line_is_too_long() -> None:
 # ---- completeness of the pages ----
 
 
-def table(page: str, heading: str = "") -> dict[str, str]:
+def page_table(page: str, heading: str = "") -> dict[str, str]:
     """Return the rows of the first table after a heading: first column to the rest of the row."""
     text = (
         (DOCS / page).read_text("utf-8").partition(heading)[2]
@@ -352,22 +352,22 @@ def test_every_public_name_is_in_the_reference(package: str, monkeypatch: pytest
 
 def test_every_status_is_in_the_reference() -> None:
     known = {status for status in core.STATUSES if status and not status.startswith("exception")}
-    assert known == set(table("reference/statuses.md")) - {"exception 01", "exception FF"}
+    assert known == set(page_table("reference/statuses.md")) - {"exception 01", "exception FF"}
 
 
 def test_every_column_is_in_the_reference() -> None:
     from multidrop.polling.batch import schema
 
-    assert [child.name for child in schema().children] == list(table("reference/recording-format.md"))
+    assert [child.name for child in schema().children] == list(page_table("reference/recording-format.md"))
 
 
 def test_every_key_of_a_plant_file_is_in_the_reference() -> None:
     from multidrop.plant import loader
 
     page = "reference/plant-file.md"
-    assert list(table(page, "## `[[line]]`")) == list(loader._LINE)
-    assert set(table(page, "## `[[line.drive]]`")) == set(loader._DRIVE)
-    assert list(table(page, "## An entry of `poll`")) == list(loader._POLL)
+    assert list(page_table(page, "## `[[line]]`")) == list(loader._LINE)
+    assert set(page_table(page, "## `[[line.drive]]`")) == set(loader._DRIVE)
+    assert list(page_table(page, "## An entry of `poll`")) == list(loader._POLL)
 
 
 def test_every_family_is_in_the_reference() -> None:
@@ -375,7 +375,7 @@ def test_every_family_is_in_the_reference() -> None:
     assert re.findall(r"^- `([\w-]+)` ", text, re.MULTILINE) == list(MODELS)
 
 
-def test_no_table_s_head_is_another_table_s_row() -> None:
+def test_table_headers_are_not_copied_rows() -> None:
     """Find table headers that were copied from a row, which mislabel the columns below."""
     for page in PAGES:
         text = page.read_text("utf-8")
@@ -392,19 +392,19 @@ def test_every_extra_is_in_the_reference() -> None:
     assert given == set(extras) - {"bench", "docs", "test"}
 
 
-def test_the_speed_table_is_readme_s() -> None:
+def test_speed_table_equals_readme() -> None:
     speed = (DOCS / "explanation" / "speed-table.md").read_text("utf-8")
     assert speed.strip() in (ROOT / "README.md").read_text("utf-8")
 
 
-def test_the_timing_diagrams_are_what_their_tables_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timing_diagrams_match_their_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(DOCS / "pictures"))
     diagrams = importlib.import_module("diagrams")
     for name in diagrams.DIAGRAMS:
         assert (DOCS / "pictures" / f"{name}.svg").read_text("utf-8") == diagrams.draw(name)
 
 
-def test_no_text_of_a_timing_diagram_leaves_its_box(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_timing_diagram_text_fits_its_box(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(DOCS / "pictures"))
     diagrams = importlib.import_module("diagrams")
     for name in diagrams.DIAGRAMS:
@@ -416,7 +416,7 @@ def test_no_text_of_a_timing_diagram_leaves_its_box(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.uncounted
 @pytest.mark.long
-def test_the_pages_are_built_without_a_warning(tmp_path: Path) -> None:
+def test_sphinx_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("sphinx")
     command = [
         sys.executable,

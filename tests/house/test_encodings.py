@@ -44,7 +44,7 @@ def lacking(source: str) -> Iterator[int]:
             yield node.lineno
 
 
-def test_every_text_that_is_opened_says_its_encoding() -> None:
+def test_opened_text_has_an_encoding() -> None:
     found = [
         f"{path.relative_to(SOURCE)}:{line}"
         for path in sorted(SOURCE.rglob("*.py"))
@@ -57,7 +57,7 @@ def test_every_text_that_is_opened_says_its_encoding() -> None:
     "call",
     ["p.read_text()", "p.write_text(text)", "open(name)", 'p.open("w")', "subprocess.run([], text=True)"],
 )
-def test_a_call_without_one_is_found(call: str) -> None:
+def test_call_without_encoding_is_detected(call: str) -> None:
     assert list(lacking(call)) == [1]
 
 
@@ -71,5 +71,5 @@ def test_a_call_without_one_is_found(call: str) -> None:
         'p.open("w", encoding=e)',
     ],
 )
-def test_a_call_with_one_is_not(call: str) -> None:
+def test_call_with_encoding_is_not_reported(call: str) -> None:
     assert list(lacking(call)) == []

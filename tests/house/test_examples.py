@@ -36,7 +36,7 @@ def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (pat
 
 
 @table("path", sorted(EXAMPLES.glob("*.py")))
-def test_an_example_is_linked_from_the_pages_and_run_here(path: Path) -> None:
+def test_example_is_linked_and_tested(path: Path) -> None:
     if path.name != "simulated_plant.py":  # imported by the others
         assert f"examples/{path.name}" in PAGES
         assert f'"{path.name}"' in Path(__file__).read_text("utf-8")
@@ -51,7 +51,7 @@ def test_a_logger_to_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_device_of_one_s_own(tmp_path: Path) -> None:
+def test_own_device(tmp_path: Path) -> None:
     printed = run(tmp_path, "own_device.py")
     assert "temperature  21.4 degC" in printed
     assert "FILTER" in printed
@@ -74,7 +74,7 @@ def test_two_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_pump_is_stopped_when_its_program_ends(tmp_path: Path) -> None:
+def test_pump_stops_when_its_program_ends(tmp_path: Path) -> None:
     printed = run(tmp_path, "pump.py", "1")
     assert "failed" not in printed
     assert printed.splitlines()[-1] == "the output frequency is now 0.0 Hz"

@@ -12,12 +12,12 @@ TESTS = Path(__file__).parents[1]
 SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
 
 
-def test_a_process_ends_with_a_block_that_fails() -> None:
+def test_failing_block_kills_its_process() -> None:
     with pytest.raises(ZeroDivisionError), BoundProcess(SLEEPS) as process:
         raise ZeroDivisionError
     assert process.returncode
 
 
-def test_no_block_of_a_test_waits_for_a_process_that_nobody_ends() -> None:
+def test_no_test_starts_an_unbound_process() -> None:
     unbound = "with subprocess." + "Popen("
     assert [str(path) for path in TESTS.rglob("*.py") if unbound in path.read_text("utf-8")] == []

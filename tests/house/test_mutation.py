@@ -63,7 +63,7 @@ OF_PYTHON = {
 
 
 @pytest.mark.parametrize(("path", "source", "made"), [("a.c", C, OF_C), ("a.py", PYTHON, OF_PYTHON)])
-def test_mistakes_that_are_made(path: str, source: str, made: set[str]) -> None:
+def test_mutants_of_a_source(path: str, source: str, made: set[str]) -> None:
     found = mutants(path, source)
     assert {each.after for each in found} == made
     assert len({each.text for each in found}) == len(found)
@@ -78,7 +78,7 @@ def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
 
 
 @pytest.mark.slow
-def test_explained_mutants_can_be_made() -> None:
+def test_explained_mutants_exist() -> None:
     files = {each["file"] for each in EXPLAINED}
     names = {mutant.name for path in files for mutant in mutants(path, (ROOT / path).read_text("utf-8"))}
     for row in EXPLAINED:
@@ -86,6 +86,6 @@ def test_explained_mutants_can_be_made() -> None:
         assert (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)) in names
 
 
-def test_the_trials_compile_files_that_are_there() -> None:
+def test_mutation_trials_compile_existing_files() -> None:
     assert all((ROOT / "csrc" / f"{name}.c").exists() for name in core_names(ROOT))
     assert {"frame", "waiter_epoll", "wakeup"} <= {*core_names(ROOT)}

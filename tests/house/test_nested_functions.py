@@ -21,7 +21,7 @@ def never_named(tree: ast.AST) -> list[str]:
     return found
 
 
-def test_every_function_within_a_test_is_used() -> None:
+def test_inner_functions_are_used() -> None:
     found = {}
     for path in sorted(TESTS.rglob("*.py")):
         if lost := never_named(ast.parse(path.read_text("utf-8"))):
@@ -29,7 +29,7 @@ def test_every_function_within_a_test_is_used() -> None:
     assert found == {}
 
 
-def test_one_that_is_forgotten_is_found() -> None:
+def test_unused_inner_function_is_detected() -> None:
     told = "def test_it():\n    async def main(): assert False\n"
     assert never_named(ast.parse(told)) == ["main in test_it, line 2"]
     assert never_named(ast.parse(told + "    run(main())\n")) == []

@@ -44,14 +44,14 @@ def named(pattern: str) -> list[str]:
     return sorted({name for code in CODE for name in re.findall(rf"(?<![\w./]){pattern}", code)})
 
 
-def test_files_that_are_named_exist() -> None:
+def test_named_files_exist() -> None:
     paths = named(FILE)
     assert len(paths) > 90
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
 @table("name", named(r"test_\w+(?![\w.])"))
-def test_tests_that_are_named_exist(name: str) -> None:
+def test_named_tests_exist(name: str) -> None:
     """Look for the test in the last file named before it."""
     for before in re.findall(rf"^(.*)`{name}`", PAGE, re.MULTILINE):
         file = re.findall(r"tests/[\w/]+/test_\w+\.py", before)[-1]
@@ -66,7 +66,7 @@ def script(command: str) -> Path | None:
     return files[0] if files and files[0].suffix == ".py" else None
 
 
-def test_commands_and_options_that_are_named_exist() -> None:
+def test_named_commands_and_options_exist() -> None:
     common = (ROOT / "tests" / "conftest.py").read_text("utf-8")
     commands = {command: file for command in CODE if (file := script(command))}
     assert len(commands) > 90

@@ -27,7 +27,7 @@ def run(*words: str) -> str:
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
 
 
-def test_each_name_is_what_its_module_has() -> None:
+def test_public_name_is_its_modules_object() -> None:
     for name in NAMES:
         home = import_module(multidrop._HOMES[name])
         assert getattr(multidrop, name) is getattr(home, name)
@@ -41,27 +41,27 @@ def test_no_name_is_listed_twice() -> None:
     assert len(set(NAMES)) == len(NAMES)
 
 
-def test_a_name_that_is_none() -> None:
+def test_unknown_name_raises_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'multidrop' has no attribute 'Buss'"):
         _ = multidrop.Buss  # type: ignore[attr-defined]
 
 
-def test_nothing_is_loaded_before_it_is_used() -> None:
+def test_modules_load_on_first_use() -> None:
     code = (
         "import sys, multidrop; print(sorted(name for name in sys.modules if name.startswith('multidrop')))"
     )
     assert run("-c", code).strip() == str(["multidrop", "multidrop.interpreter"])
 
 
-def test_the_version_is_the_distributions() -> None:
+def test_version_is_the_distribution_version() -> None:
     assert multidrop.__version__ == version("multidrop")
 
 
-def test_it_runs_as_a_module() -> None:
+def test_package_runs_as_a_module() -> None:
     assert "usage: multidrop" in run("-m", "multidrop", "--help")
 
 
-def test_what_a_declaration_needs() -> None:
+def test_family_is_declared_with_public_names() -> None:
     """Declare a user's own family with public names only."""
 
     class Own(multidrop.Drive):
@@ -75,7 +75,7 @@ def test_what_a_declaration_needs() -> None:
 # ---- repr in a debugger ----
 
 
-def test_a_drive_and_a_bus() -> None:
+def test_repr_of_drive_and_bus() -> None:
     drive = Toy(3, name="pump-3")
     assert repr(drive) == "<Toy 'pump-3', address 3, rtu, 9600 8N1, not attached>"
     with Bus("loop://") as bus:
@@ -86,11 +86,11 @@ def test_a_drive_and_a_bus() -> None:
     assert repr(bus) == "<Bus loop://, closed: pump-3>"
 
 
-def test_a_batch() -> None:
+def test_repr_of_batch() -> None:
     assert repr(example()) == "<Batch: 5 rows of 3 drives, 3.000 s from 2026-11-21T09:30:00.123+00:00>"
 
 
-def test_a_poller() -> None:
+def test_repr_of_poller() -> None:
     poller = Poller(Plant((), Path()))
     assert repr(poller) == "<Poller not started; no lines>"
     poller.close()
@@ -100,7 +100,7 @@ def test_a_poller() -> None:
 # ---- completion at a prompt ----
 
 
-def test_the_top_has_few_names_and_shows_no_others() -> None:
+def test_package_has_few_names_and_dir_lists_only_these() -> None:
     assert len(NAMES) <= 45
     assert dir(multidrop) == sorted(multidrop.__all__)
 

@@ -27,7 +27,7 @@ SETTING_UP = [
 ]
 
 
-def test_it_is_short() -> None:
+def test_readme_is_short() -> None:
     assert len(README.splitlines()) <= 120
 
 
@@ -50,14 +50,14 @@ def test_the_bench_extra_installs_all_that_benchmarks_import() -> None:
     assert imported - ours - set(sys.stdlib_module_names) - installed == set()
 
 
-def test_setting_up_is_what_ci_does() -> None:
+def test_setup_equals_ci() -> None:
     patterns = re.findall(r"grep -m1 -E '([^']+)' README\.md", (ROOT / ".ci" / "run").read_text("utf-8"))
     found = [next(line for line in README.splitlines() if re.search(pattern, line)) for pattern in patterns]
     assert sorted(found) == sorted(SETTING_UP)
 
 
 @pytest.mark.slow
-def test_ten_lines(tmp_path: Path) -> None:
+def test_ten_line_example_runs(tmp_path: Path) -> None:
     """Run the lines in a fresh interpreter without a warning."""
     (block,) = re.findall(r"^```python\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
     (tmp_path / "ten_lines.py").write_text(block)
@@ -74,6 +74,6 @@ def test_ten_lines(tmp_path: Path) -> None:
     assert acceleration == "20.0 s"
 
 
-def test_its_families_are_all_there_are() -> None:
+def test_readme_lists_every_family() -> None:
     table = README.partition("## Families")[2].partition("\n\nThey may share")[0]
     assert re.findall(r"^\| `([^`]+)`", table, re.MULTILINE) == list(MODELS)

@@ -57,7 +57,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("words", MISTAKES)
-def test_a_mistake_is_one_sentence_and_nothing_is_begun(tmp_path: Path, words: str) -> None:
+def test_mistake_prints_one_sentence_and_starts_nothing(tmp_path: Path, words: str) -> None:
     for name in (LINUX, WINDOWS, "file"):
         (tmp_path / name).touch()
     (tmp_path / "empty").mkdir()
@@ -81,7 +81,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_begun(tmp_path: Path, words: s
 
 
 @table("tool", ["bare", "booted", "foreign", "musl", "wheels", "wine"])
-def test_help_is_its_own_head(tool: str) -> None:
+def test_help_is_the_header_of_the_tool(tool: str) -> None:
     ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
     assert f"tools/{tool} " in ran.stdout
     assert ran.stdout.isascii()

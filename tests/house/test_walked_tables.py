@@ -10,7 +10,7 @@ def notes(caught: pytest.ExceptionInfo[BaseExceptionGroup[BaseException]]) -> li
     return [failure.__notes__ for failure in caught.value.exceptions]
 
 
-def test_every_row_is_tried_and_each_that_fails_is_told() -> None:
+def test_every_failing_row_is_reported() -> None:
     tried = []
 
     @table("number", range(5))
@@ -24,7 +24,7 @@ def test_every_row_is_tried_and_each_that_fails_is_told() -> None:
     assert notes(caught) == [["in the row (1,)"], ["in the row (3,)"]]
 
 
-def test_a_row_that_raises_nothing_or_is_skipped_has_failed() -> None:
+def test_row_fails_if_it_is_skipped_or_an_expected_error_is_missing() -> None:
     @table(("one", "other"), [(1, 2), (2, 2), (3, 3)], ids=["a", "b", "c"])
     def differ(one: int, other: int) -> None:
         if one == 3:
@@ -45,6 +45,6 @@ def test_tables_of_tables_and_fixtures(left: int, right: int, sum_: int, tmp_pat
 
 
 @table("rows", [[], [(1, 2)]], ids=["none", "too wide"])
-def test_a_table_that_proves_nothing_is_refused(rows: list[tuple[int, int]]) -> None:
+def test_empty_or_ill_formed_table_is_rejected(rows: list[tuple[int, int]]) -> None:
     with pytest.raises(AssertionError):
         table(["only"], rows)

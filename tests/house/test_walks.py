@@ -51,12 +51,12 @@ def test_every_file_has_its_row() -> None:
 
 
 @pytest.mark.parametrize("walk", WALKS, ids=[walk.stem for walk in WALKS])
-def test_each_step_is_there(walk: Path) -> None:
+def test_steps_exist(walk: Path) -> None:
     assert len(steps(walk)) > 8
     assert missing(walk) == []
 
 
-def test_a_step_that_leads_nowhere_is_found(tmp_path: Path) -> None:
+def test_missing_step_is_detected(tmp_path: Path) -> None:
     walk = tmp_path / "walk.md"
     walk.write_text("`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`")
     assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:"]

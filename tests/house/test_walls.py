@@ -96,7 +96,7 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
     others = rooms(modules) - {"_core", room(path)}
-    if room(path) in CLIENTS:  # covered by test_clients_use_public_names_alone
+    if room(path) in CLIENTS:  # covered by test_clients_use_only_public_names
         others -= set(multidrop.__all__)
     return {name for name in others if floor(name) >= floor(room(path))}
 
@@ -114,14 +114,14 @@ def test_only_core_imports_the_compiled_module() -> None:
     assert {name for name in found if not name.startswith("core/")} == set()
 
 
-def test_only_these_touch_the_system() -> None:
+def test_only_listed_files_use_the_system() -> None:
     outside = {str(path.relative_to(PACKAGE)): run_time_imports(path) & OUTSIDE for path in FILES}
     allowed = {name for name in outside if name.split("/")[0] in TOUCHING_THE_SYSTEM}
     allowed |= FILES_TOUCHING_THE_SYSTEM
     assert offenders({name: found for name, found in outside.items() if name not in allowed}) == {}
 
 
-def test_a_family_imports_drive_alone() -> None:
+def test_families_import_only_drive() -> None:
     families = sorted({*(PACKAGE / "families").glob("*.py")} - {PACKAGE / "families" / "registry.py"})
     found = {path.name: rooms(run_time_imports(path)) - {"drive", "families"} for path in families}
     assert offenders(found) == {}
@@ -132,13 +132,13 @@ def test_imports_point_downwards() -> None:
     assert offenders(found) == {}
 
 
-def test_imports_for_types_alone_point_downwards_too() -> None:
+def test_type_imports_point_downwards() -> None:
     """Check that annotations, too, name only rooms below."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}
 
 
-def test_imports_between_files_run_one_way() -> None:
+def test_no_import_cycles_between_files() -> None:
     """Check for cycles, including imports for annotations. Shared parts belong in one file or below both."""
     ties = {name: min(group) for group in TIED for name in group}
     graph: dict[str, set[str]] = {}
@@ -154,7 +154,7 @@ def test_imports_between_files_run_one_way() -> None:
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_clients_use_public_names_alone(client: str) -> None:
+def test_clients_use_only_public_names(client: str) -> None:
     """Check that anyone could write such a client with public names."""
     found = {
         str(path.relative_to(PACKAGE)): {
@@ -173,7 +173,7 @@ def _is_public(name: str, client: str) -> bool:
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_its_commands_alone_import_a_client(client: str) -> None:
+def test_only_listed_commands_import_a_client(client: str) -> None:
     found = {str(path.relative_to(PACKAGE)) for path in FILES if client in rooms(_imported(path))}
     assert {name for name in found if not name.startswith(f"{client}/")} <= CLIENTS[client]
 
@@ -187,7 +187,7 @@ def test_files_are_short() -> None:
     assert {name for name, count in lines.items() if count > MOST_LINES_OF_A_FILE} == set()
 
 
-def test_no_test_imports_another_one() -> None:
+def test_no_test_imports_another_test() -> None:
     tests = files("tests")
     names = {path.stem for path in tests if path.name.startswith("test_")}
     maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # saves parsing
@@ -234,7 +234,7 @@ def core() -> dict[str, str]:
     return {path.stem: re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL) for path in found}
 
 
-def test_calls_of_the_core_run_one_way() -> None:
+def test_no_call_cycles_between_core_files() -> None:
     graph = calls(core())
     assert graph["api"] >= {"engine", "turn"}
     assert graph["port"] >= {"turn", "line"}

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from imported import entries, gaps, only, told
+from imported import entries, gaps, omissions, only
 
 from multidrop.importers import ImportedDevice
 
@@ -75,13 +75,13 @@ def test_address_and_table_of_a_register(
 def test_a_number_in_a_bit_table_that_cannot_be_sent_is_lost(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,103247,float\nb,5,uint16\n")
     assert list(entries(device)) == ["b"]
-    assert told(device) == ["a: its address is not from 0 to 65535"]
+    assert omissions(device) == ["a: its address is not from 0 to 65535"]
 
 
 def test_numbers_beside_bare_hex_may_be_hex(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,10,uint16\nb,1F,uint16\n")
     assert "its address 10 may be hex, as others of its column are" in gaps(device, "a")
-    assert "b: it cannot be read:" in told(device)[0]
+    assert "b: it cannot be read:" in omissions(device)[0]
 
 
 def test_unit_of_a_bit_is_a_gap(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_neuron_s_decimal_is_a_factor_and_its_bias_is_added(tmp_path: Path) -> N
     header = "address,attribute,type,decimal,precision,bias"
     device = row(tmp_path, header, "1!400001,Read Subscribe,UINT16,2,3,-40")
     assert entries(device)["a"] == {"at": 0, "step": 2, "offset": -40}
-    assert (gaps(device, "a"), told(device)) == ([], [])
+    assert (gaps(device, "a"), omissions(device)) == ([], [])
 
 
 def test_a_second_scale_is_a_gap(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_functions_that_write_are_written_there(tmp_path: Path) -> None:
 def test_columns_that_are_not_carried_over_are_named(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,enum,room,wobble", "0x10,uint16,0=off,hall,1")
     assert found(device) == ["the column enum was not carried over"]
-    assert told(device) == ["the column wobble: is not known here, and was not carried over"]
+    assert omissions(device) == ["the column wobble: is not known here, and was not carried over"]
 
 
 def test_a_register_column_of_numbers_is_the_address(tmp_path: Path) -> None:

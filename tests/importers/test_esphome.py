@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from commands import Run
-from imported import devices, entries, gaps, only, told
+from imported import devices, entries, gaps, omissions, only
 
 from multidrop.importers import ImportedDevice, read_devices
 
@@ -129,7 +129,7 @@ def test_controllers_of_one_address_on_one_bus_are_one_device(tmp_path: Path) ->
 def test_an_entity_of_one_of_several_controllers_names_it(tmp_path: Path) -> None:
     controllers = FAST + "  - {id: slow, address: 2, modbus_id: m}\n"
     device = only(tmp_path, "node.yaml", node(controllers, VOLTS, AMPS))
-    assert told(device) == [
+    assert omissions(device) == [
         "amps: it cannot be read: modbus_controller_id is missing, and there are several controllers"
     ]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from commands import Run
-from imported import devices, entries, gaps, only, told
+from imported import devices, entries, gaps, omissions, only
 
 from multidrop.importers import ImportedDevice, plant_text, read_devices
 
@@ -210,7 +210,7 @@ def test_a_refusal_says_why(tmp_path: Path, text: str, reason: str) -> None:
 def test_unknown_host_never_becomes_a_serial_port(tmp_path: Path, hub: str, port: str) -> None:
     device = only(tmp_path, "a.yaml", f"modbus:\n  - {{{hub}, sensors: [{{slave: 1, address: 1}}]}}\n")
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
-    assert ("the hub: its type udp is not spoken here" in told(device)) == ("udp" in hub)
+    assert ("the hub: its type udp is not spoken here" in omissions(device)) == ("udp" in hub)
 
 
 @pytest.mark.parametrize("unit", [0, 248, 255])

@@ -22,8 +22,8 @@ from imported import (
     WB,
     devices,
     entries,
+    omissions,
     only,
-    told,
 )
 
 from multidrop import load_family
@@ -53,7 +53,7 @@ def test_iobroker(tmp_path: Path) -> None:
     assert found["energy"] == {
         "at": 2, "table": "input", "unit": "kWh", "number_format": "F32", "order": "CDAB", "note": "Energy",
     }  # fmt: skip
-    assert told(device) == []
+    assert omissions(device) == []
     assert "# gap: setpoint: only its count is read: its formula is a program" in family_text(device, "x")
     registers = loaded(tmp_path, device, "voltage_l1", "setpoint")
     assert (registers["setpoint"].address, registers["setpoint"].step) == (10, 0.5)
@@ -65,7 +65,7 @@ def test_modpoll(tmp_path: Path) -> None:
     assert entries(device)["energy"] == {
         "at": "9C48H", "unit": "kWh", "number_format": "U32", "order": "CDAB",
     }  # fmt: skip
-    assert told(device) == ["coils: which bits bool8 means is not known"]
+    assert omissions(device) == ["coils: which bits bool8 means is not known"]
     assert "# gap: energy: it is written there" in family_text(device, "x")
     registers = loaded(tmp_path, device, "voltage", "power", "energy")
     assert registers["energy"].address == 40008
@@ -89,7 +89,7 @@ def test_neuron(tmp_path: Path) -> None:
     assert "# gap: unsure: its order of bytes is its node's; ABCD was assumed, as Neuron does" in text
     assert "# gap: wide: only its count is read: its order of bytes #WS" in text
     assert "# gap: setpoint: it is written there; what a write does is not known here" in text
-    assert told(device) == ["bytes: a text of one character a register, in its high byte"]
+    assert omissions(device) == ["bytes: a text of one character a register, in its high byte"]
     assert loaded(tmp_path, device, "volt", "power")["power"].words == 2
 
 
@@ -117,7 +117,7 @@ def test_telegraf(tmp_path: Path) -> None:
     assert found["wide"] == {"at": 30, "number_format": "F64", "order": "CDAB"}
     assert found["narrow"] == {"at": 34}
     assert found["half"] == {"at": 3, "table": "input", "number_format": "F16"}
-    assert told(other) == ["skipped: it is marked omit, and was left out"]
+    assert omissions(other) == ["skipped: it is marked omit, and was left out"]
     registers = loaded(tmp_path, meter, "relay", "power", "energy")
     assert registers["relay"].table.name == "coil"
     assert (registers["power"].number_format.name, registers["energy"].words) == ("I16", 2)
@@ -141,7 +141,7 @@ def test_home_assistant(tmp_path: Path) -> None:
     assert [found[name]["at"] for name in ("door", "door_1")] == [3, 4]
     assert found["phase"]["invalid"] == "NaN"
     assert found["alarm"]["part"] == "0"
-    assert told(device) == [
+    assert omissions(device) == [
         "Odd: its type custom has no number format",
         "Far_1: its address is not from 0 to 65535",
         "Many: it cannot be read: virtual_count = 5000 is not 0 to 1000",
@@ -162,8 +162,8 @@ def test_sunspec(tmp_path: Path) -> None:
     assert (found["a"]["at"], found["w"]["at"], found["mn"]["at"]) == ("9C41H", "9C44H", "9C46H")
     assert (found["w"]["invalid"], found["st"]["values"]) == ("NaN", {"off": 1})
     assert found["mn"]["length"] == 16
-    assert any("mend every `at`" in sentence for sentence in told(device))
-    assert "mppt.DCA: its group repeats as often as the device says" in told(device)
+    assert any("mend every `at`" in sentence for sentence in omissions(device))
+    assert "mppt.DCA: its group repeats as often as the device says" in omissions(device)
     registers = loaded(tmp_path, device, "a", "a_sf", "wh", "net")
     assert registers["a"].address == 40001
     assert registers["wh"].number_in(b"\xff" * 8, 0) is None
@@ -196,7 +196,7 @@ def test_wb(tmp_path: Path) -> None:
     assert (found["mode"]["number_format"], found["mode"]["invalid"]) == ("I16", 0x7FFF)
     assert found["serial"] == {"at": 40, "table": "input", "length": 8, "order": "B"}
     assert found["mode_of_work"]["values"] == {"off": 0, "r_1st_stage": 1}
-    assert told(device) == [
+    assert omissions(device) == [
         "Order: is only written: a command is never imported",
         "Odd: its register type press_counter has no table",
         "setup: writes at every start are never sent, for they wear the EEPROM",
@@ -220,7 +220,7 @@ def test_esphome(tmp_path: Path) -> None:
     assert "# gap: split: only its count is read: bits that are not side by side: 0x101" in text
     assert "# gap: shown: not all of its filters were carried over: lambda" in text
     assert "# gap: computed: only its count is read: its lambda is a program" in text
-    assert told(device) == [
+    assert omissions(device) == [
         "Raw: its value_type RAW has no number format",
         "speed: is only written: a command is never imported",
     ]
@@ -275,7 +275,7 @@ def test_at_most_the_registers_of_one_family_are_declared(
     rows = "".join(f"r{address},{address},uint16\n" for address in (1, 99_999, 2, 3, 4))
     device = only(tmp_path, "a.csv", f"name,address,type\n{rows}")
     assert [register.name for register in device.registers] == ["r1", "r2"]
-    assert told(device)[-2:] == [f"{name}: a family has at most 2 registers" for name in ("r3", "r4")]
+    assert omissions(device)[-2:] == [f"{name}: a family has at most 2 registers" for name in ("r3", "r4")]
     assert declared[-1] == "r2"
 
 
@@ -381,7 +381,7 @@ def test_scattered_addresses_are_lost(tmp_path: Path) -> None:
     )
     device = only(tmp_path, "t.conf", f"[[inputs.modbus]]\nslave_id = 1\nholding_registers = [{listed}]\n")
     assert list(entries(device)) == ["good"]
-    assert told(device) == [
+    assert omissions(device) == [
         "split: its addresses 4, 9 are not those of a UINT32, side by side",
         "one: its addresses 4, 5, 6 are not those of a UINT32, side by side",
     ]

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from imported import entries, gaps, only, told
+from imported import entries, gaps, omissions, only
 
 from multidrop.importers import csv_tables, esphome, home_assistant, sunspec, telegraf, wb
 from multidrop.importers.device import KeyTable, Treatment, uncarried
@@ -221,7 +221,7 @@ def test_a_key_that_an_importer_does_not_know_is_a_gap_of_its_register(tmp_path:
 def test_settings_of_a_hub_that_are_not_carried_over_are_named(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     hub = f"modbus:\n  - name: hub\n    delay: 5\n    novel: 1\n    timeout: 3\n    sensors: [{SENSOR}}}]\n"
-    assert told(only(tmp_path, "a.yaml", hub)) == [
+    assert omissions(only(tmp_path, "a.yaml", hub)) == [
         "the hub: delay was not carried over",
         "the hub: novel is not known here, and was not carried over",
     ]

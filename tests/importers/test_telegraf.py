@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from imported import devices, entries, gaps, only, told
+from imported import devices, entries, gaps, omissions, only
 
 from multidrop.importers import ImportedDevice, plant_text, read_devices
 
@@ -91,7 +91,7 @@ def test_a_request_without_a_slave_id_is_named(tmp_path: Path) -> None:
     request = '[[inputs.modbus.request]]\nfields = [{ name = "a", address = 1, type = "INT16" }]\n'
     device = only(tmp_path, "t.conf", HEAD + request)
     assert device.address == 1
-    assert told(device) == [
+    assert omissions(device) == [
         "request: it has no slave_id, for which Telegraf asks unit 0; the plugin's was taken"
     ]
 
@@ -99,7 +99,7 @@ def test_a_request_without_a_slave_id_is_named(tmp_path: Path) -> None:
 def test_pauses_that_a_device_needs_are_named(tmp_path: Path) -> None:
     workaround = '[inputs.modbus.workarounds]\npause_after_connect = "1s"\n'
     device = of_a_request(tmp_path, 'address = 5, type = "INT16"', workaround)
-    assert told(device) == ["workarounds: pause_after_connect was not carried over"]
+    assert omissions(device) == ["workarounds: pause_after_connect was not carried over"]
 
 
 @pytest.mark.parametrize(

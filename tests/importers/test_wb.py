@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from imported import devices, entries, gaps, only, told
+from imported import devices, entries, gaps, omissions, only
 
 from multidrop.importers import ImportedDevice, read_devices
 
@@ -41,7 +41,7 @@ def test_a_subdevice_is_at_the_shift_of_each_channel_that_uses_it(tmp_path: Path
         ("second_voltage", 0x210 + 2),  # a stride counts numbers
         ("second_energy", 0x220 + 4),
     ]
-    assert told(device) == []
+    assert omissions(device) == []
 
 
 def test_subdevices_in_subdevices_add_their_shifts(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_subdevice_that_contains_itself_ends(tmp_path: Path) -> None:
     again = {"name": "Again", "device_type": "ch", "shift": 1}
     device = only(tmp_path, "w.json", with_subdevice(again, channels=[VOLTAGE, again]))
     assert len(device.registers) == 8
-    assert "more than 8 subdevices in each other" in told(device)[0]
+    assert "more than 8 subdevices in each other" in omissions(device)[0]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_entries_without_a_place_are_lost(tmp_path: Path, used: dict[str, Any], 
     device = only(tmp_path, "w.json", document)
     assert ("known", 7) in places(device)
     assert "voltage" not in entries(device)
-    assert reason in told(device)
+    assert reason in omissions(device)
 
 
 @pytest.mark.parametrize(

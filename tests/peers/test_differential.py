@@ -7,7 +7,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from damage import BITS, COIL_VALUES, ECHOES, FUNCTIONS, MOST, READS, Said, data_bytes, frames, request_body
+from damage import (
+    BITS,
+    COIL_VALUES,
+    ECHOES,
+    FUNCTIONS,
+    MOST,
+    READS,
+    SampleFrame,
+    data_bytes,
+    frames,
+    request_body,
+)
 from judges import UNKNOWN_CODE, Libmodbus, Pymodbus, Understood, Verdict, expected
 
 from multidrop.core import (
@@ -28,15 +39,15 @@ ALL = (LIBMODBUS, *PYMODBUS)
 # ---- conditions of the rules ----
 
 
-def count_of(said: Said) -> int:
+def count_of(said: SampleFrame) -> int:
     return int.from_bytes(said.body[4:6])
 
 
-def start_of(said: Said) -> int:
+def start_of(said: SampleFrame) -> int:
     return int.from_bytes(said.body[2:4])
 
 
-def contradicts_itself(said: Said) -> bool:
+def contradicts_itself(said: SampleFrame) -> bool:
     """Return True for a multiple write whose byte count contradicts its count, or is above the limit."""
     function, count = said.function, count_of(said)
     return function in (0x0F, 0x10) and (
@@ -44,34 +55,34 @@ def contradicts_itself(said: Said) -> bool:
     )
 
 
-def has_other_length(said: Said, length: int) -> bool:
+def has_other_length(said: SampleFrame, length: int) -> bool:
     return len(said.body) != length
 
 
-def request_length(said: Said) -> int:
+def request_length(said: SampleFrame) -> int:
     return 7 + said.octet(6) if said.function in (0x0F, 0x10) else 6
 
 
-def reply_length(said: Said) -> int:
+def reply_length(said: SampleFrame) -> int:
     if said.function & 0x80:
         return 3
     return 3 + said.octet(2) if said.function in READS else 6
 
 
-def is_lower_case(said: Said) -> bool:
+def is_lower_case(said: SampleFrame) -> bool:
     return said.frame != said.frame.upper()
 
 
-def is_to_another_function(said: Said) -> bool:
+def is_to_another_function(said: SampleFrame) -> bool:
     return said.function & 0x7F != said.request.function
 
 
-def confirms_another_write(said: Said) -> bool:
+def confirms_another_write(said: SampleFrame) -> bool:
     is_write = said.function in (*ECHOES, 0x0F, 0x10)
     return is_write and said.body[2:6] != request_body(said.request)[2:6]
 
 
-def has_other_data(said: Said) -> bool:
+def has_other_data(said: SampleFrame) -> bool:
     asked = data_bytes(said.request.function, said.request.count)
     return said.function in READS and said.octet(2) != asked
 
@@ -87,7 +98,7 @@ class Rule:
 
     kind: str
     judges: tuple[str, ...]
-    when: Callable[[Said], bool]
+    when: Callable[[SampleFrame], bool]
     reason: str
 
 
@@ -214,7 +225,7 @@ REPLIES = [
 
 @dataclass(frozen=True)
 class Difference:
-    said: Said
+    said: SampleFrame
     ours: Understood | Verdict
     theirs: Understood | Verdict
 
@@ -239,7 +250,7 @@ def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) ->
     assert not stale, f"{judge} does not differ any more: {[rule.reason for rule in stale]}"
 
 
-def compare(said: Said, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
+def compare(said: SampleFrame, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
     """Return no difference if both reject the frame, or both decode it identically."""
     if (isinstance(ours, str) and isinstance(theirs, str)) or ours == theirs:
         return []
@@ -253,12 +264,12 @@ framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 # ---- what we say ----
 
 
-def received(said: Said) -> tuple[int, Verdict]:
+def received(said: SampleFrame) -> tuple[int, Verdict]:
     used, message = parse_request(said.framing, said.frame)
     return used, FrameFault(used).name if message is None else trimmed(message)
 
 
-def answered(said: Said) -> Verdict:
+def answered(said: SampleFrame) -> Verdict:
     used, message = parse_reply(said.framing, said.frame, said.request)
     return FrameFault(used).name if message is None else trimmed(message)
 

@@ -71,7 +71,7 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
     number = LINES[name]
     before = descriptors(), threads()
     story = Story(of_one_variant(number))
-    story.tell(KINDS[kind])
+    story.run_with_fault(KINDS[kind])
     assert (descriptors(), threads()) == before
     assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
 
@@ -124,7 +124,7 @@ def test_a_delixi_drive_that_falls_silent_behind_a_new_echo_does_not_read_0_for_
 def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
     """Without rates the core polls without the poller's thread until a fault."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
-    story.tell(KINDS[kind])
+    story.run_with_fault(KINDS[kind])
     assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
 
 
@@ -144,9 +144,9 @@ def test_nothing_grows_for_hours() -> None:
         if hours:
             for kind in KINDS:
                 for drives in all_lines():
-                    Story(drives, seed=len(seen)).tell(KINDS[kind])
+                    Story(drives, seed=len(seen)).run_with_fault(KINDS[kind])
         else:
-            Story(of_all_variants(), seed=len(seen)).tell(KINDS["all"])
+            Story(of_all_variants(), seed=len(seen)).run_with_fault(KINDS["all"])
         seen.append((resident_kb(), descriptors(), threads()))
         print(f"pass {len(seen)}: %d kB, %d descriptors, %d threads" % seen[-1], flush=True)
     assert seen[-1][0] - seen[0][0] <= MOST_GROWTH_KB

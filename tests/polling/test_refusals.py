@@ -12,7 +12,7 @@ from examples import examples, usually
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from lines import patient, polled
-from picky import Picky, family, right
+from picky import Picky, expected_values, family
 from toy import Toy
 
 from multidrop.core import NumberFormat
@@ -76,7 +76,7 @@ def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(ev
         sim.asked.clear()
         rows = clocked.run(10)
         told = clocked.poller.summary()["lines"]["line"]["set_aside"]
-    assert values(rows) == right(set(range(WIDE)) - {7})
+    assert values(rows) == expected_values(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
     assert len(asked) <= 5  # log2 of 24, and 24 single requests
@@ -92,7 +92,7 @@ def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
         sim.asked.clear()
         rows = clocked.run(5)
         assert clocked.poller.summary()["lines"]["line"]["set_aside"] == []
-    assert values(rows) == right(range(WIDE))
+    assert values(rows) == expected_values(range(WIDE))
     assert {row.status for row in rows} == {"ok"}
     assert {count for _, count in sim.asked} == {6}
 
@@ -112,7 +112,7 @@ def test_what_was_refused_for_a_while_is_read_as_a_whole_again(monkeypatch: pyte
         sim.asked.clear()
         rows = clocked.run(3)
         assert clocked.poller.summary()["lines"]["line"]["set_aside"] == []
-    assert values(rows) == right(range(WIDE))
+    assert values(rows) == expected_values(range(WIDE))
     assert set(sim.asked) == {(0, WIDE)}
 
 
@@ -144,7 +144,7 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
         clocked.run(120)
         sim.asked.clear()
         rows = clocked.run(10)
-    assert values(rows) == right(range(WIDE))
+    assert values(rows) == expected_values(range(WIDE))
     assert {row.status for row in rows} == {"ok"}
     assert {count for _, count in sim.asked} == ({1} if longest == 1 else {6})
 
@@ -172,7 +172,7 @@ def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> N
         sim.asked.clear()
         rows = clocked.run(5)
     assert set(sim.asked) == {(0, WIDE)}
-    assert values(rows) == right(range(WIDE))
+    assert values(rows) == expected_values(range(WIDE))
 
 
 @pytest.mark.slow
@@ -219,7 +219,7 @@ def test_no_register_is_lost_that_can_be_read_by_itself(refused: set[int], most:
         rows = clocked.run(20)
         (line,) = clocked.poller._lines
         assert len(line._maker._made) <= 2 * 6
-    assert values(rows) == right(set(range(6)) - refused)
+    assert values(rows) == expected_values(set(range(6)) - refused)
 
 
 # ---- refused registers ----

@@ -57,7 +57,7 @@ ASKED = [pair for pair in READS if "native" not in pair.values[0]]
 def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[float], Delay], float]) -> None:
     path, seconds = slow
     story = Path(of_one_variant(LINES[name]))
-    answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
+    answering = story.run_over(path(seconds), TAIL + TURNS * seconds)
     assert answering == {drive.name for drive in story.drives}
 
 
@@ -65,7 +65,7 @@ def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[fl
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "longest"), STALLS)
 def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
-    Path(of_one_variant(LINES[name])).tell_of(stalling(longest))
+    Path(of_one_variant(LINES[name])).run_over(stalling(longest))
 
 
 @pytest.fixture
@@ -229,4 +229,4 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
 def test_all_families_on_a_slow_path_that_is_rough_too(kind: str) -> None:
     story = Path(of_all_variants())
     story.wire.faults = Faults(**{kind: 0.1})
-    story.tell_of(stalling(3.0))
+    story.run_over(stalling(3.0))

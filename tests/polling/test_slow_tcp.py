@@ -89,7 +89,7 @@ def test_a_slow_path_costs_time_and_no_truth(
     path, seconds = slow
     story = story_of(two_of(name), port=TCP)
     assert {drive.framing for drive in story.drives} == {Framing.TCP}
-    answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
+    answering = story.run_over(path(seconds), TAIL + TURNS * seconds)
     assert answering == {drive.name for drive in story.drives}
 
 
@@ -99,21 +99,23 @@ def test_a_slow_path_costs_time_and_no_truth(
 def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, story_of: type[Path]) -> None:
     story = story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP)
     story.wire.faults = Faults(**{kind: 0.2, "late": story.wire.most_late})
-    story.tell_of(stalling(1.0))
+    story.run_over(stalling(1.0))
     assert story.wire.struck[kind] > 50
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("story_of", usually(TrueIdsPath, OwnIdsPath))
 def test_a_stall_costs_no_truth(story_of: type[Path]) -> None:
-    story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).tell_of(stalling(15.0))
+    story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).run_over(
+        stalling(15.0)
+    )
 
 
 @pytest.mark.long
 def test_what_is_provably_late_holds_nothing_up() -> None:
     """No request waits for a late reply, and none is sent to prove anything."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
-    story.tell_of(stalling(3.0))
+    story.run_over(stalling(3.0))
     told = story.clocked.poller.summary()["lines"]["line"]
     assert told["late_replies"] > 0
     assert str(Status.LATE_ANSWER_DUE) not in told["misses"]

@@ -188,7 +188,7 @@ PUMP, FAN = InvtCHE(1, name="pump-1"), InvtCHE(2, name="вентилятор 2")
 PLAIN_FAN = InvtCHE(2, name="вентилятор-2")  # for nats-server, which rejects topics with a space
 
 
-class SaidHub:
+class ScriptedHub:
     """A hub whose values the test sets, by drive and register."""
 
     def __init__(self, fan: str) -> None:
@@ -223,7 +223,7 @@ class SaidHub:
         return Shown(self.state(drive), self.faults.get(drive))
 
 
-class NotedCommands:
+class RecordedCommands:
     """Command fakes that record each call and succeed."""
 
     def __init__(self) -> None:
@@ -255,8 +255,8 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
     polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
     drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, fan))
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
-    hub: Any = SaidHub(fan.name)
-    commands: Any = NotedCommands()
+    hub: Any = ScriptedHub(fan.name)
+    commands: Any = RecordedCommands()
     return PartContext(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
 
 

@@ -66,8 +66,10 @@ def preloaded(name: str, folder: Path) -> str:
     source = ROOT / f"tests/support/programs/{name}.c"
     _run([CC, "-std=c11", "-shared", "-fPIC", "-O1", *STRICT, "-o", library, source])
     loaded = [sys.executable, "-c", "print(open('/proc/self/maps').read())"]
-    told = subprocess.check_output(loaded, env=os.environ | {"LD_PRELOAD": str(library)}, text=True)
-    if library.name not in told:
+    loaded_libraries = subprocess.check_output(
+        loaded, env=os.environ | {"LD_PRELOAD": str(library)}, text=True
+    )
+    if library.name not in loaded_libraries:
         pytest.skip("this interpreter is started with libraries of its own alone")
     return str(library)
 

@@ -400,7 +400,7 @@ class ClockedLines:
         if threading.current_thread() not in self._beside:
             self._pass_until(end_ns)
         while self.now < end_ns:
-            assert not self._leaving, "no more time passes: finish it first"
+            assert not self._leaving, "time has ended: finish the thread first"
             time.sleep(0.0002)
 
     def command(self, drive: Drive, request: Message) -> None:

@@ -38,7 +38,7 @@ SENT = (CommandOutcome.DONE, CommandOutcome.FAILED)
 UNSENT = (CommandOutcome.NOT_SENT, CommandOutcome.REFUSED)
 
 
-class Asked(NamedTuple):
+class CommandRecord(NamedTuple):
     """One command: its setpoint (None: a stop), how it was requested, and its reported result."""
 
     drive: str
@@ -62,7 +62,7 @@ class Verdict(NamedTuple):
     oldest_s: float  # from the offer until the drive received the write
 
 
-class RoughCommands(FleetCommands):
+class UnreliableCommands(FleetCommands):
     """A client whose messages are duplicated and delayed, as by a faulty network or program."""
 
     def __init__(self, urls: Sequence[str], log: Path, dice: random.Random) -> None:
@@ -189,29 +189,29 @@ class CommandDrill:
                     assert time.monotonic() < ends, found.text
                     await asyncio.sleep(0.1)
 
-    async def _asker(self, drive: str, commands: int, seconds: float, seed: float) -> list[Asked]:
+    async def _asker(self, drive: str, commands: int, seconds: float, seed: float) -> list[CommandRecord]:
         dice = random.Random(seed)
         number = -(-commands // len(self.sims))
         assert number < HIGHEST
         found = []
-        async with RoughCommands(self.nats.urls, self.folder / f"{drive}.asked.jsonl", dice) as asker:
+        async with UnreliableCommands(self.nats.urls, self.folder / f"{drive}.asked.jsonl", dice) as asker:
             for raw in range(1, number + 1):
                 if raw % STOP_EVERY == 0:
                     found.append(await self._stop(asker, drive))
                 else:
                     asker.way = "no offer"
                     answer = await asker.write(drive, "frequency", raw / 100)
-                    found.append(Asked(drive, raw, asker.way, asker.offered_s, answer.outcome, 0))
+                    found.append(CommandRecord(drive, raw, asker.way, asker.offered_s, answer.outcome, 0))
                 await asyncio.sleep(dice.uniform(0, 2 * seconds / number))
             await asker.settle()
         return found
 
-    async def _stop(self, asker: FleetCommands, drive: str) -> Asked:
+    async def _stop(self, asker: FleetCommands, drive: str) -> CommandRecord:
         before = self.stops(drive)
         answer = await asker.stop([drive])
-        return Asked(drive, None, "stop", 0.0, answer.outcome, self.stops(drive) - before)
+        return CommandRecord(drive, None, "stop", 0.0, answer.outcome, self.stops(drive) - before)
 
-    def _judge(self, asked: Sequence[Asked], deeds: Counter[str]) -> Verdict:
+    def _judge(self, asked: Sequence[CommandRecord], deeds: Counter[str]) -> Verdict:
         seen = {drive: self.setpoints(drive) for drive in self.sims}
         noted = {
             (note["drive"], note["what"])

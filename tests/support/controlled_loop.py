@@ -16,7 +16,7 @@ class _PassingSelector(selectors.SelectSelector):
     def select(self, timeout: float | None = None) -> list[Any]:
         ready = super().select(0)
         if not ready:
-            assert timeout is not None, "nothing is left that could happen"
+            assert timeout is not None, "no event is pending"
             self.now += max(timeout, 0.0)
         return ready
 

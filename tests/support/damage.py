@@ -22,7 +22,7 @@ Body = bytes  # without start, end and checksum
 
 
 @dataclass(frozen=True)
-class Said:
+class SampleFrame:
     """A frame and its undamaged original; a reply also has its request."""
 
     framing: Framing
@@ -184,7 +184,7 @@ TEXT: dict[str, Change] = {
 }
 
 
-def frames(seed: int, framing: Framing, number: int, *, replies: bool) -> list[Said]:
+def frames(seed: int, framing: Framing, number: int, *, replies: bool) -> list[SampleFrame]:
     """Return requests or replies: whole, damaged with a correct checksum, damaged on the line, or foreign."""
     chance = random.Random(seed)
     left = LEFT if framing is Framing.RTU else LEFT | TEXT
@@ -205,5 +205,5 @@ def frames(seed: int, framing: Framing, number: int, *, replies: bool) -> list[S
         if damage == "left":
             damage = chance.choice(list(left))
             frame = left[damage](chance, frame)
-        found.append(Said(framing, frame, request, damage))
+        found.append(SampleFrame(framing, frame, request, damage))
     return found

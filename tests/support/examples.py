@@ -40,14 +40,14 @@ def every_third(cases: Sequence[object]) -> list[Any]:
 def every_fourth(each: Iterable[object], cases: Sequence[object], tried: Sequence[object]) -> list[Any]:
     """Return every fourth pair, along diagonals, and those `tried`; all but `tried` are marked `long`."""
     return [
-        pytest.param(one, case, id=f"{one}-{_told(case)}", marks=() if is_tried else pytest.mark.long)
+        pytest.param(one, case, id=f"{one}-{_case_id(case)}", marks=() if is_tried else pytest.mark.long)
         for number, one in enumerate(each)
         for nth, case in enumerate(cases)
         if (is_tried := (one, case) in tried) or (number + nth) % 4 == 0
     ]
 
 
-def _told(case: object) -> str:
+def _case_id(case: object) -> str:
     parts = case if isinstance(case, tuple) else (case,)
     return "-".join(getattr(part, "__name__", str(part)) for part in parts)
 

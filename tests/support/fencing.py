@@ -137,7 +137,7 @@ class Fence:
         try:
             yield watched
         finally:
-            _tell(watched, signal.SIGKILL)
+            _signal(watched, signal.SIGKILL)
             _await_death(watched, PATIENCE_S)
             os.close(watched)
             while select.select([self._ours], [], [], 0)[0]:
@@ -170,7 +170,7 @@ class Fence:
             if _await_death(master, 0):
                 return False
             if now_s() > end:
-                _tell(master, signal.SIGUSR1)  # prints the stack of each thread
+                _signal(master, signal.SIGUSR1)  # prints the stack of each thread
                 time.sleep(1.0)
                 requests = self.far.requests - asked
                 raise AssertionError(
@@ -184,7 +184,7 @@ class Fence:
         while (left := stop_s - now_s()) > 0:
             if self._grant(left):
                 seen_s = now_s()
-        _tell(master, signal.SIGSTOP)
+        _signal(master, signal.SIGSTOP)
         while (left := seen_s + self._lease + self._guard - now_s()) > 0:
             if self._grant(left):  # a renewal it requested before the suspension
                 seen_s = now_s()
@@ -192,13 +192,13 @@ class Fence:
         self.far.settle(1.0)
         before = self.far.requests
         time.sleep(chance.uniform(0, 0.02))
-        _tell(master, signal.SIGCONT)
+        _signal(master, signal.SIGCONT)
         time.sleep(WATCHED_S)
         self.far.settle(0.1)
         return Round(self.far.requests - before, _await_death(master, 0))
 
 
-def _tell(master: int, number: int) -> None:
+def _signal(master: int, number: int) -> None:
     with suppress(ProcessLookupError):
         signal.pidfd_send_signal(master, number)
 

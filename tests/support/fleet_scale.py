@@ -134,8 +134,8 @@ class LargeFleet:
         wanted = sorted(self.lines)
 
         def found() -> list[str]:
-            told = [process.ask().values() for process in self.processes]
-            return sorted(line for gateways in told for lines in gateways for line in lines)
+            answers = [process.ask().values() for process in self.processes]
+            return sorted(line for gateways in answers for lines in gateways for line in lines)
 
         until(lambda: found() == wanted, "each line has one gateway")
 
@@ -147,7 +147,7 @@ class LargeFleet:
             process.kill()
 
 
-def nowhere(lines: int) -> dict[str, Any]:
+def plant_of_fake_lines(lines: int) -> dict[str, Any]:
     """Return a plant of this many fake lines."""
     return {f"line-{at}": {"line": {"name": f"line-{at}"}, "files": {}} for at in range(lines)}
 

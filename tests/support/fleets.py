@@ -114,7 +114,7 @@ class GatedBucket(MemoryBucket):
         return stored or await super().put(key, value, revision)
 
 
-class NotedMastership:
+class RecordingMastership:
     """A mastership that records its deadline, and raises the engine's errors."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
@@ -122,7 +122,7 @@ class NotedMastership:
         self.until = 0
         self.ends = 0
         self.events: list[str] = []
-        self.lines: NotedLines | None = None
+        self.lines: RecordingLines | None = None
 
     def extend(self, until_ns: int) -> None:
         assert until_ns > self.clock(), "armed at a time that is past"
@@ -144,10 +144,10 @@ class NotedMastership:
         return self.clock() < self.until
 
 
-class NotedLines:
+class RecordingLines:
     """Fake lines: which gateway had which line when, and whether two ever had one at a time."""
 
-    def __init__(self, name: str, mastership: NotedMastership, hall: Hall) -> None:
+    def __init__(self, name: str, mastership: RecordingMastership, hall: Hall) -> None:
         self.name = name
         self.mastership = mastership
         self.hall = hall
@@ -168,16 +168,16 @@ class Hall:
     """The lines of all gateways, as the drives see them."""
 
     def __init__(self) -> None:
-        self.gateways: list[NotedLines] = []
+        self.gateways: list[RecordingLines] = []
         self.overlaps: list[str] = []
         self.at: dict[str, float] = {}  # time of each line's last claim
 
-    def add(self, name: str, mastership: NotedMastership) -> NotedLines:
-        lines = NotedLines(name, mastership, self)
+    def add(self, name: str, mastership: RecordingMastership) -> RecordingLines:
+        lines = RecordingLines(name, mastership, self)
         self.gateways.append(lines)
         return lines
 
-    def look(self, line: str, taker: NotedLines) -> None:
+    def look(self, line: str, taker: RecordingLines) -> None:
         for other in self.gateways:
             if other is not taker and line in other.taken and other.mastership.may_send:
                 self.overlaps.append(f"{line}: {other.name} and {taker.name}")

@@ -95,7 +95,7 @@ class Users:
             self._scraper,
             self._asker,
             self._cached_master,
-            self._passing_master,
+            self._uncached_master,
         ]
         await asyncio.gather(*(self._again(user) for user in users))
 
@@ -179,7 +179,7 @@ class Users:
         """Read the polled words of each drive in turn."""
         await self._master(lambda turn: (self.place.first, WORDS), "reads")
 
-    async def _passing_master(self) -> None:
+    async def _uncached_master(self) -> None:
         """Read the common block of each drive in turn, and occasionally an unpolled register."""
 
         def wanted(turn: int) -> tuple[int, int]:

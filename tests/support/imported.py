@@ -193,7 +193,7 @@ def only(folder: Path, name: str, contents: str | dict[str, Any]) -> ImportedDev
     return device
 
 
-def told(device: ImportedDevice) -> list[str]:
+def omissions(device: ImportedDevice) -> list[str]:
     """Return the importer's sentences about omitted entries."""
     return [str(lost) for lost in device.lost]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from damage import BITS, ECHOES, READS, Said
+from damage import BITS, ECHOES, READS, SampleFrame
 from peers import build_with_libmodbus, require_module
 
 from multidrop.core import Framing, Message
@@ -19,7 +19,7 @@ Verdict = Message | str  # a string is the reason for rejection
 JUDGE = Path(__file__).parents[1] / "c" / "libmodbus_judge.c"
 EXCEPTIONS = range(12)  # errno of libmodbus for exceptions 00 to 0B; its own errors follow
 EMBBADEXC = 14
-UNKNOWN_CODE = "an exception whose code is not told"
+UNKNOWN_CODE = "an exception without a code"
 NO_FUNCTION = "it has no such function"
 
 
@@ -50,13 +50,13 @@ class Libmodbus:
         done = subprocess.run([self._program], input=said, capture_output=True, text=True, check=True)
         return done.stdout.splitlines()
 
-    def hear(self, requests: Sequence[Said]) -> list[Understood | str]:
+    def hear(self, requests: Sequence[SampleFrame]) -> list[Understood | str]:
         """Return what its server does on these requests, which are all addressed to it."""
         return [
             _received(line) for line in self._run(f"request {_text(request.frame)}" for request in requests)
         ]
 
-    def ask(self, replies: Sequence[Said]) -> list[tuple[bytes, Verdict]]:
+    def ask(self, replies: Sequence[SampleFrame]) -> list[tuple[bytes, Verdict]]:
         """Return its client's requests, and how it decodes these replies."""
         asked = [reply.request for reply in replies]
         lines = [
@@ -182,18 +182,18 @@ class Pymodbus:
         self._server = make(self._pdu.DecodePDU(True))
         self._client = make(self._pdu.DecodePDU(False))
 
-    def hear(self, said: Said) -> Verdict:
+    def hear(self, said: SampleFrame) -> Verdict:
         """Return the request that its server decodes."""
         return self._open(self._server, said, address=0)
 
-    def ask(self, said: Said) -> Verdict:
+    def ask(self, said: SampleFrame) -> Verdict:
         """Return how its client decodes the reply."""
         found = self._open(self._client, said, said.request.address)
         if isinstance(found, Message) and found.function in READS and not found.exception:
             return replace(found, start=said.request.start, count=said.request.count)
         return found
 
-    def _open(self, framer: Any, said: Said, address: int) -> Verdict:
+    def _open(self, framer: Any, said: SampleFrame, address: int) -> Verdict:
         try:
             _, pdu = framer.handleFrame(said.frame, address, 0)
         except (ValueError, self._failure) as failure:

@@ -51,20 +51,20 @@ def audit(directory: Path) -> Path:
 
 
 def live(port: str, directory: Path, life: str, number: int) -> None:
-    told = (directory / f"{life}.told").open("wb", buffering=0)
+    log = (directory / f"{life}.told").open("wb", buffering=0)
     drive = Counted(1, name=NAME)
     polled = PolledDrive(drive, (Polled(Counted.count, None),))
     plant = Plant((PlantLine("line", port, None, None, (polled,)),), directory / "plant.toml")
     writers = [open_writer(directory / f"{life}{suffix}", METADATA) for suffix in (".arrows", ".csv")]
-    told.write(b"rows 0\n")
+    log.write(b"rows 0\n")
     with Poller(plant, ledger=ledger(directory), audit=audit(directory)) as poller:
         for at in count(number):
             while batch := poller.take():
                 for writer in writers:
                     writer.write(batch)
-                told.write(b"rows %d\n" % writers[0].rows)
+                log.write(b"rows %d\n" % writers[0].rows)
             drive.write(Counted.number, at)
-            told.write(b"wrote %d\n" % at)
+            log.write(b"wrote %d\n" % at)
 
 
 def main() -> None:

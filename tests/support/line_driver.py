@@ -63,7 +63,7 @@ class LineDriver:
     def echo(self, known: int) -> None:
         self._line.echo = known
 
-    def tell_echo(self, known: int) -> None:
+    def set_echo(self, known: int) -> None:
         """Set the echo, as a line's user does."""
         self.echo, self._line.echo_is_told = known, known == lib.MD_ECHO
 

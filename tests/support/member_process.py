@@ -43,7 +43,7 @@ class NoMastership:
         pass
 
 
-def tell(**what: object) -> None:
+def report(**what: object) -> None:
     print(json.dumps(what), flush=True)
 
 
@@ -56,12 +56,12 @@ async def live(urls: list[str], names: list[str]) -> None:
     tasks = [asyncio.create_task(member.run()) for member in members]
     asks = asyncio.create_task(answer(members))
     counts = dict.fromkeys(names, 0)
-    tell(ready=True)
+    report(ready=True)
     while not any(task.done() for task in (*tasks, asks)):
         for member in members:
             if counts[member.name] != len(member.polled):
                 counts[member.name] = len(member.polled)
-                tell(gateway=member.name, at=monotonic(), lines=counts[member.name])
+                report(gateway=member.name, at=monotonic(), lines=counts[member.name])
         await asyncio.sleep(LOOK_S)
     for task in tasks:
         task.cancel()
@@ -73,7 +73,7 @@ async def live(urls: list[str], names: list[str]) -> None:
 async def answer(members: list[Member]) -> None:
     while await asyncio.to_thread(sys.stdin.readline):
         for member in members:
-            tell(gateway=member.name, polled=sorted(member.polled), margin_s=member.lease.left_s)
+            report(gateway=member.name, polled=sorted(member.polled), margin_s=member.lease.left_s)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ Meter: type[Drive] = type(
     "Meter",
     (Drive,),
     {
-        "__doc__": "A meter of which nothing is said but its registers.",
+        "__doc__": "A meter with only its registers stated.",
         **floats(),
         "serial_number": reading(0xFC00, table=HOLDING, number_format=NumberFormat.U32),
     },
@@ -51,7 +51,7 @@ StatedMeter: type[Drive] = type(
     "StatedMeter",
     (Drive,),
     {
-        "__doc__": "The same with what its document says of reading.",
+        "__doc__": "The same meter with its documented read limits.",
         "most_registers": {INPUT: 80, HOLDING: 80},
         "readable_gaps": {INPUT: range(0x180)},
         **floats(),

@@ -134,16 +134,16 @@ class Node:
 
     def leads_servers(self) -> bool:
         """Return True if this server leads the assignment of streams."""
-        return bool(self._told("")["meta_cluster"]["leader"] == self.name)
+        return bool(self._jetstream_state("")["meta_cluster"]["leader"] == self.name)
 
-    def _told(self, about: str) -> Any:
+    def _jetstream_state(self, about: str) -> Any:
         url = f"http://{self.host}:{self.monitor}/jsz{about}"
         with closing(urllib.request.urlopen(url, timeout=2)) as answer:
             return json.load(answer)
 
     def leads(self) -> set[str]:
         """Return the streams that this server leads."""
-        found = self._told("?streams=true&accounts=true")
+        found = self._jetstream_state("?streams=true&accounts=true")
         streams = [one for account in found["account_details"] for one in account.get("stream_detail") or ()]
         return {one["name"] for one in streams if one.get("cluster", {}).get("leader") == self.name}
 
@@ -219,12 +219,12 @@ def cluster(
     def make(attempt: int) -> Cluster:
         return Cluster(folder / str(attempt) if attempt else folder, number, program, places)
 
-    with begun(make) as running:
+    with started_cluster(make) as running:
         yield running
 
 
 @contextmanager
-def begun(make: Callable[[int], C]) -> Iterator[C]:
+def started_cluster(make: Callable[[int], C]) -> Iterator[C]:
     """Start servers and wait for them; retry if another program took a free port in between."""
     for attempt in range(ATTEMPTS):
         running = make(attempt)

@@ -18,7 +18,7 @@ def family(registers: int, **declared: Any) -> type[Drive]:
     return type("Plain", (Drive,), {"__doc__": "Of this test.", **readings, **declared})
 
 
-def right(addresses: Iterable[int]) -> dict[str, float]:
+def expected_values(addresses: Iterable[int]) -> dict[str, float]:
     """Return a picky device's values at these addresses, by register name."""
     return {f"r{at}": 100 + at for at in addresses}
 

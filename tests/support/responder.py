@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import checksums
-from responder_drives import DELIXI, Asked, ResponderDrive
+from responder_drives import DELIXI, DriveRequest, ResponderDrive
 
 __all__ = ["ReceivedFrame", "Responder", "ResponderLine"]
 
@@ -134,11 +134,11 @@ class Responder:
         """Run the job in the responder thread, and wait until it is done."""
         done = threading.Event()
 
-        def do_and_tell() -> None:
+        def run_and_notify() -> None:
             job()
             done.set()
 
-        self._jobs.append(do_and_tell)
+        self._jobs.append(run_and_notify)
         os.write(self._waker, b"\0")
         done.wait()  # a signal handler may interrupt this wait, and the job still completes
 
@@ -268,7 +268,7 @@ class ReceivedFrame:
     connection: int  # increases each time the port comes back
     frame: bytes
     what: str
-    asked: Asked | None
+    asked: DriveRequest | None
 
     def __str__(self) -> str:
         said = (
@@ -277,7 +277,7 @@ class ReceivedFrame:
         return f"{self.at / 1e9:.4f} {self.what:8}{said}"
 
 
-def split(buffer: bytes) -> tuple[bytes, Asked | None, bytes]:
+def split(buffer: bytes) -> tuple[bytes, DriveRequest | None, bytes]:
     """Return the first frame, its request (None if its checksum is wrong), and the rest; without a frame,
     b"".
     """
@@ -296,24 +296,24 @@ def split(buffer: bytes) -> tuple[bytes, Asked | None, bytes]:
     return frame, _standard(frame[:-2]), rest
 
 
-def _ascii(frame: bytes) -> Asked | None:
+def _ascii(frame: bytes) -> DriveRequest | None:
     body = frame[1:-4].decode("ascii", "replace")
     with suppress(ValueError):
         if frame == checksums.delixi(body):
             octets = bytes.fromhex(body)
             start, value = int.from_bytes(octets[2:4]), int.from_bytes(octets[4:])
-            return Asked(octets[0], octets[1], start, value)
+            return DriveRequest(octets[0], octets[1], start, value)
         if frame == checksums.ascii(body):
             return _standard(bytes.fromhex(body))
     return None
 
 
-def _standard(body: bytes) -> Asked:
+def _standard(body: bytes) -> DriveRequest:
     value = body[7:9] if body[1] in (15, 16) else body[4:6]
-    return Asked(body[0], body[1], int.from_bytes(body[2:4]), int.from_bytes(value))
+    return DriveRequest(body[0], body[1], int.from_bytes(body[2:4]), int.from_bytes(value))
 
 
-def reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: int = 0) -> bytes:
+def reply(drive: ResponderDrive, asked: DriveRequest, frame: bytes, exception: int = 0) -> bytes:
     """Execute a request; return the drive's reply."""
     if drive.kind.protocol == DELIXI:
         return _delixi_reply(drive, asked, frame, exception)
@@ -330,7 +330,7 @@ def reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: int = 0)
     return checksums.ascii(body) if frame[:1] == b":" else checksums.rtu(body)
 
 
-def _delixi_reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: int) -> bytes:
+def _delixi_reply(drive: ResponderDrive, asked: DriveRequest, frame: bytes, exception: int) -> bytes:
     head = f"{asked.address:02X}"
     if exception:
         return checksums.delixi(f"{head}{exception:02X}000000000000")
@@ -398,7 +398,7 @@ class ResponderLine:
             replies += self._answer(frame, asked)
         return replies
 
-    def _answer(self, frame: bytes, asked: Asked | None) -> list[bytes]:
+    def _answer(self, frame: bytes, asked: DriveRequest | None) -> list[bytes]:
         drives = [] if asked is None else self._addressed(asked.address)
         self.log.append(
             ReceivedFrame(time.monotonic_ns(), self.connection, frame, _what(asked, drives), asked)
@@ -437,11 +437,11 @@ class ResponderLine:
                 self.held.set()
 
 
-def _is_write(drive: ResponderDrive, asked: Asked) -> bool:
+def _is_write(drive: ResponderDrive, asked: DriveRequest) -> bool:
     return asked.function in (DELIXI_WRITES if drive.kind.protocol == DELIXI else WRITES)
 
 
-def _what(asked: Asked | None, drives: Sequence[ResponderDrive]) -> str:
+def _what(asked: DriveRequest | None, drives: Sequence[ResponderDrive]) -> str:
     if asked is None:
         return "damaged"
     if not drives or not _is_write(drives[0], asked):

@@ -14,7 +14,7 @@ STANDARD, DELIXI = "standard", "Delixi's own"
 COIL_ON = 0xFF00
 
 
-class Asked(NamedTuple):
+class DriveRequest(NamedTuple):
     """A request: `value` is a read's count or a write's value."""
 
     address: int
@@ -23,7 +23,7 @@ class Asked(NamedTuple):
     value: int
 
 
-Judge = Callable[[Asked], bool]
+Judge = Callable[[DriveRequest], bool]
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
     return lambda each: (each.function, each.start) == (function, start) and judge(each.value)
 
 
-def _erman_moves(asked: Asked) -> bool:
+def _erman_moves(asked: DriveRequest) -> bool:
     """Return True for START on, or STOP or EMERGENCY STOP off (section 10, commands)."""
     start = (asked.start, asked.value) == (0, COIL_ON)
     return asked.function == 15 or (
@@ -55,7 +55,7 @@ def _erman_moves(asked: Asked) -> bool:
     )
 
 
-def _erman_stops(asked: Asked) -> bool:
+def _erman_stops(asked: DriveRequest) -> bool:
     off = (asked.start, asked.value) == (0, 0)
     return asked.function == 5 and (off or (asked.start in (1, 2) and asked.value == COIL_ON))
 
@@ -181,7 +181,7 @@ class ResponderDrive:
         """Return the state for function 03 of Delixi's own protocol."""
         return 2 if self.turns else 1
 
-    def write(self, asked: Asked) -> None:
+    def write(self, asked: DriveRequest) -> None:
         before = self.runs
         if asked.function == 5:
             self._coils[asked.start] = asked.value

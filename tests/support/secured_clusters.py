@@ -16,7 +16,7 @@ from typing import Any
 
 from fleet_drills import fleet_status
 from kills import kill_all
-from nats_clusters import Cluster, Node, begun, server_program
+from nats_clusters import Cluster, Node, server_program, started_cluster
 from peers import require_program
 from serial_hall import SerialHall
 
@@ -143,7 +143,9 @@ class SecuredCluster(Cluster):
 def secured_cluster(
     folder: Path, number: int = 3, gateways: Sequence[str] = GATEWAYS, change: Change = _as_written
 ) -> Iterator[SecuredCluster]:
-    with begun(lambda attempt: SecuredCluster(folder / str(attempt), number, gateways, change)) as running:
+    with started_cluster(
+        lambda attempt: SecuredCluster(folder / str(attempt), number, gateways, change)
+    ) as running:
         yield running
 
 

@@ -73,7 +73,7 @@ class Story:
                 self.clocked.command(self.motor, command)
                 self.run(0.5)
 
-    def tell(self, faults: Faults) -> None:
+    def run_with_fault(self, faults: Faults) -> None:
         """Run before, during and after the fault; check that the rate recovers."""
         with self.clocked:
             cycle = _longest_gap([row for row in self.run(HEALTHY) if row.value is not None])
@@ -120,10 +120,10 @@ class Story:
         self.judge_values()
         misses = Counter(row.status for row in self.rows if row.value is None)
         assert {why for why in misses if not why.startswith("exception ")} <= REASONS
-        told = self.clocked.poller.summary()
-        line = told["lines"]["line"]
-        assert told["dropped"] == 0
-        assert told["samples"] + misses.total() == len(self.rows)
+        summary = self.clocked.poller.summary()
+        line = summary["lines"]["line"]
+        assert summary["dropped"] == 0
+        assert summary["samples"] + misses.total() == len(self.rows)
         assert Counter(line["misses"]) == misses
         slots = int(self.clocked.seconds / self.every) - 1 if self.every else 0
         rows = Counter((row.drive, row.register) for row in self.rows)
@@ -211,7 +211,7 @@ class Path(Story):
 
     wires = PathWire
 
-    def tell_of(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
+    def run_over(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
         """Check every row; return the drives with values at the end."""
         self.wire.delay = delay
         with self.clocked:

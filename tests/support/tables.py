@@ -24,20 +24,20 @@ def table(
     columns = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
     several = not isinstance(names, str) or len(columns) > 1
     values = [tuple(row) if several else (row,) for row in rows]
-    told = values if ids is None else list(ids)
-    assert values, "a table without rows proves nothing"
-    assert len(told) == len(values), "each row has an id"
+    row_ids = values if ids is None else list(ids)
+    assert values, "a table needs rows"
+    assert len(row_ids) == len(values), "each row has an id"
     assert all(len(row) == len(columns) for row in values), f"each row has {columns}"
 
     def decorate(test: Test) -> Test:
         @functools.wraps(test)
         def walked(**others: Any) -> None:
             failed: list[BaseException] = []
-            for row, name in zip(values, told, strict=True):
+            for row, row_id in zip(values, row_ids, strict=True):
                 try:
                     test(**dict(zip(columns, row, strict=True)), **others)
                 except FAILURES as failure:
-                    failure.add_note(f"in the row {name!r}")
+                    failure.add_note(f"in the row {row_id!r}")
                     failed.append(failure)
             if failed:
                 raise BaseExceptionGroup(f"{len(failed)} of {len(values)} rows failed", failed)

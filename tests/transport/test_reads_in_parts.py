@@ -8,7 +8,7 @@ import checksums
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from picky import Picky, family, right
+from picky import Picky, expected_values, family
 from simulated_bus import SimulatedBus
 
 from multidrop.core import NumberFormat
@@ -24,7 +24,7 @@ def test_a_refusal_splits_and_is_remembered(monkeypatch: pytest.MonkeyPatch) -> 
     bus = SimulatedBus(monkeypatch, sim)
     bus.attach(drive)
     first = drive.read_many(drive.registers.values())
-    assert first == right(range(WIDE))
+    assert first == expected_values(range(WIDE))
     assert [count for _, count in sim.asked] == [24, 12, 6, 6, 12, 6, 6]
     sim.asked.clear()
     assert drive.read_many(drive.registers.values()) == first
@@ -50,9 +50,9 @@ def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch
         drive.read_many(drive.registers.values())
     assert sim.asked == [(3, 1)]  # useless requests are not repeated
     sim.missing.clear()
-    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     others = [register for register in drive.registers.values() if register.address != 3]
-    assert drive.read_many(others) == right(set(range(WIDE)) - {3})
+    assert drive.read_many(others) == expected_values(set(range(WIDE)) - {3})
 
 
 @given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
@@ -64,7 +64,7 @@ def test_all_comes_or_what_is_refused_is_named(refused: set[int], most: int, ask
         registers = [drive.register(f"r{at}") for at in sorted(asked)]
         for _ in range(2):  # then the parts are known
             if not refused & asked:
-                assert drive.read_many(registers) == right(asked)
+                assert drive.read_many(registers) == expected_values(asked)
                 continue
             with pytest.raises(DriveException) as caught:
                 drive.read_many(registers)
@@ -101,9 +101,9 @@ def test_silence_to_a_long_request_splits_where_a_short_one_is_answered(
     drive = family(WIDE)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, sim := Picky(drive, silent_beyond=8))
     bus.attach(drive)
-    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     sim.asked.clear()
-    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     assert [count for _, count in sim.asked] == [6] * 4
 
 
@@ -115,7 +115,7 @@ def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) ->
         drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3 + [(0, 1)]
     sim.silent_beyond = 125
-    assert drive.read_many(drive.registers.values()) == right(range(WIDE))
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     sim.asked.clear()
     sim.silent_beyond = 1  # noise, say: it has answered the whole
     with pytest.raises(NoReply):

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from controlled_loop import run_controlled
-from fleets import GatedBucket, HandClock, MemoryBucket, NotedMastership
+from fleets import GatedBucket, HandClock, MemoryBucket, RecordingMastership
 from peers import require_module
 from tables import table
 
@@ -29,10 +29,10 @@ class Trial:
     def __init__(self) -> None:
         self.clock = HandClock()
         self.buckets = [MemoryBucket(f"lease_{path}") for path in range(3)]
-        self.masterships: list[NotedMastership] = []
+        self.masterships: list[RecordingMastership] = []
 
     def lease(self, name: str = "a", lock: LifeLock | None = None) -> Lease:
-        self.masterships.append(NotedMastership(self.clock))
+        self.masterships.append(RecordingMastership(self.clock))
         buckets: Any = self.buckets
         return Lease(name, buckets, self.masterships[-1], lock=lock, clock=self.clock)
 
@@ -291,7 +291,7 @@ def test_a_late_path_of_an_ended_session_is_not_used_by_the_next() -> None:
 def test_a_suspension_between_clock_and_timer_is_survived() -> None:
     """A timer in the past would kill the process; the engine refuses it."""
 
-    class StandingStill(NotedMastership):
+    class StandingStill(RecordingMastership):
         def extend(self, until_ns: int) -> None:
             self.clock.pass_s(3)
             raise ValueError("past")

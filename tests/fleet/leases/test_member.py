@@ -11,7 +11,7 @@ from functools import partial
 from itertools import count
 
 import pytest
-from fleets import Hall, NotedMastership
+from fleets import Hall, RecordingMastership
 from nats_clusters import Cluster
 from peers import require_module
 
@@ -87,7 +87,7 @@ class Gateways:
     async def join(self, name: str) -> Member:
         paths = paths_of(self.cluster.urls)
         await open_all(paths)
-        mastership = NotedMastership(boottime_ns)
+        mastership = RecordingMastership(boottime_ns)
         lines = self.hall.add(name, mastership)
         member = Member(name, paths, lines, mastership, terms=self.terms)
         self.members[name] = member
@@ -157,7 +157,7 @@ async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> As
     buckets = [
         LeaseBucket(bucket, partial(paths.__getitem__, at), "other") for at, bucket in enumerate(names.LEASES)
     ]
-    mastership = NotedMastership(boottime_ns)
+    mastership = RecordingMastership(boottime_ns)
     lease = Lease("other", buckets, mastership, terms=LONG, note=lambda: {"draining": False})
     value = lease._value
     monkeypatch.setattr(lease, "_value", lambda **ended: {**value(**ended), "rules": RULES + 1})

@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 import pytest
-from fleets import HandClock, MemoryBucket, NotedMastership
+from fleets import HandClock, MemoryBucket, RecordingMastership
 from peers import require_module
 
 require_module("nats")
@@ -32,7 +32,7 @@ class Story:
 
     def begin(self, name: str, rules: int) -> Lease:
         """Begin the session of a gateway with these rules."""
-        lease = Lease(name, self.buckets, NotedMastership(self.clock), clock=self.clock)
+        lease = Lease(name, self.buckets, RecordingMastership(self.clock), clock=self.clock)
         with self._monkeypatch.context() as patch:
             patch.setattr(lease_rules, "RULES", rules)
             assert asyncio.run(lease.try_to_begin())

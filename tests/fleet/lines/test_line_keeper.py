@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fleets import GatedBucket, Hall, HandClock, MemoryBucket, NotedLines, NotedMastership
+from fleets import GatedBucket, Hall, HandClock, MemoryBucket, RecordingLines, RecordingMastership
 from peers import require_module
 
 require_module("nats")
@@ -40,8 +40,8 @@ class Trial:
 
     def __init__(self) -> None:
         self.clock = HandClock()
-        self.mastership = NotedMastership(self.clock)
-        self.lines = NotedLines("a", self.mastership, Hall())
+        self.mastership = RecordingMastership(self.clock)
+        self.lines = RecordingLines("a", self.mastership, Hall())
         leases: list[Any] = [MemoryBucket(name) for name in names.LEASES]
         self.lease = Lease("a", leases, self.mastership, clock=self.clock)
         nowhere: Any = None
@@ -538,7 +538,7 @@ def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogC
     assert "Traceback" in caplog.text
 
 
-class BrokenLines(NotedLines):
+class BrokenLines(RecordingLines):
     """Lines whose port cannot be opened, for this reason; "" opens them."""
 
     why = "nothing listens there"

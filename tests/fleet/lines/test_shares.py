@@ -6,7 +6,7 @@ import asyncio
 from collections import Counter
 from typing import Any
 
-from fleets import Hall, HandClock, NotedMastership
+from fleets import Hall, HandClock, RecordingMastership
 from peers import require_module
 
 require_module("nats")
@@ -25,7 +25,7 @@ class Trial:
 
     def __init__(self) -> None:
         self.clock = HandClock()
-        mastership = NotedMastership(self.clock)
+        mastership = RecordingMastership(self.clock)
         self.member = Member("a", [], Hall().add("a", mastership), mastership)
         self.member.lease.clock = self.clock
         self.member.lease.session = 1
