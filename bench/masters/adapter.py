@@ -1,4 +1,4 @@
-"""The one place in bench/, besides players/replay.py and many_adapter.py, that knows multidrop's API."""
+"""multidrop as a master. In bench/ only this file, players/replay.py and many_adapter.py use its API."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEASE_NS = 3600 * 1_000_000_000
 
 
 def silence(baudrate: int) -> float:
-    """Seconds that multidrop keeps between two exchanges: one bit more, for a second stop bit."""
+    """Return multidrop's pause between two exchanges in s: one bit longer, for a second stop bit."""
     drive = Played(1, baudrate=baudrate)
     return drive.needed_silence() + drive.settings.bit
 
@@ -47,7 +47,7 @@ def _plant_text(job: Job) -> str:
 
 @contextmanager
 def polling(job: Job, mastership: Mastership | None = None) -> Iterator[Poller]:
-    """All registers of all drives, as fast as the line allows."""
+    """Poll all registers of all drives, as fast as the line allows."""
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
         path.write_text(_plant_text(job))
@@ -57,7 +57,7 @@ def polling(job: Job, mastership: Mastership | None = None) -> Iterator[Poller]:
 
 
 def counts(poller: Poller) -> tuple[int, int]:
-    """Good exchanges and failures so far."""
+    """Return the numbers of good exchanges and of failures so far."""
     summary = poller.summary()
     return summary["samples"] // REGISTERS, summary["misses"] // REGISTERS
 
@@ -68,7 +68,7 @@ def missed(batch: Batch) -> int:
 
 
 def dropped(poller: Poller) -> int:
-    """Rows so far that nobody took in time; the summary says so too, but of thousands of drives at length."""
+    """Return the number of dropped rows; for thousands of drives, `summary` would take long."""
     return poller._row_queue.dropped
 
 
@@ -92,7 +92,7 @@ def multidrop(job: Job, mastership: Mastership | None = None) -> Iterator[Callab
 
 @contextmanager
 def leased(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
-    """Poll a line that other processes may take over: before each request the clock is looked at."""
+    """Poll with a mastership: the core checks the clock before each request."""
     mastership = Mastership()
     mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + LEASE_NS)
     try:
@@ -113,11 +113,11 @@ def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
 
 
 def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
-    """Good exchanges, and for each value how long after its reply's first byte the consumer had it.
+    """Return the number of good exchanges, and each value's delay in ms from its reply's first byte.
 
-    The consumer sleeps on the poller's descriptor and takes what there is as soon as it wakes.
+    The consumer sleeps on the poller's descriptor, and takes the rows as soon as it wakes.
     """
-    _replied_ns(decoder(1)())  # what is imported at the first use would make it late
+    _replied_ns(decoder(1)())  # imports at the first use would delay it
     late = [numpy.empty(0)]
     with polling(job) as poller:
         end = time.monotonic() + job.seconds
@@ -157,7 +157,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
     def decode() -> Batch:
         columns = Columns(BATCH_ROWS)
-        add, into = lib.md_columns_add, columns.c  # as the core's own thread does, with little of Python
+        add, into = lib.md_columns_add, columns.c  # as the core's own thread does, with little Python code
         for block, found in turns[: BATCH_ROWS // REGISTERS]:
             add(into, block.c, found, 0)
         return Batch(columns, *names)
@@ -166,7 +166,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
 
 def record(path: Path, decode: Callable[[], Batch], values: int) -> int:
-    """Decode and write until so many values are in the recording; how many there are."""
+    """Decode and write until the recording has that many values; return their number."""
     with open_writer(path, {}) as writer:
         while writer.rows < values:
             writer.write(decode())

@@ -21,7 +21,7 @@ class Job:
 
     @property
     def wire(self) -> float:
-        """Seconds from the beginning of a request to the end of its reply on paced_line."""
+        """Seconds from the start of a request to the end of its reply on paced_line."""
         return (8 + 5 + 2 * REGISTERS) * self.character + DELAY_S
 
     @property
@@ -30,7 +30,7 @@ class Job:
 
     @property
     def port_baudrate(self) -> int:
-        """The baud rate with which a rival opens the port; it takes its own waits from that."""
+        """The baud rate with which a rival opens the port; it computes its waits from it."""
         return self.baudrate or 115200
 
 

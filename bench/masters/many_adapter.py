@@ -1,4 +1,4 @@
-"""Polls lines that no plant file describes: on open descriptors, of all families, or unreliable ones."""
+"""Poll lines without a plant file: on open descriptors, with all families, or with unreliable replies."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from multidrop.transport.line import Line
 
 
 class Inherited(Line):
-    """A line on a descriptor that is open already, which no URL can name."""
+    """A line on an open descriptor, which has no URL."""
 
     def _open(self) -> None:
         os.set_blocking(int(self.port), False)
@@ -46,7 +46,7 @@ def _opened(port: str, *facts: Any) -> Line:
 
 @contextmanager
 def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
-    """All registers of the drives on each port: a path, or the number of an open descriptor."""
+    """Poll all registers of the drives on each port: a path, or the number of an open descriptor."""
     declared = tuple(
         PlantLine(
             port,
@@ -68,7 +68,7 @@ def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -
 def polling_lines(
     ports: Sequence[str], baudrate: int, drives: int = 16, every: float | None = None
 ) -> Iterator[Poller]:
-    """Drives with the addresses from 1 on each port; baud rate 0: without waits."""
+    """Poll drives with addresses from 1 on each port; baud rate 0: without waits."""
 
     def drive(port: str, address: int) -> Drive:
         name = _name(port, address)
@@ -84,13 +84,13 @@ def _name(port: str, address: int) -> str:
 
 
 def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds: float) -> list[float]:
-    """Return for each request of one drive per line how long after its slot it began to leave."""
+    """Return the delay of each request from the start of its slot, in us, for one drive per line."""
     with polling_lines(ports, baudrate, 1, every) as poller:
         batches = list(poller.batches(seconds))
         grids = {_name(line.name, 1): line.started_ns for line in poller._lines}
     period_ns = round(every * 1e9)
     sent_ns = {(row.drive, row.monotonic_ns - grids[row.drive]) for batch in batches for row in batch}
-    # The first ones are due at the moment at which polling starts.
+    # The first slots start with polling itself.
     return [sent % period_ns / 1e3 for _, sent in sorted(sent_ns) if sent > period_ns / 2]
 
 
@@ -99,7 +99,7 @@ def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds
 
 @dataclass(frozen=True)
 class Mixed:
-    """A line of all families in the arguments of mixed_line.c, and the bus cycle that it should reach."""
+    """A line of all families, as arguments of mixed_line.c, and its predicted bus cycle."""
 
     drives: Sequence[Drive]
     words: Sequence[str]
@@ -108,7 +108,7 @@ class Mixed:
 
 
 def mixed() -> Mixed:
-    """One drive of each family and framing, as its document leaves the factory."""
+    """Return a line with one drive of each family and framing, with its documented factory settings."""
     kinds = [(family, framing) for family in MODELS.values() for framing in family.framings]
     drives = [
         family(at, name=f"{family.model} {framing}", framing=framing)
@@ -130,13 +130,13 @@ def mixed() -> Mixed:
             )
         )
         for drive in drives
-        for demanded in [drive.needed_silence() + drive.settings.bit]  # we keep more around ASCII frames
+        for demanded in [drive.needed_silence() + drive.settings.bit]  # multidrop waits longer around ASCII
     ]
     return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
 
 def poll_mixed(port: str, seconds: float) -> dict[str, Any]:
-    """Return the summary of the line."""
+    """Poll the line; return its summary."""
     with _polling_drives({port: mixed().drives}, None) as poller:
         for _ in poller.batches(seconds):
             pass
@@ -149,24 +149,24 @@ def poll_mixed(port: str, seconds: float) -> dict[str, Any]:
 
 @dataclass
 class Judged:
-    """Poll drives whose replies are late, lost or doubled, and count what became of them."""
+    """Counts of values and replies on lines whose replies are late, lost or doubled."""
 
-    exchanges: int = 0  # whose requests left
+    exchanges: int = 0  # requests that were sent
     samples: int = 0
-    wrong: int = 0  # values that are another register's
-    beyond: int = 0  # of these, whose reply came when it was not to be expected any more
+    wrong: int = 0  # values of another register
+    beyond: int = 0  # of these, from replies later than three time-outs
     late: int = 0  # replies that were recognised after their time-out
     misses: Counter[str] = field(default_factory=Counter)
-    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # in vain, by drive and value
+    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # without a reply, by drive and value
 
 
 def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
-    """Poll until so many exchanges are done, and hold each value against what its register holds."""
+    """Poll for that many exchanges, and compare each value with its register's."""
     return _judged(ports, drives, lambda judged: judged.exchanges >= exchanges)
 
 
 def judge_for(ports: Sequence[str], seconds: float, drives: int) -> Judged:
-    """The same for so many seconds."""
+    """Do the same for that many seconds."""
     end = time.monotonic() + seconds
     return _judged(ports, drives, lambda judged: time.monotonic() >= end)
 
@@ -221,7 +221,7 @@ def _judge(batch: Batch, held: Mapping[tuple[str, str], int], judged: Judged) ->
 
 
 def _is_beyond(row: Mapping[str, Any], asked_ns: Mapping[tuple[str, int], int]) -> bool:
-    """Return True for a value that answers a request of more than three time-outs before."""
+    """Return True if the value answers a request from more than three time-outs ago."""
     question_ns = asked_ns.get((row["drive"], int(row["value"])))
     last_ns = 3e9 * Unreliable.response_timeout
     return question_ns is not None and row["monotonic_ns"] + row["uncertainty_ns"] - question_ns > last_ns

@@ -40,12 +40,12 @@ def leased(job: Job) -> Iterator[Poll]:
         yield poll
 
 
-# ---- masters that are called for each exchange: how to open, how to read ----
+# ---- masters that are called for each exchange: open and read functions ----
 
 
 @contextmanager
 def reading_by_hand(job: Job) -> Iterator[Read]:
-    """`drive.read_many` in a loop, in place of multidrop's poller."""
+    """Call `drive.read_many` in a loop, instead of multidrop's poller."""
     from bench.masters import adapter
 
     with adapter.reading(job) as read:
@@ -118,7 +118,7 @@ def in_turn(
             while time.monotonic() < end:
                 address = 1 + asked % job.drives
                 asked += 1
-                with suppress(Exception):  # each has its own for a failed exchange
+                with suppress(Exception):  # each rival has errors of its own
                     good += list(read(address)) == expected(address)
             return good, asked - good
 
@@ -128,7 +128,7 @@ def in_turn(
     return rival
 
 
-# ---- and one that is not ----
+# ---- a master that polls by itself ----
 
 
 @contextmanager
@@ -199,7 +199,7 @@ def _missing(wanted: Sequence[str]) -> set[str]:
 
 
 def insist_on(masters: Sequence[str]) -> None:
-    """Leave with one sentence that says what to install, if anything is missing."""
+    """Exit with one sentence that names the packages to install, if any is missing."""
     missing = _missing([name for name in masters if name in IN_PYTHON])
     if missing:
         sys.exit(f"rivals are missing: {sys.executable} -m pip install {' '.join(sorted(missing))}")
@@ -208,7 +208,7 @@ def insist_on(masters: Sequence[str]) -> None:
 
 
 def measure(master: str, job: Job) -> dict[str, Any]:
-    """Exchanges, failures, CPU seconds, seconds and version of a master that does the job."""
+    """Run a master; return exchanges, failures, CPU seconds, seconds and its version."""
     if master == "libmodbus":
         flags = subprocess.check_output(["pkg-config", "--cflags", "--libs", "libmodbus"], text=True).split()
         program = compiled("masters/libmodbus_master.c", *flags)
@@ -220,7 +220,7 @@ def measure(master: str, job: Job) -> dict[str, Any]:
 
 
 def measure_bare(job: Job, silence: float, asleep: float = 0.0) -> dict[str, Any]:
-    """The same of bare_master.c: seconds of silence before a request, and without a look after it."""
+    """Return the same for bare_master.c: `silence` s before each request, `asleep` s of sleep after it."""
     command = [compiled("masters/bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
     command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]
     command += ["--asleep-us", asleep * 1e6, job.port]

@@ -1,6 +1,6 @@
 """multidrop as a master on Windows: `python windows_master.py JOB`, a Job as JSON; prints its result as JSON.
 
-It runs where there is no bench: of this folder it takes the drives alone.
+It runs without the package `bench`, and uses only the declared drives of this folder.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def plant_text(job: dict[str, Any]) -> str:
 
 
 def values_of(batch: Any) -> int:
-    """Return how many values it has; a value that the drive does not hold ends this program."""
+    """Return the number of values; a wrong value ends this program."""
     found = 0
     for row in batch:
         address, register = int(row.drive.partition("-")[2]), int(row.register[1:])

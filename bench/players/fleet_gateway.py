@@ -1,7 +1,8 @@
 """A gateway of known samples: `python -m bench.players.fleet_gateway NAME FOLDER TOLD URL...`
 
-It appends exchanges that count up, and notes in the file TOLD how many it was told to be on the disk: lines
-of a run's first number and a count. With `-` for TOLD it forwards what it has. It is killed at any moment.
+It appends numbered exchanges. In the file TOLD it notes how many the spool reported as stored, as lines with
+a run's first number and a count. With `-` for TOLD it only forwards its samples. It may be killed at any
+moment.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.samples_stream import StreamError, connect
 from multidrop.fleet.samples.spool import Spool
 
-EXCHANGES = 100  # of a batch
+EXCHANGES = 100  # in a batch
 RATE = 1000  # exchanges a second: 10,000 values
 GAP = 1_000_000  # between the first numbers of two runs
 
@@ -37,11 +38,11 @@ async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:
         await asyncio.gather(*doing)
     except Exception:
         traceback.print_exc()
-    os._exit(1)  # neither ends by itself, and the thread would go on
+    os._exit(1)  # neither ends by itself, and the thread would continue
 
 
 def fill(spool: Spool, drives: Names, told: Path) -> None:
-    """Append for ever."""
+    """Append without end."""
     runs = len({line.split()[0] for line in told.read_text().splitlines()}) if told.exists() else 0
     first, count, begun = runs * GAP, 0, time.monotonic()
     with told.open("a") as file:

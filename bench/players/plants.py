@@ -1,7 +1,7 @@
-"""Simulated lines in a process of their own, of all families and hostile, and what their values prove.
+"""Simulated lines with all families and faults, in a separate process.
 
-The demo's eight variants hold values that name drive and register (EncodedDrive). A ninth drive on
-each line has a motor, so that its starts can bring noise.
+The demo's eight variants have values that encode drive and register (EncodedDrive), so each value proves
+its origin. A ninth drive on each line has a motor, because starts cause noise.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from multidrop.plant.model import Plant
 from multidrop.sim import EncodedDrive, Faults, FaultyWire, Simulator, Wire, proof, serve, simulated
 
 MOTOR = "fan"
-EVERY = 2.0  # s, of each drive's first register; the others as fast as the line allows
+EVERY = 2.0  # s, period of each drive's first register; the others have no rate
 PATIENCE = 30.0  # s, until the simulator has started
 BEAT = 5e-3  # s
-LONG = 30e-3  # s, that with the latest reply and a collision are near the shortest response time-out
+LONG = 30e-3  # s; with the latest reply and a collision, close to the shortest response time-out
 
 
 def write_plant(directory: Path, lines: int) -> Path:
-    """A plant file; the last of several lines is a TCP port, which the simulator chooses."""
+    """Write a plant file; the last of several lines has a TCP port that the simulator chooses."""
     path = directory / "plant.toml"
     tables = []
     for number in range(1, lines + 1):
@@ -69,25 +69,25 @@ def is_motor(drive: str) -> bool:
 
 @dataclass
 class RunningPlant:
-    """A running simulator: where its lines are, and how it fares."""
+    """A running simulator: its ports, and its delays."""
 
     ports: Sequence[str]
     pid: int
     _late: SynchronizedArray[float]
 
     def latest(self) -> float:
-        """The longest in s that the simulator or a pty was held up since this was asked last."""
+        """The longest delay of the simulator or a pty since the last call, in s."""
         with self._late.get_lock():
             late, self._late[0] = self._late[0], 0.0
         return late
 
     def was_held_up(self, since: float) -> bool:
-        """Return True if one was held up for so long that answers may have come after their time-out."""
+        """Return True if a delay was so long that replies may have come after their time-out."""
         return max(self._late[1:]) >= since
 
 
 def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
-    """The plant's lines with these faults, each drive but the motors' one of encoded values."""
+    """Return the plant's lines with these faults; all drives except the motors have encoded values."""
     return [
         FaultyWire(
             [
@@ -104,10 +104,10 @@ def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
 
 @contextmanager
 def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[RunningPlant]:
-    """The wires that this makes, in a process of their own, to which the function is handed over."""
+    """Run the wires that `make` returns in a separate process, which calls it."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    late = context.Array("d", 2)  # the longest time held up; when it was so for long the last time
+    late = context.Array("d", 2)  # the longest delay; the time of the last long delay
     process = context.Process(target=_simulate, args=(make, arguments, theirs, late), daemon=True)
     process.start()
     try:
@@ -128,7 +128,7 @@ def _simulate(
     connection: Connection,
     late: SynchronizedArray[float],
 ) -> None:
-    with suppress(OSError):  # so that the line keeps its time on a machine that has much else to do
+    with suppress(OSError):  # so that the line keeps its pace on a busy machine
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     Thread(target=_watch, args=(late,), daemon=True).start()
 
@@ -139,9 +139,9 @@ def _simulate(
 
 
 def _watch(late: SynchronizedArray[float]) -> None:
-    """Measure for how long this process, or a pty's worker in the kernel, is held up.
+    """Measure the delays of this process, and of a pty's worker in the kernel.
 
-    A drive that hears so late answers so late.
+    A drive that receives late replies late.
     """
     master, slave = os.openpty()
     tty.setraw(slave)

@@ -1,4 +1,4 @@
-"""The drives that paced_line.c and responders.c play, declared as a user declares a family of their own."""
+"""The drives that paced_line.c and responders.c play, declared as a family of one's own."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from multidrop.drive.register import HOLDING, INPUT, reading
 
 
 class Played(Drive):
-    """Register r of address a holds 256 * a + r."""
+    """Register r of address a has the value 256 * a + r."""
 
     model = "played"
     title = "Played by paced_line"
@@ -20,7 +20,7 @@ class Played(Drive):
 
 
 class NoTime(Settings):
-    """Characters that take next to no time, so that few of them are still better than many."""
+    """Characters that take almost no time, so that fewer of them are still better."""
 
     @property
     def character(self) -> float:
@@ -32,7 +32,7 @@ class NoTime(Settings):
 
 
 class Unpaced(Played):
-    """The same on a line that has no waits: what is left is the host's own cost."""
+    """The same on a line without waits, which shows the host's own cost."""
 
     response_delay = 0.0
 
@@ -42,7 +42,7 @@ class Unpaced(Played):
 
 
 class Unreliable(Unpaced):
-    """Played by responders: four blocks of one length, whose replies only their values tell apart."""
+    """Played by responders: four blocks of one length, whose replies differ only in their values."""
 
     model = "unreliable"
     title = "Played by responders"
@@ -54,10 +54,10 @@ class Unreliable(Unpaced):
     u0, u1, u2, u3, u4, u5, u6, u7, u8, u9 = (reading(address, table=INPUT) for address in range(10))
 
     def needed_silence(self) -> float:
-        return 3e-4  # in which a reply that comes twice is over
+        return 3e-4  # long enough for the second copy of a reply
 
     @classmethod
     def held(cls, address: int, name: str) -> int:
-        """Return the value that the drive of this address holds there."""
+        """Return the value of this register of the drive with this address."""
         register = cls.register(name)
         return 256 * address + register.address + (128 if register.table is INPUT else 0)

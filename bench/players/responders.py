@@ -1,4 +1,4 @@
-"""Lines that responders.c answers on, as a context."""
+"""Lines on which responders.c replies, as a context manager."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.support.programs import CHECKSUM, compiled, talking
 
 @contextmanager
 def responders(kind: str, count: int, *options: object) -> Iterator[tuple[list[str], list[int]]]:
-    """Play so many lines whose drives answer: their ports, and the descriptors to hand down."""
+    """Play that many lines; yield their ports, and the descriptors for child processes."""
     program = compiled("players/responders.c", *CHECKSUM)
     if kind == "pty":
         with talking([program, "--ptys", count, *options]) as talker:

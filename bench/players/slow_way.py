@@ -1,4 +1,4 @@
-"""A way of so many bytes a second to a server on this machine, each way for itself, counted byte by byte."""
+"""A relay to a server on this machine with a limited rate in bytes per second, in each direction."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-PIECE = 64  # bytes that are passed on at once
+PIECE = 64  # bytes that are forwarded at once
 
 
 class SlowWay:
-    """A listener on `port`, which passes on to another one at `rate` bytes a second; None is no limit."""
+    """Forward `port` to another port at `rate` bytes per second; None means unlimited."""
 
     def __init__(self, server: int) -> None:
         self.rate: float | None = None
@@ -35,7 +35,7 @@ class SlowWay:
                     threading.Thread(target=self._pass_on, args=ends, daemon=True).start()
 
     def _pass_on(self, source: socket.socket, sink: socket.socket) -> None:
-        free = 0.0  # when what was passed on before is through
+        free = 0.0  # when the earlier bytes are through
         with suppress(OSError):
             while piece := source.recv(PIECE if self.rate else 1 << 16):
                 if self.rate:

@@ -1,4 +1,4 @@
-"""A client that is attacked: it does what it is told line by line, and tells what it did, and when."""
+"""A client under attack: it reads one command per line, and reports each result with its time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def tell(what: str, **more: Any) -> None:
 
 
 def told(call: Callable[[], object]) -> str:
-    """Return the failure of a call; nothing when it did not fail."""
+    """Return the error of a call as text; empty if it did not fail."""
     try:
         call()
     except Exception as failure:
@@ -40,7 +40,7 @@ def told(call: Callable[[], object]) -> str:
 
 
 class Client:
-    """Buses with their drives; each method does one command."""
+    """Buses with their drives; each method carries out one command."""
 
     def __init__(self, buses: Sequence[Bus]) -> None:
         self.buses = buses
@@ -58,7 +58,7 @@ class Client:
         tell("called")
 
     def race(self, drive: int, verb: str, after: float, stop: str) -> None:
-        """Start in a thread, and stop `after` s later in another."""
+        """Start a motor in one thread, and stop it `after` s later in another."""
         found: list[str] = []
         moving = threading.Thread(target=lambda: found.append(told(getattr(self.drives[drive], verb))))
         moving.start()
@@ -70,7 +70,7 @@ class Client:
         tell("called", failure=failure, start=found[0])
 
     def start_aside(self, drive: int, verb: str) -> None:
-        """Start in a thread, and go on."""
+        """Start a motor in a thread, and return at once."""
         threading.Thread(target=told, args=(getattr(self.drives[drive], verb),), daemon=True).start()
         tell("asked")
 
@@ -88,7 +88,7 @@ def attached(stack: ExitStack, port: str, drives: Sequence[Drive]) -> Bus:
 
 
 def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Drive]]) -> list[Bus]:
-    """The buses of a poller, which reads two registers of each drive as fast as the lines allow."""
+    """Return the buses of a poller that reads two registers of each drive as fast as possible."""
     lines = []
     for port, found in zip(ports, drives, strict=True):
         asked = [PolledDrive(each, tuple(Polled(reg, None) for reg in each.readings()[:2])) for each in found]

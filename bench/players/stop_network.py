@@ -1,4 +1,4 @@
-"""A network of its own between client and responder, that can be cut towards the responder alone."""
+"""A network between client and responder that can be cut in the direction of the responder only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from responder_drives import KINDS, ResponderDrive
 from bench.players.stop_victim import Counters, Victim, victim
 
 NEAR, FAR, PREFIX = "10.249.17.1", "10.249.17.2", 30
-NOBODY = "02:00:00:00:00:99"  # no interface has this address: what is sent to it is lost
+NOBODY = "02:00:00:00:00:99"  # no interface has this address: packets to it are lost
 LISTEN = (
     "import socket, sys; it = socket.create_server((sys.argv[1], 0));"
     "socket.send_fds(socket.socket(fileno=int(sys.argv[2])), [b'x'], [it.fileno()])"
@@ -30,7 +30,7 @@ LISTEN = (
 
 
 class Network:
-    """A namespace with an interface that is joined to one of ours."""
+    """A network namespace with an interface that is connected to one of this namespace."""
 
     def __init__(self) -> None:
         self.name = f"stops{os.getpid()}"
@@ -57,7 +57,7 @@ class Network:
             _ip("netns", "del", self.name)
 
     def listen(self) -> socket.socket:
-        """A socket in the namespace, kept by this process."""
+        """Return a listening socket in the namespace, owned by this process."""
         ours, theirs = socket.socketpair()
         with ours, theirs:
             words = [
@@ -76,7 +76,7 @@ class Network:
         return socket.socket(fileno=fd)
 
     def cut(self) -> None:
-        """From now on what we send is lost; what the responder sends still comes."""
+        """From now on, lose all packets to the responder; packets from it still arrive."""
         _ip("neigh", "replace", FAR, "lladdr", NOBODY, "dev", self._near, "nud", "permanent")
 
     def mend(self) -> None:
@@ -89,7 +89,7 @@ def _ip(*words: str) -> None:
 
 @contextmanager
 def network() -> Iterator[Network | None]:
-    """None where this machine does not let us make one."""
+    """Yield a network, or None if this machine does not allow it."""
     made = None
     with changing_network():
         if shutil.which("ip") and os.geteuid() == 0:
@@ -103,7 +103,7 @@ def network() -> Iterator[Network | None]:
 
 
 def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """The network is cut just before a START leaves, and whole again after the client was told."""
+    """Cut the network just before a START is sent, and restore it after the client has the error."""
     counters = Counters()
     with network() as made:
         if made is None:
@@ -127,7 +127,7 @@ def _cut_one(
     counters: Counters,
     is_long: bool,
 ) -> None:
-    """Start twice whole, the second time to learn how many looks there are, and a third time cut."""
+    """Start twice with a network, to count the reads before a start, and once with a cut network."""
     looks = 0
     for _ in range(2):
         begun = len(line.log)
@@ -149,7 +149,7 @@ def _cut_one(
         client.hear("left")
     time.sleep(chance.uniform(0.0, 10.0) if is_long else 0.0)
     made.mend()
-    time.sleep(3.0 if is_long else 1.5)  # what TCP held back comes now
+    time.sleep(3.0 if is_long else 1.5)  # TCP delivers its held-back bytes now
     counters.rounds += 1
     late = [each for each in client.received(line, 1, "moves") if each.at > told_ns]
     counters.moved += len(late)

@@ -1,4 +1,4 @@
-"""One attack's responders and client, and what its stops came to."""
+"""The responders and the client of one attack, and the results of its stops."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ PATIENCE = 150.0  # s, for a client to end by itself
 
 @dataclass
 class Counters:
-    """Stops that were asked for, one a motor, and what became of them."""
+    """Requested stops, one for each motor, and their results."""
 
     rounds: int = 0
     asked: int = 0
-    turning: int = 0  # motors still, afterwards
-    moved: int = 0  # frames that move a motor, after one that stops it
-    unsent: int = 0  # no stop was on the wire
-    excused: int = 0  # motors that turn because the stops were cut short, which was said
-    first_ms: list[float] = field(default_factory=list)  # from the asking to the first stop frame
+    turning: int = 0  # motors that still turn afterwards
+    moved: int = 0  # frames that move a motor after its stop
+    unsent: int = 0  # stops that never reached the wire
+    excused: int = 0  # motors that turn after an aborted stop that was reported
+    first_ms: list[float] = field(default_factory=list)  # from the request to the first stop frame
     stories: list[str] = field(default_factory=list)
 
     @property
@@ -42,7 +42,7 @@ class Counters:
 
 
 class Victim:
-    """A client process, its responders, and the time when it was asked to stop."""
+    """A client process, its responders, and the time of the request to stop."""
 
     def __init__(self, far: Responder, process: subprocess.Popen[str], errors: Path) -> None:
         self.far = far
@@ -58,7 +58,7 @@ class Victim:
         self.process.stdin.flush()
 
     def hear(self, what: str) -> dict[str, Any]:
-        """Return the client's next report; empty when it is dead."""
+        """Return the client's next report; empty if it has ended."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             said: dict[str, Any] = json.loads(line)
@@ -67,12 +67,12 @@ class Victim:
         return {}
 
     def leave(self) -> None:
-        """Have it leave its `with` block."""
+        """Make the client leave its `with` block."""
         assert self.process.stdin is not None
         self.process.stdin.close()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal; the first one asks for the stops."""
+        """Send a signal; the first one requests the stops."""
         if not self.asked_ns:
             self.asked_ns = time.monotonic_ns()
         self.process.send_signal(number)
@@ -87,7 +87,7 @@ class Victim:
         return self._errors.read_text()
 
     def begin(self, *, turning: bool) -> None:
-        """A new episode; its motors are turned by hand, or left."""
+        """Start a new episode; its motors are set turning, or left as they are."""
         self.asked_ns = 0
         for line in self.lines:
             self._begun[line] = len(line.log)
@@ -96,14 +96,14 @@ class Victim:
                     drive.turn()
 
     def hold(self, requests: int) -> None:
-        """Answer nothing on the first line after so many requests, until `release`."""
+        """Stop answering on the first line after that many requests, until `release`."""
         self.far.do(lambda: self.lines[0].hold(requests))
 
     def release(self) -> None:
         self.far.release(self.lines[0])
 
     def received(self, line: ResponderLine, address: int, what: str) -> list[ReceivedFrame]:
-        """In this episode."""
+        """Return the frames of this kind that the drive received in this episode."""
         return [
             each
             for each in line.log[self._begun.get(line, 0) :]
@@ -111,7 +111,7 @@ class Victim:
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
-        """Count what became of the stops of all drives."""
+        """Count the results of the stops of all drives."""
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():
@@ -144,7 +144,7 @@ def victim(
     ramp: float = 0.0,
     far: Responder | None = None,
 ) -> Iterator[Victim]:
-    """A client that is ready, with a line for each list of kinds and addresses."""
+    """Yield a ready client, with one line for each list of kinds and addresses."""
     with TemporaryDirectory(prefix="multidrop-stops-") as name:
         directory = Path(name)
         if far is None:
@@ -170,7 +170,7 @@ def victim(
             found = Victim(far, process, errors)
             try:
                 if not found.hear("ready"):
-                    raise RuntimeError(f"the client did not begin: {found.errors}")
+                    raise RuntimeError(f"the client did not start: {found.errors}")
                 yield found
             finally:
                 process.kill()

@@ -1,4 +1,4 @@
-"""The rate that is kept, and how late results are, beside a Python thread that computes without pause.
+"""The polling rate, and the delay of results, beside a busy Python thread.
 
 `python -m bench.questions.cadence MASTER JOB` is the process of one master; its results come as JSON.
 """
@@ -35,7 +35,7 @@ def of_multidrop(job: Job) -> tuple[int, numpy.ndarray]:
 
 
 def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
-    """Return the number of good exchanges, and by how much longer than on the wire each call took, in ms."""
+    """Return the number of good exchanges, and the time of each call beyond its time on the wire, in ms."""
     wire = job.wire if job.baudrate else 0.0
     took: list[float] = []
     with rivals.pymodbus(job) as read:
@@ -51,7 +51,7 @@ MASTERS = {"multidrop": of_multidrop, "pymodbus": of_pymodbus}
 
 
 def work(master: str, job: Job) -> None:
-    """Print rate and lateness as JSON: alone, and then beside the busy thread."""
+    """Print rate and delay as JSON: first alone, and then beside the busy thread."""
     told = {}
     for when in ("alone", "beside"):
         if when == "beside":

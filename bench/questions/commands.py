@@ -1,7 +1,7 @@
-"""Polling of a line beside threads that read by hand without pause.
+"""Polling of a line beside threads that read without pause.
 
 16 drives at the pace of a wire are polled as fast as the line allows. Each thread calls `drive.read_many`
-again and again, and such exchanges go ahead of the polling.
+in a loop, and its exchanges go ahead of polling.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bench.support.programs import paced_line
 
 
 def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
-    """Return exchanges a second of the polling and of the threads, and the threads' longest call in s."""
+    """Return exchanges per second of polling and of the threads, and the threads' longest call in s."""
     with paced_line(baudrate=baudrate) as line, adapter.polling(Job(line.path, baudrate, seconds)) as poller:
         bus = poller.bus("line")
         stop, took = threading.Event(), []
@@ -29,7 +29,7 @@ def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
                 drive.read_many(drive.readings())
                 took.append(time.monotonic() - begun)
 
-        time.sleep(1.0)  # until delays are learnt
+        time.sleep(1.0)  # to measure the delays
         readers = [threading.Thread(target=read, args=[bus.drives[at]]) for at in range(threads)]
         before, begun = adapter.counts(poller)[0], time.monotonic()
         for reader in readers:

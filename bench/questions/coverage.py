@@ -1,9 +1,9 @@
-"""The share of your own device templates that the register model holds, and what the rest lacks.
+"""The share of your device templates that the register model can represent, and the reasons for the rest.
 
-It takes a folder with files of other programs, in any layout that `multidrop import` reads, and reads them as
-that does. Each entry is then declared as its program uses it, read or written, so the library itself decides.
-None of the public collections is part of this repository: get one that its licence lets you use, or take what
-you wrote.
+It reads a folder of other programs' files, in any layout that `multidrop import` reads. It declares each
+entry as its program uses it, read or written, so the library itself decides.
+
+This repository contains none of the public collections. Use one whose licence allows it, or your own files.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from bench.support.holding import DETAILS, Holding, family_of, holdings
 from bench.support.tables import heading, show
 from multidrop.importers import SUFFIXES, ImportedDevice, all_devices
 
-MOST_SHOWN = 15  # rows of what is said besides
-# A number or a name in a reason: reasons that differ in nothing else count together.
+MOST_SHOWN = 15  # remarks in the report
+# A number or a name in a reason: reasons that differ only in these count together.
 _DETAIL = re.compile(r"\b((?<=scale register )\w+|0x[0-9a-fA-F]+|[0-9A-F]{4}H|\d+)\b")
 
 
@@ -41,11 +41,11 @@ def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
 
 
 class Coverage:
-    """Counts of what came of the entries of some devices."""
+    """Counts of representable entries of devices."""
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
-        self.refused = Counter[str]()  # by reason: devices whose entries are held, but not together
+        self.refused = Counter[str]()  # by reason: devices whose entries are representable, but not together
         self.whole = sum(self._is_whole(entries) for _, entries in self.by_device)
 
     def _is_whole(self, entries: list[Holding]) -> bool:
@@ -61,13 +61,13 @@ class Coverage:
         return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each detail, the entries that need it, and those of them that are held."""
+        """Yield each detail, the entries that need it, and the representable ones among them."""
         for key, words in DETAILS.items():
             needing = [entry for entry in self.entries if key in entry.details]
             yield words, len(needing), sum(entry.is_whole for entry in needing)
 
     def lacking(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each reason, how many entries are not held because of it, and in how many devices."""
+        """Yield each reason, and the numbers of entries and of devices that it excludes."""
         entries, devices = Counter[str](), Counter[str]()
         for _, found in self.by_device:
             reasons = [_lack(entry) for entry in found if entry.lacks]
@@ -76,7 +76,7 @@ class Coverage:
         yield from ((reason, count, devices[reason]) for reason, count in entries.most_common())
 
     def besides(self) -> Iterator[tuple[str, int]]:
-        """Yield each remark of the importers on what is held, and how often they make it."""
+        """Yield each remark of the importers on representable entries, and how often they make it."""
         said = Counter(
             _DETAIL.sub("N", gap) for entry in self.entries if entry.entry for gap in entry.entry.gaps
         )
@@ -95,7 +95,7 @@ def _lack(entry: Holding) -> str:
 
 
 def report(coverage: Coverage, unread: list[str]) -> None:
-    """Print the shares, the details that are needed, and what lacks."""
+    """Print the shares, the required details, and the reasons for missing entries."""
     entries, devices = coverage.entries, len(coverage.by_device)
     held = sum(entry.is_whole for entry in entries)
     readable = sum(entry.is_held for entry in entries)

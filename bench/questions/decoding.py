@@ -1,6 +1,6 @@
-"""Captures of RTU frames made into columns on one core: megabytes of frames a second.
+"""Conversion of RTU captures to columns on one core, in megabytes of frames per second.
 
-Every capture is read from memory; its packets hold one frame each and nothing that says whose it is.
+Every capture is read from memory. Each packet has one frame, without any information about its sender.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from multidrop.capture import Capture, Decoding
 from multidrop.core import Framing, Message, build_reply, build_request
 
 USER_LINK_TYPE = 147
-EXCHANGES = 2000  # that differ
+EXCHANGES = 2000  # different ones
 
 
 def main() -> None:
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def write(path: Path, registers: int, least_bytes: float) -> int:
-    """Write a capture of at least so many bytes of frames; return how many it has."""
+    """Write a capture with at least that many bytes of frames; return the actual number."""
     records, size = [], 0
     for time_us, frame in enumerate(frames(registers)):
         records.append(struct.pack("<IIII", 0, time_us, len(frame), len(frame)) + frame)

@@ -1,7 +1,7 @@
-"""Cost of faults on a paced line: stray bytes, silent drives, requests that are refused.
+"""Cost of faults on a paced line: stray bytes, silent drives, refused requests.
 
-31 drives at 38400 baud, or `--drives` of them. Each rate is divided by that of the same plant without the
-stray bytes, or without the silent drives, which is measured right before. All figures are medians.
+31 drives at 38400 baud, or `--drives` of them. Each rate is divided by the rate of the same plant without the
+stray bytes, or without the silent drives, measured immediately before. All figures are medians.
 `python -m bench.questions.faults MASTER JOB` is the process of a master whose requests are refused.
 """
 
@@ -26,12 +26,12 @@ from bench.support.programs import module, paced_line
 DRIVES = 31
 BAUDRATE = 38400
 REFUSALS = 20
-CHARACTERS = 8 + 5  # of a request and of the exception that answers it
+CHARACTERS = 8 + 5  # of a request and of its exception reply
 WIRE_MS = CHARACTERS * 10 / BAUDRATE * 1e3 + 2
 
 
 def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: Any) -> tuple[float, float]:
-    """Return the drives' answers a second once the master has settled, and its good exchanges of all."""
+    """Return the replies per second after the settling time, and the share of good exchanges."""
     settle_ms = round(arguments.settle * 1000)
     with paced_line(baudrate=BAUDRATE, drives=drives, settle_ms=settle_ms, **fault) as line:
         own = rivals.measure(master, Job(line.path, BAUDRATE, arguments.settle + arguments.seconds, drives))
@@ -40,7 +40,7 @@ def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: A
 
 
 def cases(drives: int, silent: list[int]) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Yield each fault's name, the drives of the plant without it, and the line's options for it."""
+    """Yield each fault's name, the drives of the plant without the fault, and the line's options for it."""
     yield "00 before every reply", drives, {"stray": True}
     for dead in silent:
         living = drives - dead
@@ -72,14 +72,14 @@ READERS = {"multidrop": of_multidrop, **rivals.READERS}
 
 
 def ask_in_vain(master: str, job: Job) -> None:
-    """Print as JSON how many ms each call took to tell that the drive refuses, and its words."""
+    """Print, as JSON, the ms until each call reported the drive's refusal, and its error text."""
     took, said = [], "an empty answer"
     with READERS[master](job) as read:
         for at in range(REFUSALS):
             begun = time.monotonic()
             try:
                 read(1 + at % job.drives)
-            except Exception as failure:  # each has its own
+            except Exception as failure:  # each master has errors of its own
                 said = str(failure) or type(failure).__name__
             took.append(1e3 * (time.monotonic() - begun))
     print(json.dumps({"took": took, "said": said.splitlines()[0]}))
@@ -116,13 +116,13 @@ def main() -> None:
     if rows:
         tables.show(("master", "case", "without", "answers/s", "kept", "read"), rows)
         print(
-            "\nwithout: answers a second without the fault; kept: the median of what each pair kept."
-            "\nread: good exchanges of all that were asked, from the start on; silent drives' are failed.\n"
+            "\nwithout: replies per second without the fault; kept: the median share of each pair."
+            "\nread: good exchanges as a share of all, from the start on; silent drives' count as failed.\n"
         )
 
     readers = [master for master in READERS if master in arguments.masters]
     print(f"A drive that answers with an exception; time-out {1e3 * TIMEOUT_S:g} ms.")
-    print(f"On the wire that takes {WIRE_MS:.1f} ms, the silence before it not counted.\n")
+    print(f"On the wire that takes {WIRE_MS:.1f} ms, without the silence before it.\n")
     tables.show(("master", "known after ms p50", "max", "told"), [refused(master) for master in readers])
 
 

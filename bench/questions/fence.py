@@ -1,9 +1,9 @@
-"""Requests of a master that stood still, on lines that another one has taken over: how many the far end saw.
+"""Requests from a suspended master on lines that another master has taken over, as seen from the far end.
 
-A process polls 10 socket:// lines under a lease, and is stopped (SIGSTOP) at a random moment. Another takes
-over when the last renewal is older than lease and guard by its own clock; then the first one goes on. Three
-kinds: the look and the kernel's timer, the look alone, and neither. Ends with 1 when the first let
-anything through, or when the last did not.
+A process polls 10 socket:// lines under a lease, and is stopped (SIGSTOP) at a random moment. Another process
+takes over when, by its own clock, the last renewal is older than lease and guard. Then the first one
+continues. There are three kinds: with the clock check and the kernel's timer, with the check only, and
+without both. Exits with 1 if the first kind let a request through, or if the last kind did not.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def rounds(kind: str, stops: int, lines: int, lease: float, guard: float, seed: 
 
 
 def side_by_side(kind: str, stops: int, details: argparse.Namespace) -> list[Round]:
-    """Share the stops among processes; each has lines and masters of its own."""
+    """Distribute the suspensions over processes; each has lines and masters of its own."""
     jobs = details.jobs
     shares = [stops // jobs + (job < stops % jobs) for job in range(jobs)]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:

@@ -1,9 +1,9 @@
-"""A real gateway among a fleet's others: does it keep the rate of its lines as a poller alone does?
+"""Does a real gateway in a large fleet keep the rate of its lines, as a poller alone does?
 
-A fleet of 20 gateways on three real NATS nodes and thousands of lines, all on this machine. 19 gateways are
-state machines, whose lines are not there. The real one polls its share, some 500 lines on TCP sockets with
-one drive each, beside all of them; before that `multidrop poll` polls the same lines alone. Two cores bear no
-more than a modest rate of so many lines: twice a second by default. Judged from the drives' side.
+A fleet of 20 gateways on three real NATS nodes has thousands of lines, all on this machine. 19 gateways are
+only state machines, whose lines do not exist. The real one polls its share: some 500 lines on TCP sockets
+with one drive each. Before that, `multidrop poll` polls the same lines alone. Two cores can poll so many
+lines only at a modest rate: twice a second by default. The rates are measured from the drives' side.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SETTLE_S = 5.0
 
 
 class Seen(NamedTuple):
-    """One run, from the drives' side; the CPU is of all threads of the process that polls."""
+    """One run, from the drives' side; the CPU time is that of the polling process."""
 
     requests: int
     longest_s: float
@@ -58,7 +58,7 @@ def main() -> None:
     own = [line for line, gateway in shares.items() if gateway == REAL]
 
     def run(words: Sequence[str]) -> Seen:
-        """Poll the lines of `hall` by `multidrop` with these words."""
+        """Poll the lines of `hall` with this `multidrop` command."""
         log, command = Path(folder) / "log", [sys.executable, "-m", "multidrop", *words]
         with (
             log.open("wb") as output,

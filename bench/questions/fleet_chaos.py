@@ -1,10 +1,10 @@
-"""Is a sample lost or doubled between a poller and the sinks, whatever is killed?
+"""Is a sample lost or doubled between a poller and the sinks, whatever process is killed?
 
-Two gateways append known samples and note what they were told to be on their disks; three nodes of NATS
-forward them; a hub keeps them in Parquet files and another in PostgreSQL. For some minutes each of these is
-killed (SIGKILL) at random moments, alone or together with others, and some stay away for seconds. Then all
-run on until they are done, and both sinks are compared with the notes. Ends with 1 where one sample of those
-is missing, or any is taken.
+Two gateways append known samples and note which ones were reported as stored. Three NATS nodes forward the
+samples. One hub stores them in Parquet files, another in PostgreSQL. For some minutes all these processes are
+killed (SIGKILL) at random moments, alone or together, and some stay away for seconds. Then all run until they
+are done, and both sinks are compared with the notes. Exits with 1 if a noted sample is missing, or if any
+sample is stored twice.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from multidrop.fleet.samples.samples_stream import StreamError, connect, create_
 
 ROOT = Path(__file__).parents[2]
 GATEWAYS = ("gateway-1", "gateway-2")
-PATIENCE_S = 300.0  # for all to be done after the last kill
+PATIENCE_S = 300.0  # until all must be done after the last kill
 
-Numbers = dict[str, Counter[int]]  # by gateway, how often each exchange is there
+Numbers = dict[str, Counter[int]]  # by gateway: the number of copies of each exchange
 
 
 class Process:
-    """A program that is started again after each kill."""
+    """A program that is restarted after each kill."""
 
     def __init__(self, folder: Path, name: str, *words: str) -> None:
         self._words, self._log = [sys.executable, "-m", *words], folder / f"{name}.log"
         self.start()
 
     def start(self) -> None:
-        with self._log.open("ab") as log:  # here, where `bench` is; the library is the installed one
+        with self._log.open("ab") as log:  # in this directory, for `bench`; the library is installed
             self.process = subprocess.Popen(
                 self._words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=ROOT
             )
@@ -61,12 +61,12 @@ class Process:
         return self.process.poll() is not None
 
     def check_alive(self) -> None:
-        """Raise AssertionError with the end of its log where it ended by itself."""
+        """Raise AssertionError with the end of its log if it ended by itself."""
         assert not self.is_over(), f"it ended by itself: {self._log.read_text()[-1000:]}"
 
 
 class Chaos:
-    """All that runs, and what is done to it."""
+    """All processes, and the attacks on them."""
 
     def __init__(self, folder: Path, servers: Cluster, database: Postgres, dice: random.Random) -> None:
         self.folder, self.servers, self.database, self._dice = folder, servers, database, dice
@@ -86,7 +86,7 @@ class Chaos:
         return Process(self.folder, name, *words)
 
     def await_told(self) -> None:
-        """Wait until each gateway was told that something is stored: before that there is nothing to lose."""
+        """Wait until each gateway has stored samples: before that, none can be lost."""
         ends = time.monotonic() + PATIENCE_S
         while not all(sum(runs.values()) for runs in told(self.folder).values()):
             for gateway in self.gateways:
@@ -95,7 +95,7 @@ class Chaos:
             time.sleep(0.1)
 
     def round(self) -> None:
-        """Do one thing at random, and let all run for a while."""
+        """Make one random attack, and let all processes run for a while."""
         attacks: tuple[tuple[str, Callable[[], None]], ...] = (
             ("gateway", self._gateway),
             ("node", self._node),
@@ -111,7 +111,7 @@ class Chaos:
         self.counts[name] += 1
         self._wait(0.2, 6.0)  # an election takes 4 to 9 s
         for hub in self.hubs:
-            if hub.is_over():  # it gave up by itself
+            if hub.is_over():  # it ended without an attack
                 self.counts["hub ended by itself"] += 1
                 hub.start()
 
@@ -175,7 +175,7 @@ class Chaos:
                 gateway.start()
 
     def settle(self) -> None:
-        """Kill all gateways and hubs, and let everything that is on disks reach the sinks."""
+        """Kill all gateways and hubs, and let all stored samples reach the sinks."""
         self.close()
         self.servers.wait()
         self.database.wait()
@@ -195,7 +195,7 @@ class Chaos:
         client = await connect(self.servers.urls)
         for name, gateway in zip(GATEWAYS, self.gateways, strict=True):
             stored = [int(path.name[:12]) for path in (self.folder / name).glob("*.arrows")]
-            if not stored:  # it was killed each time before it stored anything
+            if not stored:  # it was always killed before it stored a sample
                 continue
             log = subject_of(name, _log_of(self.folder / name))
             while True:
@@ -216,7 +216,7 @@ def _log_of(folder: Path) -> str:
 
 
 def told(folder: Path) -> dict[str, dict[int, int]]:
-    """Return, by gateway and its runs' first numbers, how many exchanges it was told to be stored."""
+    """Return the number of exchanges reported as stored, by gateway and the first number of each run."""
     found: dict[str, dict[int, int]] = {}
     for name in GATEWAYS:
         runs: dict[int, int] = defaultdict(int)
@@ -251,7 +251,7 @@ def in_postgres(database: Postgres) -> Numbers:
 
 
 def compare(of: dict[str, dict[int, int]], kept: Numbers) -> tuple[int, int, int, int]:
-    """Return the exchanges that were told, the missing among them, holes in runs, and doubled ones."""
+    """Return the numbers of noted exchanges, of missing ones among them, of holes in runs, and of doubles."""
     missing = holes = 0
     for name, runs in of.items():
         numbers = kept[name]
@@ -287,7 +287,7 @@ def everything(folder: Path, dice: random.Random) -> Iterator[Chaos]:
 
 
 def run(folder: Path, seconds: float, dice: random.Random) -> int:
-    """Attack for so long, compare, and return the number of what must not be."""
+    """Attack for that long, compare, and return the number of errors."""
     with everything(folder, dice) as chaos:
         chaos.await_told()
         ends = time.monotonic() + seconds

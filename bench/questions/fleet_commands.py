@@ -1,10 +1,10 @@
-"""Is a command of a fleet carried out twice, or its asker told wrongly, whatever is killed or stands still?
+"""Is a command of a fleet carried out twice, or its result reported wrongly, under attack?
 
-Three gateways and three NATS nodes are killed (SIGKILL) and stopped (SIGSTOP, gateways for up to 3.5 s) at
-random moments, while askers write a setpoint after the other to the simulated drives of their lines; of their
-messages some are doubled, at once or seconds later, and some are late; every 20th command is a stop. The
-drives' own lists of writes are the judge. Ends with 1 where a command was carried out twice, its asker was
-told wrongly, or one that was carried out is not in its gateway's log.
+Three gateways and three NATS nodes are killed (SIGKILL) and suspended (SIGSTOP, gateways for up to 3.5 s) at
+random moments. Meanwhile callers write setpoints to the simulated drives of their lines. Some of their
+messages are doubled, at once or seconds later, and some are late. Every 20th command is a stop. The drives'
+own lists of writes show the truth. Exits with 1 if a command was carried out twice, if its caller got a wrong
+result, or if an executed command is missing in its gateway's log.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Fleet drills: gateways and NATS nodes are killed and stopped; how long is a line silent, and who overlaps?
+"""Fleet drills: how long is a line silent if gateways or NATS nodes are killed, and do masters overlap?
 
-Real processes on this machine: three NATS nodes, three gateways, and lines on sockets that note each request
-with the connection it came by. Then the same with each gateway and each node in a network namespace, whose
-cables are cut for 1 to 8 s; that needs root. Then with a gateway and a node in each of three namespaces, as
-on three machines. A gap is the longest time between two requests of one line, from the deed on for 11 s and
-more.
+All processes are real and run on this machine: three NATS nodes, three gateways, and lines on sockets that
+record each request with its connection. The second part puts each gateway and each node into a network
+namespace and cuts its cable for 1 to 8 s; this needs root. The third part puts a gateway and a node into each
+of three namespaces, like three machines. A gap is the longest time between two requests of one line, in the
+11 s or more after an attack.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Samples of a fleet: bytes and CPU a value of messages, and what their stores take and need.
+"""Samples of a fleet: bytes and CPU time per value, in messages and in the hub's stores.
 
-The rows are those of a plant in operation: each line asks its drives in turn, ten registers at once, every
-12 ms and some; speeds, currents and voltages move by a step or two at three of five polls, temperatures at
-one of three; 5 of 1000 requests are missed. Nothing is as regular as a simulator's.
+The rows resemble those of a real plant, which are less regular than a simulator's. Each line reads its drives
+in turn, ten registers at once, every 12 ms or a little more. Speeds, currents and voltages change by a step
+or two in three of five polls, temperatures in one of three. 5 of 1000 requests are missed.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from multidrop.fleet.samples.spool import SpoolFolder
 from multidrop.polling import BatchColumns
 
 UTC = 1_795_253_399_123_456_789
-DRIVES = 16  # a line
-REGISTERS = {  # name: a value in steps, the step, and how often it moves
+DRIVES = 16  # per line
+REGISTERS = {  # name: a value in steps, the step, and the probability of a change
     "output_frequency": (4500, 0.01, 0.6),
     "output_current": (53, 0.1, 0.7),
     "output_voltage": (3800, 0.1, 0.3),
@@ -78,7 +78,7 @@ def exchanges(lines: int, dice: random.Random) -> Iterator[tuple[int, int, int, 
 
 
 def columns_of(rows: int, lines: int, dice: random.Random) -> BatchColumns:
-    """Return rows as `Batch.columns()` gives them."""
+    """Return rows in the form of `Batch.columns()`."""
     kinds = {"time": "q", "monotonic_ns": "q", "uncertainty_ns": "q"}
     kinds |= {"drive": "H", "register": "H", "value": "d", "status": "H"}
     made: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
@@ -142,9 +142,9 @@ def messages() -> Iterator[tuple[object, ...]]:
 
 
 def stores(folder: Path) -> Iterator[tuple[object, ...]]:
-    """Write the same half million rows of 500 lines by each store, in two commits."""
+    """Write the same half million rows of 500 lines to each store, in two commits."""
     found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
-    units = units_of(found[0])  # all have the same drives
+    units = units_of(found[0])  # all messages have the same drives
     sent = [one.data for columns in found for one in packed(columns, units)]
     rows = sum(len(columns.time) for columns in found)
     spool = SpoolFolder(folder / "spool", "gateway-1", "fleet")
@@ -191,7 +191,7 @@ def commit(sink: SampleSink, sent: list[bytes]) -> None:
 
 
 def narrow(database: Postgres, sent: list[bytes]) -> int:
-    """Write a row a value, with an index by drive, register and time, as one would do at first."""
+    """Write one row per value, with an index by drive, register and time: the obvious way."""
     import psycopg
 
     database.ask(
@@ -225,7 +225,7 @@ def size_of(folder: Path) -> int:
 
 
 def timed(rows: int, act: Callable[[], int]) -> tuple[str, str, str]:
-    """Return million rows a second, the CPU of this process in ns, and bytes on the disk, of a row."""
+    """Return million rows per second, and per row the CPU time of this process in ns and bytes on disk."""
     begun, used = time.monotonic(), cpu()
     size = act()
     seconds, used = time.monotonic() - begun, cpu() - used

@@ -1,8 +1,8 @@
-"""Ten thousand lines: how soon does each have a gateway, when a fleet begins and when a quarter of it dies?
+"""The time until each of 10,000 lines has a gateway: at the start, and after a quarter of the fleet dies.
 
-20 real gateways' state machines, in four processes, three real NATS nodes, all on this machine; the lines are
-not there, so that nothing is opened and sent. A cold start counts from the moment at which all processes are
-connected. CPU seconds are those of all gateways and servers: two cores have 16 of them in 8 s.
+20 real state machines of gateways, in four processes, and three real NATS nodes run on this machine. The
+lines do not exist, so no port is opened. A cold start counts from the moment when all processes are
+connected. CPU seconds are those of all gateways and servers: two cores offer 16 of them in 8 s.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
             fleet.check()
             begun = fleet.start(dead.gateways)
             fleet.settled(begun)
-            time.sleep(10)  # the balance moves lines to them
+            time.sleep(10)  # for the balance to move lines to them
             fleet.check()
     tables.show(("what", "lines", "until the last, s", "CPU s", "lines a gateway", "load"), rows)
 

@@ -1,8 +1,8 @@
-"""Memory of a poller, and the instructions that an exchange takes, from which small machines are reckoned.
+"""Memory of a poller, and the instructions of an exchange, to estimate the load of small machines.
 
-Instructions are counted by valgrind in the process that polls, in two runs of different lengths: what is
-between them is the polling alone. The kernel's are not counted; its time is taken from a run without
-valgrind. `python -m bench.questions.footprint JOB` is the process that polls.
+valgrind counts the instructions of the polling process in two runs of different lengths; the difference is
+polling alone. It does not count the kernel's, so the kernel's time is measured in a run without valgrind.
+`python -m bench.questions.footprint JOB` is the process that polls.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BAUDRATE = 38400
 DRIVES = 31
 SETTLE_S = 2.0
 
-# Cortex cores: clock in GHz, and instructions a cycle that such code is taken to reach there.
+# Cortex cores: clock in GHz, and the assumed instructions per cycle of such code.
 BOARDS = {
     "Raspberry Pi Zero W (ARM1176, 1.0 GHz)": (1.0, 0.4),
     "Raspberry Pi 3, Zero 2 W (Cortex-A53, 1.0 GHz)": (1.0, 0.6),
@@ -37,17 +37,17 @@ BOARDS = {
 class Job:
     ports: list[str]
     seconds: float
-    record: str = ""  # a file; "": rows are taken and dropped
+    record: str = ""  # a file; "": rows are taken and discarded
 
 
-# ---- the process that polls: it imports nothing that a user's would not ----
+# ---- the process that polls: it imports only modules that a user's program imports ----
 
 
 def resident_kb(kind: str = "VmRSS") -> int:
     text = Path("/proc/self/status").read_text()
     found = re.search(rf"{kind}:\s+(\d+) kB", text)
     if not found:
-        raise RuntimeError("the kernel does not tell the resident memory")
+        raise RuntimeError("the kernel does not report the resident memory")
     return int(found[1])
 
 
@@ -98,7 +98,7 @@ def poll(job: Job) -> dict[str, Any]:
 
 
 def run(job: Job, *before: str) -> dict[str, Any]:
-    """Run a process that polls, under the program `before` it."""
+    """Run a process that polls, under the program `before`."""
     command = [*before, sys.executable, "-m", "bench.questions.footprint", json.dumps(asdict(job))]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return dict(json.loads(told))
@@ -111,13 +111,13 @@ def instructions(lines: int, seconds: float) -> tuple[int, dict[str, Any]]:
         told = run(Job(ports, seconds), *valgrind)
         summary = re.search(r"^summary: (\d+)", out.read_text(), re.MULTILINE)
         if not summary:
-            raise RuntimeError("valgrind tells no count")
+            raise RuntimeError("valgrind reports no count")
         return int(summary[1]), told
 
 
 @contextmanager
 def talkers(lines: int) -> Iterator[list[str]]:
-    """Play so many paced lines, and give their ports."""
+    """Play that many paced lines; yield their ports."""
     from bench.players.responders import responders
 
     with responders("pty", lines, "--baudrate", BAUDRATE, "--delay-us", 2000) as (ports, _):
@@ -165,9 +165,9 @@ def main() -> None:
         rows.append((board, f"{per_cycle:.1f}", f"{used * 1e6:.0f}", f"{used * rate:.0%}"))
     tables.show(("RECKONED, not measured", "instructions a cycle", "CPU us", "of a core"), rows)
     print(
-        "\nReckoned: instructions counted on x86-64 and taken to be as many on ARM; instructions a cycle are"
-        "\nassumed; the kernel's time has the share there that it has here. Up to 80 us are spun away before"
-        "\na request where there are at most four lines, on any board. No such board was at hand."
+        "\nReckoned: instructions are counted on x86-64 and assumed to be as many on ARM; instructions a"
+        "\ncycle are assumed; the kernel's share of the time is assumed to be the same. With at most four"
+        "\nlines, up to 80 us before a request are spent spinning, on any board. No such board was tested."
     )
 
 

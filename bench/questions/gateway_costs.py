@@ -1,8 +1,9 @@
-"""Measure what each kind of work of `multidrop serve` takes of a processor, alone and with warm caches.
+"""Measure the CPU time of each kind of work of `multidrop serve`, alone and with warm caches.
 
-31 drives x 10 values lie in the hub of a gateway that does not run: requests are handed to its protocols as
-asyncio would. Before each turn come new rows with other values. The least of many turns is what a machine
-with other work to do disturbs least; the kernel's share and cold caches are not in it, see `gateway_load`.
+The hub of a gateway that does not run has 31 drives with 10 values each. Requests are passed to its protocols
+as asyncio would pass them. Before each turn the hub gets new rows with other values. The table has the least
+of many turns, because other work disturbs it least. It contains neither the kernel's share nor cold caches:
+see `gateway_load`.
 """
 
 from __future__ import annotations
@@ -42,17 +43,17 @@ from multidrop.gateway.settings import ServeSettings
 from multidrop.polling.batch import Batch
 from multidrop.transport.statistics import line_statistics
 
-LINES = (8, 8, 8, 7)  # drives on each
+LINES = (8, 8, 8, 7)  # drives on each line
 
 
 def as_numbers(data: Any, kind: str) -> memoryview:
-    """Return bytes as numbers of a kind that is known at run time alone."""
+    """Return bytes as numbers of a format that is known only at run time."""
     found: memoryview = data.cast(kind)
     return found
 
 
 class GivenColumns(Columns):
-    """Columns that no core made."""
+    """Columns that do not come from the core."""
 
     def __init__(self, columns: dict[str, memoryview]) -> None:
         self._columns = columns
@@ -65,7 +66,7 @@ class GivenColumns(Columns):
 
 
 class FakeTransport(asyncio.Transport):
-    """The network: bytes that are written to it are gone."""
+    """A network that discards all bytes."""
 
     written = 0
 
@@ -84,7 +85,7 @@ class FakeTransport(asyncio.Transport):
 
 
 class Worker:
-    """A gateway that does not run, and the kinds of its work, each to be done once for all drives."""
+    """A gateway that does not run, and its kinds of work, each done once for all drives."""
 
     def __init__(self, folder: Path) -> None:
         self.plant = Plant.load(write_plant(folder, LINES))
@@ -95,7 +96,7 @@ class Worker:
         self.transport = FakeTransport()
 
     def take_rows(self) -> None:
-        """Give the hub a row of each register."""
+        """Give the hub one row for each register."""
         turn, drives, registers = next(self._turns), len(self.drives), len(POLLED)
         codes = [(drive, register) for drive in range(drives) for register in range(registers)]
         now_ns, size = time.monotonic_ns(), len(codes)
@@ -122,13 +123,13 @@ class Worker:
         self.gateway.hub.take(self.batch)
 
     def frame(self) -> None:
-        """Make a frame, and encode it for those who have the one before."""
+        """Make a frame, and encode it for viewers that have the previous frame."""
         frames = self.gateway.frames
         frames._build()
         frames._since(frames._remembered[-2]["n"] if len(frames._remembered) > 1 else WHOLE)
 
     def next_viewer(self) -> Callable[[], Any]:
-        """Return what tells a viewer what changed, where another one was told the same."""
+        """Return a function that sends the changes to a viewer after another viewer got the same."""
         frames = self.gateway.frames
         for _ in range(2):
             self.take_rows()
@@ -143,7 +144,7 @@ class Worker:
         self.gateway._look_for_events()
 
     def statistics(self) -> None:
-        """Take a reading of a second's exchanges."""
+        """Take a reading of the exchanges of one second."""
         turn = next(self._turns)
         delays = Counter(dict.fromkeys(range(60, 75), turn))
         of_drive = Counters(turn, turn, 10 * turn, turn, ideal_ns=turn, missed=Counter({Status.NO_REPLY: 1}))
@@ -160,7 +161,7 @@ class Worker:
         expose_metrics(families_of(gateway.hub, gateway.recent.newest, figures_of(gateway)), "")
 
     def masters(self, start: int, words: int) -> Callable[[], None]:
-        """Return what reads these words of all drives."""
+        """Return a function that reads these words of all drives."""
         units = {name: number for number, name in enumerate(self.drives, 1)}
         gateway, settings = self.gateway, ModbusSettings(units=units)
         server = ModbusServer(self.plant, gateway.hub, gateway.commands, settings, gateway.ask)
@@ -171,13 +172,13 @@ class Worker:
             before = self.transport.written
             for unit in units.values():
                 client.data_received(struct.pack(">HHHBBHH", unit, 0, 6, unit, 3, start, words))
-                client._drain()  # where it would have let others have their turn
+                client._drain()  # it would yield to other clients here
             assert self.transport.written - before == len(units) * (9 + 2 * words)
 
         return read
 
     def viewer(self) -> Callable[[], Any]:
-        """Return what asks for a frame that is there."""
+        """Return a function that requests an available frame."""
         from uvicorn import Config
         from uvicorn.protocols.http.h11_impl import H11Protocol
         from uvicorn.server import ServerState
@@ -216,7 +217,7 @@ WORKS: dict[str, Callable[[Worker], Callable[[], Any]]] = {
 
 
 async def least_us(name: str, turns: int) -> float:
-    """Return the least CPU time of so many turns."""
+    """Return the least CPU time of that many turns, in us."""
     with TemporaryDirectory() as folder:
         worker = Worker(Path(folder))
         act, least = WORKS[name](worker), float("inf")

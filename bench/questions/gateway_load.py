@@ -1,10 +1,12 @@
-"""Measure what `multidrop serve` costs the polling, and a stop of all drives, beside all its users at once.
+"""Measure how much `multidrop serve` with many users costs polling, and delays a stop of all drives.
 
-A simulated plant of 31 drives x 10 values x 10 Hz is polled by a plain Poller that records, by the gateway
-alone, and by the gateway beside five viewers, ten that read nothing, a scraper, questions to its history, an
-MQTT listener and two Modbus masters; these slices take turns. Then all motors are stopped over HTTP, again
-and again, without the users and beside them: times are from the request to the last drive's stop as the
-simulator saw it, and to the answer. `--minutes 60` goes on beside the users, with a row a minute.
+A simulated plant has 31 drives with 10 values each at 10 Hz. Slices of three kinds alternate: a plain Poller
+that records, the gateway alone, and the gateway with its users. The users are five viewers, ten more that do
+not read, a scraper, history queries, an MQTT listener and two Modbus masters.
+
+Then all motors are stopped over HTTP many times, without and with the users. Times are from the request to
+the last drive's stop, as the simulator received it, and to the answer. `--minutes 60` continues with the
+users, and prints a row per minute.
 """
 
 from __future__ import annotations
@@ -35,10 +37,10 @@ from bench.support.programs import module
 from multidrop import Plant, Poller
 from multidrop.recording import SegmentWriter
 
-LINES = (8, 8, 8, 7)  # drives on each, at 115200 bit/s: `multidrop plan` says 78 % of the time
-LOOK_S = 0.05  # between looks at counters
-SETTLE_S = 3.0  # after a start: delays are learnt, and users have come
-RUN_S = 1.0  # for which motors run before they are stopped
+LINES = (8, 8, 8, 7)  # drives on each line, at 115200 bit/s: 78 % utilisation by `multidrop plan`
+LOOK_S = 0.05  # between readings of counters
+SETTLE_S = 3.0  # after a start: delays are measured, and users are connected
+RUN_S = 1.0  # motors run this long before a stop
 STOPS_IN_A_ROW = 3
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 PATIENCE_S = 60.0
@@ -47,7 +49,7 @@ BROKER_CONF = "listener {} 127.0.0.1\nallow_anonymous true\n"
 
 
 class Counts(NamedTuple):
-    """Counters of the polling since it began, and the moment, in s, at which they were those."""
+    """Counters since polling started, and the time of their reading, in s."""
 
     at: float
     exchanges: float
@@ -56,7 +58,7 @@ class Counts(NamedTuple):
 
 
 class Used(NamedTuple):
-    """The CPU time in s of a process, and of its children; resident memory in MB."""
+    """The CPU time of a process, and of its children, in s; resident memory in MB."""
 
     own: float
     children: float
@@ -79,7 +81,7 @@ def used(pid: int) -> Used:
 
 
 def _cpu(pid: int) -> tuple[float, float]:
-    """Return the CPU time of a process, and of its children that have ended."""
+    """Return the CPU time of a process, and of its ended children."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     own, children = (int(fields[at]) + int(fields[at + 1]) for at in (11, 13))
     return own * TICK_S, children * TICK_S
@@ -95,7 +97,7 @@ class Polling:
 
 
 class PlainPoll(Polling):
-    """A Poller that records, and nothing else."""
+    """A Poller that only records."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process, self.pid = process, process.pid
@@ -125,7 +127,7 @@ class Gateway(Polling):
         return said
 
     def counts(self) -> Counts:
-        """Return the counts when they change, which is once a second."""
+        """Return the counts when they change, once a second."""
         before, now = self._counts(), self._counts()
         while now.exchanges == before.exchanges:
             time.sleep(LOOK_S)
@@ -146,7 +148,7 @@ class Gateway(Polling):
 
 
 def poll(plant: Path, folder: Path) -> None:
-    """Poll and record, and tell the counts for each line of standard input, until it ends."""
+    """Poll and record; print the counts for each line of standard input, until it ends."""
     with Poller(Plant.load(plant)) as poller, SegmentWriter(folder / "rows.arrows", {}, every=600) as writer:
         poller.on_batch(writer.write)
         for _ in sys.stdin:
@@ -201,7 +203,7 @@ HEAD = (
 
 
 class Hall:
-    """The plant, its simulator and its broker, and what is measured there."""
+    """The plant, its simulator and its broker, and the measurements."""
 
     def __init__(self, pumps: SimulatedPumps, plant: Path, place: Place, before: Sequence[str]) -> None:
         self.pumps, self.plant, self.place, self.before = pumps, plant, place, before
@@ -224,7 +226,7 @@ class Hall:
             self.counts[what] = max(before, number) if "longest" in what else before + number
 
     def slice(self, name: str, polling: Polling, seconds: float) -> tuple[object, ...]:
-        """Measure for so many seconds. A simulator that stood still answers late, and values are missed."""
+        """Measure for that many seconds. A suspended simulator replies late, so values are missed."""
         self.pumps.late_s()
         counts = polling.counts()
         begun, before = time.monotonic(), used(polling.pid)
@@ -259,7 +261,7 @@ class Hall:
                     yield self.slice("serve, users", gateway, seconds)
 
     def stops(self, rounds: int) -> Iterator[tuple[object, ...]]:
-        """Stop all, in turns of some without users and some beside them."""
+        """Stop all drives, in alternating rounds without and with the users."""
         found: dict[str, list[tuple[float, float, float]]] = {"alone": [], "users": []}
         with serving(self.plant, self.place, self.before) as gateway:
             time.sleep(SETTLE_S)
@@ -287,7 +289,7 @@ class Hall:
         return min(times) - begun, max(times) - begun, answered - begun
 
     def minutes(self, number: int, seconds: float) -> Iterator[tuple[object, ...]]:
-        """Poll alone for a while, then serve beside users for so many minutes, and poll alone again."""
+        """Poll alone for a while, then serve users for that many minutes, and poll alone again."""
         with plain_poll(self.plant, self.before) as polling:
             time.sleep(SETTLE_S)
             yield self.slice("poll", polling, seconds)
@@ -314,7 +316,7 @@ def hall(rotate: str, before: Sequence[str]) -> Iterator[Hall]:
 
 
 def show_as_they_come(head: Sequence[str], rows: Iterator[tuple[object, ...]]) -> list[tuple[object, ...]]:
-    """Print each row on stderr at once; return all."""
+    """Print each row on stderr at once; return all rows."""
     found = []
     for row in rows:
         print(*row, f"load {os.getloadavg()[0]:.1f}", sep="  ", file=sys.stderr, flush=True)
@@ -333,10 +335,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="of a slice")
     parser.add_argument("--slices", type=int, default=5, help="of each kind")
-    parser.add_argument("--stops", type=int, default=15, help="of all drives, of each kind")
-    parser.add_argument("--minutes", type=int, default=0, help="beside the users, instead of all that")
+    parser.add_argument("--stops", type=int, default=15, help="stops of all drives, of each kind")
+    parser.add_argument("--minutes", type=int, default=0, help="only this, with the users")
     parser.add_argument("--rotate", help="of the history: 1 min, or 10 with --minutes")
-    parser.add_argument("--ahead", action="store_true", help="run simulator and polling by SCHED_RR")
+    parser.add_argument("--ahead", action="store_true", help="run simulator and polling with SCHED_RR")
     parser.add_argument("--poll", nargs=2, type=Path, metavar=("PLANT", "FOLDER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.poll:
@@ -360,7 +362,7 @@ def run(arguments: argparse.Namespace) -> None:
             print("\nall drives stopped over HTTP; ms\n")
             stops = here.stops(arguments.stops) if arguments.stops else iter(())
             tables.show(("until", "beside", "stops", "least", "median", "longest"), [*stops])
-        print("\nvalues that were missed")
+        print("\nmissed values")
         for what, missed in sorted(here.missed.items()) or [("none", 0)]:
             print(f"  {what}: {missed}")
         print(f"\nthe users, in {here.loaded_s:.0f} s")

@@ -1,6 +1,6 @@
-"""Lateness of requests that are due at a fixed rate, against the grid, on an idle machine.
+"""Lateness of requests that are due at a fixed rate, on an idle machine.
 
-Held against a C program that sleeps until each point of the same grid, in slices that alternate.
+Compared with a C program that sleeps until each time of the same grid, in alternating slices.
 `python -m bench.questions.jitter JOB` is the process that polls.
 """
 
@@ -80,7 +80,7 @@ def main() -> None:
     rows = [row("bare C timer", yard, yard)]
     rows += [row(f"multidrop, {lines} line{'s' * (lines > 1)}", late[lines], yard) for lines in late]
     tables.show(("what", "requests", "late us p50", "p99", "max", "p99 - bare"), rows)
-    print("\nlate: from when a request was due until it was handed to the system, by CLOCK_MONOTONIC.")
+    print("\nlate: from the time when a request was due until its write() call, by CLOCK_MONOTONIC.")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Late, doubled and lost replies: count those that were taken for another request's reply.
 
-Several drives on each line, four blocks of one length per drive; a value names its drive and its
-register. Replies are late by up to three times the time-out, lost, or doubled: first so that a drive's later
-reply may come before an earlier one, as no line has it, then in their order. Last, all of them come over a
-path that holds them up for longer, and keeps their order.
+Each line has several drives with four blocks of one length each, and each value encodes its drive and
+register. Replies are late by up to three times the time-out, lost, or doubled. In the first part a drive's
+later reply may come before an earlier one, which no real line does; in the second part they keep their order.
+In the last part all replies come over a path that delays them for longer, and keeps their order.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def main() -> None:
     print(
         f"\nOf the replies {LATE_PERMILLE / 10:g} % come up to {3 * TIMEOUT_MS} ms late, "
         f"{LOST_PERMILLE / 10:g} % never, {TWICE_PERMILLE / 10:g} % twice; missed: values, 10 in an exchange."
-        "\nLater than that: over three time-outs after the request, when the responders received it late."
+        "\nLater than that: over three time-outs after the request, because the responders received it late."
     )
     print()
     tables.show(("path", "exchanges", "values", "another register's", "late"), list(slow_paths(arguments)))
@@ -60,7 +60,7 @@ def _told(judged: many_adapter.Judged, seconds: float) -> dict[str, object]:
         "seconds": f"{seconds:.0f}",
         "exchanges": judged.exchanges,
         "values": judged.samples,
-        "values that are another register's": judged.wrong - judged.beyond,
+        "values of another register": judged.wrong - judged.beyond,
         "the same, by answers later than that": judged.beyond,
         "late replies that were recognised": judged.late,
         **{f"missed: {why}": count for why, count in judged.misses.most_common()},
@@ -68,7 +68,7 @@ def _told(judged: many_adapter.Judged, seconds: float) -> dict[str, object]:
 
 
 def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
-    """Yield a row for each path, of few drives on few lines: each exchange takes as long as the path."""
+    """Yield a row for each path, with few lines and drives: each exchange takes as long as the path."""
     for path_ms in PATHS_MS:
         constant = "--path-us", 1000 * path_ms
         stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms

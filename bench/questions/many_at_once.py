@@ -1,9 +1,9 @@
-"""Many lines at once, and many threads that do to one poller all that may be done to it.
+"""Many lines at once, and many threads that use every function of one poller.
 
-Rows are taken and judged, motors started and stopped, drives removed and added again, and the summary
-is looked at, all at the same time; several times the poller is closed and another one opened. Ends
-with 1 when a value is another register's, when a row or a command is lost, when a thread does not end,
-or when memory, descriptors or threads grow.
+At the same time, threads take and check rows, start and stop motors, remove and add drives, and read the
+summary. Several times the poller is closed and a new one is opened. Exits with 1 if a value is another
+register's, if a row or a command is lost, if a thread does not end, or if memory, descriptors or threads
+grow.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Wire, simulated
 
-PATIENCE = 30.0  # s, until a thread that was asked to end must have ended
+PATIENCE = 30.0  # s, for a thread to end
 HEAD: tuple[str, ...] = (
     "exchanges",
     "a second",
@@ -46,7 +46,7 @@ HEAD += ("failed", "memory kB", "descriptors", "threads")
 
 
 def plant(ports: Sequence[str], drives: int) -> Plant:
-    """Return a plant with IBDs on each line from address 1 on, and a YD1000 whose motor is commanded."""
+    """Return a plant with IBDs from address 1 on each line, and a YD1000 whose motor gets commands."""
     lines = []
     for number, port in enumerate(ports, 1):
         found = [InnovertIBD(at, name=f"ibd-{number}-{at}") for at in range(1, drives)]
@@ -58,7 +58,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
 
 
 def wires(lines: int, drives: int) -> list[Wire]:
-    """Return wires without waits: no processor is left to keep a pace."""
+    """Return wires without waits, because all processors are too busy to keep a pace."""
     return [
         Wire(
             [
@@ -73,7 +73,7 @@ def wires(lines: int, drives: int) -> list[Wire]:
 
 
 class Round:
-    """One poller, from its opening to its end, and the threads around it."""
+    """One poller from start to end, and the threads around it."""
 
     def __init__(self, declared: Plant, seed: int) -> None:
         self.plant = declared
@@ -121,7 +121,7 @@ class Round:
             self._leave.set()
             raise
 
-    # ---- what the threads do ----
+    # ---- the threads' tasks ----
 
     def take(self, chance: random.Random) -> None:
         self.take_all()
@@ -137,7 +137,7 @@ class Round:
             self.count(rows=len(rows), values=len(values), misattributed=len(wrong))
 
     def come_and_go(self, chance: random.Random) -> None:
-        """Two threads may choose the same drive: then one of them is told so."""
+        """Remove and add drives. If two threads choose the same drive, one of them gets an error."""
         line = chance.choice(self.plant.lines)
         polled = chance.choice(line.drives[:-1])
         try:
@@ -150,7 +150,7 @@ class Round:
         self.count(moved=1)
 
     def command(self, chance: random.Random) -> None:
-        """One thread at a motor: a stop waits until the motor stands, and somebody else might start it."""
+        """Command the motors, one thread for each, because another start would prolong the wait of a stop."""
         line = chance.choice(self.plant.lines)
         if self._panels[line.name].acquire(blocking=False):
             try:
@@ -162,7 +162,7 @@ class Round:
         self.count(given=1)
         try:
             if chance.random() < 0.3:
-                motor.set_frequency(chance.randrange(1, 5))  # so that it soon stands
+                motor.set_frequency(chance.randrange(1, 5))  # so that it stops soon
             getattr(motor, chance.choice(["start", "stop", "state"]))()
         except BusError:
             self.count(failed=1)
@@ -173,12 +173,12 @@ class Round:
         self.poller.statistics()
         time.sleep(chance.uniform(0, 0.2))
 
-    # ---- what came of it ----
+    # ---- the results ----
 
     def told(self) -> tuple[int, int]:
-        """Return the exchanges, and how many rows the summary counts that nobody took.
+        """Return the exchanges, and the number of rows that the summary counts but that were not taken.
 
-        All drives are back by then, so that the summary has every one.
+        All drives are back by then, so the summary has every one.
         """
         summary = self.poller.summary()
         lost = summary["samples"] + summary["misses"] - self.counts["rows"]
@@ -207,7 +207,7 @@ def main() -> int:
                 this_round.run(60 * arguments.minutes / arguments.rounds)
                 exchanges, lost = this_round.told()
                 descriptors = len(list(Path("/proc/self/fd").iterdir()))
-                gc.collect()  # who refers to each other in a circle waits for that
+                gc.collect()  # frees reference cycles
                 seen.append((resident_kb(os.getpid()), descriptors, threading.active_count()))
                 cells = (
                     exchanges,
@@ -232,7 +232,7 @@ def main() -> int:
                     or this_round.counts["given"] != this_round.counts["ended"]
                 ):
                     failures.append(f"round {number + 1}: a value is another's, or a row or command is lost")
-    half = seen[len(seen) // 2]  # by then what is used again and again has its size
+    half = seen[len(seen) // 2]  # by then, reused memory has its final size
     if seen[-1][0] - half[0] > MOST_GROWTH_KB or seen[-1][1:] != seen[0][1:]:
         failures.append(f"memory, descriptors or threads grow: half-way {half}, at last {seen[-1]}")
     print("\n" + ("\n".join(failures) or "nothing misattributed, nothing lost, nothing grows"))

@@ -1,9 +1,9 @@
 """The host's cost of an exchange when one process polls many lines.
 
-A bare epoll loop in C over as many lines runs before every slice, and ratios are to that slice. The
-client is on one processor and the responders are on another: on the same one the scheduler lets them
-interrupt a client that takes more time than they do, every few exchanges. More lines than the system has
-room for are left out, and the limit is printed. A default run takes a quarter of an hour.
+A bare epoll loop in C over the same number of lines runs before every slice, and ratios are to that slice.
+The client runs on one processor and the responders on another. On the same one, the scheduler would let the
+responders interrupt a client that takes more time than they do, every few exchanges. Numbers of lines beyond
+a limit of the system are skipped, and the limit is printed. A default run takes a quarter of an hour.
 `python -m bench.questions.many_lines JOB` is the process that polls.
 """
 
@@ -31,15 +31,15 @@ from bench.support.programs import CHECKSUM, compiled, module, on_processor
 
 BAUDRATE = 115200
 DELAY_US = 2000
-SETTLE_S = 2.0  # some thousand drives' first exchanges
-DESCRIPTORS = 5  # that a poller holds for a line: its port and two pipes; the responders need fewer
-OTHERS = 64  # descriptors that are no line's
+SETTLE_S = 2.0  # for the first exchanges of some thousand drives
+DESCRIPTORS = 5  # of a poller for each line: its port and two pipes; the responders need fewer
+OTHERS = 64  # other descriptors of the process
 PTYS = Path("/proc/sys/kernel/pty")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Ports to poll for `seconds`: paths, or numbers of descriptors that are open already."""
+    """Ports to poll for `seconds`: paths, or numbers of open descriptors."""
 
     ports: Sequence[str]
     baudrate: int
@@ -88,7 +88,7 @@ def poll(job: Lines) -> dict[str, Any]:
 
 
 def room(kind: str) -> dict[str, int]:
-    """Return how many such lines each limit of the system allows."""
+    """Return the number of such lines that each limit of the system allows."""
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     limits = {f"{DESCRIPTORS} descriptors a line, {files} a process": (files - OTHERS) // DESCRIPTORS}
     if kind == "pty":
@@ -98,10 +98,10 @@ def room(kind: str) -> dict[str, int]:
 
 
 def has_room(kind: str, count: int) -> bool:
-    """Return True if there is room for so many lines; else print why not."""
+    """Return True if there is room for that many lines; else print the limit."""
     why, most = min(room(kind).items(), key=itemgetter(1))
     if count > most:
-        print(f"{kind} {count} is left out: there is room for {most} ({why}).", flush=True)
+        print(f"{kind} {count} is skipped: there is room for {most} ({why}).", flush=True)
     return count <= most
 
 
@@ -178,7 +178,7 @@ def main() -> None:
     tables.show(("lines", "exchanges/s", "CPU us", "of a core", "in Python", "failed"), [paced(arguments)])
     print(
         "\nCPU us: of all threads of the process, per exchange; in Python: of these, those that run Python."
-        "\nThe lines are polled by Poller; a socket pair stands in for a port that is open already."
+        "\nPoller polls the lines; a socket pair replaces an open port."
     )
 
 

@@ -11,7 +11,7 @@ from bench.masters.jobs import Job
 from bench.support import tables
 from bench.support.programs import paced_line
 
-WARM_UP = 0.02  # of all exchanges: buffers have grown to their size by then
+WARM_UP = 0.02  # share of the exchanges, after which buffers have their final size
 ROWS = 10
 
 
@@ -19,7 +19,7 @@ def resident_kb() -> int:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1])
-    raise RuntimeError("the kernel does not tell the resident memory")
+    raise RuntimeError("the kernel does not report the resident memory")
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--exchanges", type=int, default=10_000_000)
     total = parser.parse_args().exchanges
     tables.heading(
-        f"{total} exchanges of 10 registers over TCP without waits; batches are taken and dropped."
+        f"{total} exchanges of 10 registers over TCP without waits; batches are taken and discarded."
     )
 
     rows = []

@@ -1,7 +1,7 @@
 """Utilisation of a line with all families on it: several baud rates, formats and silences.
 
-Every drive is as its document leaves the factory, and all its readings are polled. The ideal is the
-bus cycle that is predicted before the port is opened.
+Every drive has its documented factory settings, and all its readings are polled. The ideal is the bus cycle
+that is predicted before the port is opened.
 `python -m bench.questions.mixed_line PORT SECONDS` is the process that polls.
 """
 
@@ -21,7 +21,7 @@ PORT = str(CORE / "termios.c")
 
 
 def measured(line: many_adapter.Mixed, seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what the drives and what the poll saw of the line."""
+    """Return the line's report from the drives' side, and from the poll."""
     with talking([compiled("players/mixed_line.c", *FRAMES, PORT), *line.words]) as player:
         told = subprocess.check_output(module("bench.questions.mixed_line", player.said, str(seconds)))
     return player.report, json.loads(told)

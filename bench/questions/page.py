@@ -1,10 +1,10 @@
-"""Measure how old the gateway's page is in Chromium: in one tab, in nine, on a slow way, and after a kill.
+"""Measure the age of the gateway's page in Chromium: in one tab, in nine, on a slow network, after a kill.
 
-31 drives on three simulated lines, each with ten values every 0.1 s, by `multidrop serve` and the page
-itself. A frame's age is the viewer's clock less the frame's time: when it comes, and while it is shown, which
-is until the next one comes. A value's age is that of the drive whose newest value is the oldest. All is
-looked at every 10 ms. The slow way is once Chromium's own (Network.emulateNetworkConditions), which counts
-whole packets of 1500 bytes, and once a relay that counts bytes.
+`multidrop serve` polls 31 drives on three simulated lines, with ten values of each every 0.1 s. A frame's age
+is the viewer's clock minus the frame's time, when it arrives and until the next one arrives. The age of
+values is that of the drive whose newest value is the oldest. All ages are checked every 10 ms. The slow
+network is once Chromium's own (Network.emulateNetworkConditions), which counts whole packets of 1500 bytes,
+and once a relay that counts bytes.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def plant_text(ports: Path) -> str:
 
 @contextmanager
 def program(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A multidrop command, and the first line that it prints."""
+    """Run a multidrop command; yield the first line that it prints."""
     command = [sys.executable, "-m", "multidrop", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -81,7 +81,7 @@ def until(page: Any, expression: str) -> float:
 
 
 def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
-    """Return a page that is live; `bytes_a_second` slows its network down from then on."""
+    """Return a live page; `bytes_a_second` limits its network from then on."""
     page = context.new_page()
     page.goto(url)
     until(page, LIVE)
@@ -94,7 +94,7 @@ def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
 
 
 def row(what: str, pages: list[Any], seconds: float) -> list[object]:
-    """Look at some pages, one after another while all are open; return a row of the table."""
+    """Measure pages one after another while all are open; return a row of the table."""
     arrived: list[float] = []
     frames: list[float] = []
     values: list[float] = []
@@ -116,7 +116,7 @@ def figures(ages: list[float]) -> list[str]:
 
 
 def frame_sizes(url: str) -> str:
-    """Return the bytes of a whole frame, and of what changed since another one, on the wire and unpacked."""
+    """Return the bytes of a whole frame, and of a frame with changes only, on the wire and unpacked."""
     import gzip
     import urllib.request
 
@@ -136,12 +136,12 @@ def frame_sizes(url: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0, help="for which each row is looked at")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of each row")
     parser.add_argument("--kills", type=int, default=5, help="of the gateway")
     arguments = parser.parse_args()
     from playwright.sync_api import sync_playwright
 
-    tables.heading("How old is what the page shows?")
+    tables.heading("How old are the values on the page?")
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     with TemporaryDirectory() as directory, sync_playwright() as playwright:
         plant = Path(directory) / "plant.toml"

@@ -1,7 +1,7 @@
-"""Measure what Chromium's network limiter adds to an answer, beside a way of as many bytes a second.
+"""Measure the delay that Chromium's network limiter adds, compared with a relay of the same rate.
 
-A page in Chromium asks for answers of so many bytes, one after another, at moments that have nothing to do
-with one another. The limiter is Network.emulateNetworkConditions, as `bench.questions.page` uses it.
+A page in Chromium requests answers of some sizes, one after another, at random times. The limiter is
+Network.emulateNetworkConditions, as `bench.questions.page` uses it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ASK = """async ([size, pauses]) => {
 
 
 class Sized(BaseHTTPRequestHandler):
-    """Answers a path with as many bytes as it says."""
+    """Answer a path with the number of bytes in it."""
 
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True
@@ -47,7 +47,7 @@ class Sized(BaseHTTPRequestHandler):
         self.wfile.write(head.encode() + body)
 
     def log_message(self, *words: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 @contextmanager

@@ -1,7 +1,7 @@
-"""The bus cycle of random plants as multidrop plans it, against the usual ways to merge registers.
+"""The bus cycle of random plants with multidrop's plan, compared with the usual ways to merge registers.
 
-All keep the families' limits and read across the same addresses. Each plan is in the same order, but
-for the last row: multidrop's own blocks in the order in which the plant file has the drives.
+All plans keep the families' limits and read across the same addresses. They have the same order, except in
+the last row: multidrop's own blocks in the plant file's order of drives.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Plant = list[tuple[Drive, Registers]]
 
 
 def plant(lot: random.Random) -> Plant:
-    """Drives of all families at all their settings, each with some of its registers."""
+    """Return drives of all families with random settings, each with some of its registers."""
     drives: Plant = []
     for address in range(1, lot.randint(1, MOST_DRIVES) + 1):
         family = lot.choice(list(MODELS.values()))
@@ -44,7 +44,7 @@ def plant(lot: random.Random) -> Plant:
 
 
 def merged(drive: Drive, registers: Registers, most_gap: int) -> list[Block]:
-    """Merge registers by rising address while at most `most_gap` addresses lie between two; -1: none."""
+    """Merge registers in order of address, across at most `most_gap` other addresses; -1: never merge."""
     tables: dict[Table, list[Register[Any]]] = {}
     for register in registers:
         tables.setdefault(register.table, []).append(register)
@@ -80,11 +80,11 @@ def end(register: Register[Any]) -> int:
     return register.address + register.words
 
 
-# ---- what they take ----
+# ---- their duration ----
 
 
 def cycle(drives: Iterable[Drive], of_drive: dict[Drive, Iterable[Block]]) -> float:
-    """Return the seconds for reading everything once, in this order of the drives."""
+    """Return the seconds to read everything once, in this order of the drives."""
     exchanges = [Planned(drive, block) for drive in drives for block in of_drive[drive]]
     return sum(
         gap(exchanges[at - 1].drive, each.drive) + sending(each.drive, each.block) + each.drive.response_delay

@@ -1,8 +1,8 @@
-"""The predicted bus cycle against the measured one.
+"""The predicted bus cycle compared with the measured one.
 
-On paced_line.c, and on simulated drives of all families with their own settings and silences. The
-measured cycle is the time from a drive's first request of one cycle to that of the next: the mean of
-a second, and of all seconds the median, because other programs disturb some.
+On paced_line.c, and on simulated drives of all families with their own settings and silences. The measured
+cycle is the time from a drive's first request in one cycle to that in the next. The figure is the median of
+the means of each second, because other programs disturb some seconds.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 
 GOAL = 0.02
-SETTLING_S = 0.5  # in which response delays are learnt
+SETTLING_S = 0.5  # to measure response delays
 
-Wanted = list[tuple[Drive, float | None]]  # each with all its readings, every so many s
+Wanted = list[tuple[Drive, float | None]]  # each with all its readings, and its period in s
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Case:
     predicted: float  # s
     known: float  # the same with the response delays that were measured
     measured: float
-    missed: int  # values that were asked for in vain; each exchange of them costs a time-out
+    missed: int  # missed values; each failed exchange costs a time-out
 
     def row(self) -> list[str]:
         seconds = (self.predicted, self.known, self.measured)
@@ -68,7 +68,7 @@ def exchanges(wanted: Wanted) -> list[Planned]:
 
 
 def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
-    """Return the measured cycle of the drives that are polled as fast as the line allows."""
+    """Return the measured cycle of the drives without a rate."""
     drives = tuple(PolledDrive(drive, polls(drive, every)) for drive, every in wanted)
     plant = Plant((PlantLine("line", port, None, None, drives),), Path("plant.toml"))
     watched = next(drive for drive, every in wanted if every is None)
@@ -88,14 +88,14 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
 
 
 def middle(times: Sequence[int]) -> float:
-    """Return the usual s between two of these times in ns: the median over the seconds of their means."""
+    """Return the median of the per-second mean periods, in s, of these times in ns."""
     most = len(times) - 1
     step = min(most, max(1, round(1e9 * most / (times[-1] - times[0]))))
     return median(times[at + step] - times[at] for at in range(0, most - step + 1, step)) / step / 1e9
 
 
 def cycle(wanted: Wanted, delays: dict[Drive, float]) -> float:
-    """Return the predicted s from one turn to the next of the drives without a rate."""
+    """Return the predicted cycle of the drives without a rate, in s."""
     return next(1 / rate.reached for rate in predict(exchanges(wanted), delays).rates if rate.every is None)
 
 
@@ -142,7 +142,7 @@ def mixed(seconds: float) -> Iterator[Case]:
 
 @contextmanager
 def simulated(drives: Iterable[tuple[str, Drive]]) -> Iterator[str]:
-    """The port of a line on which `multidrop simulate` plays them."""
+    """Yield the port of a line on which `multidrop simulate` plays these drives."""
     with TemporaryDirectory() as directory:
         plant = Path(directory) / "plant.toml"
         entries = (
@@ -162,12 +162,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=4.0, help="of each line")
     arguments = parser.parse_args()
-    tables.heading("Bus cycles in ms: predicted, predicted with the response delays measured, measured.")
+    tables.heading("Bus cycles in ms: predicted, predicted with the measured response delays, measured.")
     cases = [*paced(arguments.seconds), *mixed(arguments.seconds)]
     columns = ("line", "predicted", "by delays", "measured", "off", "by delays", "missed")
     tables.show(columns, [case.row() for case in cases])
     outside = [case.name for case in cases if abs(case.measured / case.predicted - 1) > GOAL]
-    print(f"\nmore than {GOAL:.0%} off what was predicted: {'; '.join(outside) or 'none'}")
+    print(f"\nmore than {GOAL:.0%} away from the prediction: {'; '.join(outside) or 'none'}")
 
 
 if __name__ == "__main__":

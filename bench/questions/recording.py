@@ -1,6 +1,6 @@
 """Decoding, batches and writing to disk: values per second, and CPU per value.
 
-The same 16 replies of 10 registers are decoded anew for every batch.
+The same 16 replies of 10 registers are decoded again for every batch.
 """
 
 from __future__ import annotations

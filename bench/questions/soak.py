@@ -1,9 +1,12 @@
-"""The demo's plant on hostile lines, polled and recorded for hours: what it costs, and what it proves.
+"""The demo's plant on hostile lines, polled and recorded for hours: its cost, and its errors.
 
-Ends with 1 when a value is another register's, unless the line itself was held up for so long that
-answers came after the response time-out, beyond which nobody can tell them; when one is missing
-without a row that says why, when the recording is not what was polled, or when memory, descriptors or
-threads grow.
+Exits with 1 in these cases:
+
+- A value is another register's. Exception: the line itself was delayed so long that replies came after the
+  response time-out, and then no client could recognise them.
+- A value is missing without a row that gives the reason.
+- The recording differs from the polled rows.
+- Memory, descriptors or threads grow.
 """
 
 from __future__ import annotations
@@ -34,9 +37,9 @@ from multidrop.toml_check import parse_duration
 
 PLAYERS = Path(__file__).parents[1] / "players"
 MOST_GROWTH_KB = 2048  # of resident memory, from the end of the first period on
-COMMAND_EVERY = 20.0  # s between a motor's start and its stop
-IN_FLIGHT = 2  # slots of a register that are not rows yet
-HELD_UP = 1.0  # s before a value came, in which the line was held up
+COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
+IN_FLIGHT = 2  # slots of a register without a row yet
+HELD_UP = 1.0  # s before a value came, in which the line was delayed
 HEAD: tuple[str, ...] = (
     "hours",
     "exchanges",
@@ -58,7 +61,7 @@ def resident_kb(pid: int) -> int:
 
 @dataclass
 class Span:
-    """Least and most of a number."""
+    """The least and the greatest value of a number."""
 
     least: int = sys.maxsize
     most: int = 0
@@ -85,7 +88,7 @@ class Period:
 
 
 class Commander(threading.Thread):
-    """Starts and stops the motor of each line, as someone at a panel would."""
+    """Starts and stops the motor of each line, as a person at a panel would."""
 
     def __init__(self, buses: list[Bus]) -> None:
         super().__init__(name="commander", daemon=True)
@@ -117,7 +120,7 @@ class Commander(threading.Thread):
 
 
 class Soak:
-    """One run: rows are judged as they come, and counted by period."""
+    """One run: rows are checked as they come, and counted by period."""
 
     def __init__(self, plant: Plant, poller: Poller, out: Path, simulator: plants.RunningPlant) -> None:
         self.plant = plant
@@ -132,7 +135,7 @@ class Soak:
             for poll in drive.polls
             if poll.every
         }
-        self.slots: Counter[tuple[str, str]] = Counter()  # rows of what is polled at a rate
+        self.slots: Counter[tuple[str, str]] = Counter()  # rows of registers with a rate
         self.total = Period()
         self.exchanges = 0
         self.faults: list[str] = []
@@ -178,12 +181,12 @@ class Soak:
         return period
 
     def unexplained(self, overrun: int) -> int:
-        """Return how many values so far are neither there nor missed nor counted as left out."""
+        """Return the number of values so far that have no row and are not counted as skipped."""
         slots = int((time.monotonic() - self.begun) / plants.EVERY) - IN_FLIGHT
         return max(0, sum(max(0, slots - self.slots[key]) for key in self.timed) - overrun)
 
     def periods(self, hours: float, every: float, commander: Commander) -> Iterator[Period]:
-        """Print each period's line when it is over."""
+        """Print the line of each period at its end."""
         print("  ".join(HEAD), flush=True)
         end = self.begun + hours * 3600
         while (left := end - time.monotonic()) > 1:

@@ -1,8 +1,8 @@
-"""Stops under attack: whether any motor turns that was stopped, and how soon the stop was on the wire.
+"""Stops under attack: does a motor turn after its stop, and how soon is the stop on the wire?
 
-Client processes are attacked from outside by signals, deaf lines, pauses and cut networks, and from inside
-by threads that start motors. The responders are not the library's. Ends with 1 when a motor was left
-turning that should not, or was told to move after a stop. The same seed makes the same attacks.
+Client processes are attacked from outside by signals, deaf lines, suspensions and cut networks, and from
+inside by threads that start motors. The responders do not use the library. Exits with 1 if a motor turns that
+should not, or if a frame moves it after a stop. The same seed makes the same attacks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from bench.support import tables
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ALL = [(kind, address) for address, kind in enumerate((*KINDS, "yd1000"), 1)]
-LOOKS: dict[str, tuple[int, ...]] = {  # the exceptions that its first looks get
+LOOKS: dict[str, tuple[int, ...]] = {  # the exceptions in reply to the first reads of a stop
     "erman-er-g-220": (2,),
     "invt-che": (0x11, 0x06),
     "innovert-ibd": (6,),
@@ -36,10 +36,10 @@ LOOKS: dict[str, tuple[int, ...]] = {  # the exceptions that its first looks get
     "yd1000": (4,),
     "fan": (1,),
 }
-MOST_LOOKS = 8  # of a start, before it writes
-LATE, PATIENCE = 0.6, 3.0  # s: answers come so late; a stop that they cannot confirm in time is given so long
-CUT_SHORT = "cut short"  # in what a client says whose stops were
-PAUSE = 2.5  # s: longer than a start may be late, and than one of its looks may take
+MOST_LOOKS = 8  # reads of a start before its write
+LATE, PATIENCE = 0.6, 3.0  # s: delay of the replies; time for a stop that they confirm too late
+CUT_SHORT = "cut short"  # in the output of a client whose stops were aborted
+PAUSE = 2.5  # s: longer than a start's expiry, and than one of its reads
 Attack = Callable[[random.Random, int, bool], Counters]
 
 
@@ -50,7 +50,7 @@ def _in_turn(chance: random.Random) -> Iterator[str]:
 def signals(number: int, leaving: bool) -> Attack:
     """Return an attack by signals at random moments, while the client waits or leaves.
 
-    Three of them may cut its stops short.
+    Three signals may abort its stops.
     """
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
@@ -75,7 +75,7 @@ def signals(number: int, leaving: bool) -> Attack:
 
 
 def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """A thread starts a motor; the signal comes in the middle of one of its exchanges."""
+    """Send a signal during an exchange of a thread that starts a motor."""
     counters, kinds = Counters(), _in_turn(chance)
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], on_exit=True, sets=True) as client:
@@ -92,7 +92,7 @@ def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Co
 
 
 def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """A start in one thread, and a stop in another in the middle of it."""
+    """Start a motor in one thread, and stop it in another thread during the start."""
     counters = Counters()
     for kind, known in KINDS.items():
         with victim([[(kind, 1)]], sets=True) as client:
@@ -110,7 +110,7 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Nobody hears anything for a while from the asking on."""
+    """Make the line deaf for a while from the request to stop."""
     counters = Counters()
     for _ in range(rounds):
         seconds = chance.uniform(2.0, 20.0) if is_long else 1.2
@@ -128,7 +128,7 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def two_lines(*, polls: bool) -> Attack:
-    """Return an attack on two lines of four motors that take their time to stand: a signal stops both."""
+    """Return an attack on two lines of four motors that stop slowly: a signal stops both lines."""
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()
@@ -145,7 +145,7 @@ def two_lines(*, polls: bool) -> Attack:
 
 
 def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """The first looks at a drive are answered by an exception, or all that it says is 0.6 s late."""
+    """Reply to the first reads of a drive with an exception, or delay all its replies by 0.6 s."""
     counters = Counters()
     for _ in range(rounds):
         for kind, codes in LOOKS.items():
@@ -168,7 +168,7 @@ def _stop(client: Victim, counters: Counters, why: str, **more: float) -> None:
 
 
 def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Ctrl-Z in the middle of a start, and on again after its time: what moves then was not asked for now."""
+    """Suspend the client (Ctrl-Z) during a start until its expiry is over; then no motor may move."""
     counters, kinds = Counters(), _in_turn(chance)
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], sets=True) as client:
@@ -189,7 +189,7 @@ def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     return counters
 
 
-ATTACKS: dict[str, tuple[Attack, float]] = {  # with the share of the rounds that it has
+ATTACKS: dict[str, tuple[Attack, float]] = {  # with its share of the rounds
     "a signal while it runs": (signals(1, leaving=False), 0.5),
     "two signals": (signals(2, leaving=False), 1),
     "three signals": (signals(3, leaving=False), 0.5),
@@ -227,11 +227,9 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=20, help="2 take half a minute")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", choices=ATTACKS, action="append", help="of the attacks; may be repeated")
-    parser.add_argument("--stories", action="store_true", help="tell each stop that failed")
+    parser.add_argument("--stories", action="store_true", help="print each failed stop")
     arguments = parser.parse_args()
-    tables.heading(
-        "Stops of clients that are attacked; times are from the asking to the first stop on the wire."
-    )
+    tables.heading("Stops of clients under attack; times are from the request to the first stop on the wire.")
     rows, failures, stories = [], 0, []
     for name in arguments.only or ATTACKS:
         attack, share = ATTACKS[name]

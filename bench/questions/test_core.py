@@ -36,7 +36,7 @@ TEN_VALUES = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in rang
 
 
 def unhurried(request: Message) -> Exchange:
-    """Return an exchange without a silence or a time on the wire: what it costs is the host's."""
+    """Return an exchange without silence and wire time, so that its cost is the host's alone."""
     return Exchange(
         Framing.RTU,
         request,
@@ -74,7 +74,7 @@ def fd(responder: str) -> Any:
 
 
 def carry_out(port: Port, exchanges: list[Exchange], row_queue: RowQueue) -> Columns:
-    """Queue them all, and take their rows."""
+    """Queue the exchanges, and take their rows."""
     last = port.done + len(exchanges)
     port.submit(exchanges, [0] * len(exchanges))
     while port.done != last:

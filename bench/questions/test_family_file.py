@@ -1,4 +1,4 @@
-"""Cost of loading a family from its file, and of finding it again unchanged."""
+"""Cost of loading a family from its file, and of a second load without changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEFAULT = '[default]\ntable = "input"\nnumber_format = "F32"\n'
 
 @pytest.fixture
 def meter(tmp_path: Path) -> Path:
-    """A file of 40 float registers, one a line."""
+    """A file with 40 float registers, one per line."""
     entries = (f'value_{at} = {{ at = 0x{2 * at:04X}, unit = "V" }}\n' for at in range(REGISTERS))
     path = tmp_path / "meter.toml"
     path.write_text(f"{HEAD}{DEFAULT}[reading]\n{''.join(entries)}")

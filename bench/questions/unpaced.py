@@ -1,7 +1,7 @@
 """The host's cost of an exchange: lines without waits, on a pty and over TCP.
 
-A bare write-poll-read loop in C runs before every slice, and ratios are to that slice. Both ends
-are on one processor, which repeats best. A default run takes six minutes.
+A bare write-poll-read loop in C runs before every slice, and ratios are to that slice. Both ends run on one
+processor, because its results vary least. A default run takes six minutes.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rivals.insist_on(arguments.masters)
     tables.heading(
-        "Lines without waits: 16 drives, 10 registers each, the library's own silence where it has one."
+        "Lines without waits: 16 drives, 10 registers each, the library's own silence if it has one."
     )
 
     with on_processor(0):

@@ -1,8 +1,8 @@
 """Utilisation of a paced wire by each master, requests that came too early, and the host's cost.
 
-A bare master in C that keeps multidrop's silence runs before every slice; differences and ratios
-are to that slice. Figures are medians over the slices, but what is counted is counted over all of
-them. A default run takes a quarter of an hour.
+A bare master in C that keeps multidrop's silence runs before every slice; differences and ratios are to that
+slice. Figures are medians of the slices, and counts are sums over all slices. A default run takes a quarter
+of an hour.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bench.support import tables
 from bench.support.programs import paced_line
 
 BARE = "bare C"
-ASLEEP = "bare C, asleep"  # until a character and a half before a reply's end: that is when multidrop looks
+ASLEEP = "bare C, asleep"  # until a character and a half before a reply's end, when multidrop wakes
 
 COLUMNS = (
     "baud",
@@ -115,7 +115,7 @@ def main() -> None:
         rows.append(row(baudrate, BARE, yards, yards))
     tables.show(COLUMNS, rows)
     print(
-        "\nutilisation: ideal bus cycle / measured; over 1 where the silence is not kept."
+        "\nutilisation: ideal bus cycle / measured; over 1 if the silence is not kept."
         "\ntoo early: requests more than 20 us before the silence was over, and their share of all requests."
         "\nlate: median time from the end of the silence until a request is seen."
         "\nCPU: of the master's process, per exchange; failed: exchanges without the right values."

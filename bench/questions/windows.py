@@ -1,7 +1,7 @@
-"""Utilisation of a paced wire, and requests too early, on a COM port of Windows by Wine, and here.
+"""Utilisation of a paced wire, and requests that came too early: on a COM port with Wine, and on Linux.
 
-FOLDER is one that `tools/wine make` filled. Wine is not Windows: its timers keep time to a millisecond, each
-wait goes through a process of its own (wineserver), and its COM port is a pseudo-terminal here.
+FOLDER was filled by `tools/wine make`. Wine is not Windows: its timers have a resolution of one millisecond,
+each wait goes through another process (wineserver), and its COM port is a pseudo-terminal.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def here(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def on_windows(job: Job, folder: Path) -> dict[str, Any]:
-    """Return the same of a poll by Wine."""
+    """Return the same for a poll with Wine."""
     link = folder / "wine" / "dosdevices" / f"com{COM}"
     link.unlink(missing_ok=True)
     link.symlink_to(job.port)
@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
     parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
     parser.add_argument("--slices", type=int, default=3)
-    parser.add_argument("--ahead", action="store_true", help="run line and masters by SCHED_RR; as root")
+    parser.add_argument("--ahead", action="store_true", help="run line and masters with SCHED_RR; needs root")
     arguments = parser.parse_args()
     if arguments.ahead:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(2))
@@ -109,8 +109,8 @@ def main() -> None:
     print(
         "\nutilisation: ideal bus cycle / measured."
         "\ntoo early: requests more than 20 us before the silence was over."
-        "\ngiven up: of these, those that came while the line still owed the reply before: it was held up for"
-        "\nlonger than the time-out, and the master did not wait for it any more."
+        "\ngiven up: of these, those sent before the previous reply had come: it was delayed for longer than"
+        "\nthe time-out, and the master had stopped waiting for it."
         "\nlate: median time from the end of the silence until a request is seen."
         "\nCPU: of the master's process, per exchange, without Wine's server."
         "\nmisses: exchanges without values."

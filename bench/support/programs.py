@@ -1,4 +1,4 @@
-"""The C programs of bench/: compiled once a run, and the paced line as a context."""
+"""The C programs of bench/: compiled once per run, and the paced line as a context manager."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 HERE = Path(__file__).parents[1]
 PROCESSORS = sorted(os.sched_getaffinity(0))
 CORE = HERE.parent / "csrc"
-CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that take the core's own checksums
+CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that use the core's own checksums
 FRAMES = (*CHECKSUM, str(CORE / "body.c"), str(CORE / "frame.c"))
 
 
@@ -28,7 +28,7 @@ def _directory() -> TemporaryDirectory[str]:
 
 @cache
 def compiled(source: str, *flags: str) -> Path:
-    """The program made of a C file in bench/."""
+    """Compile a C file in bench/; return the path of the program."""
     target = Path(_directory().name) / Path(source).stem
     subprocess.run(["cc", "-O2", str(HERE / source), "-o", str(target), *flags], check=True)
     return target
@@ -41,9 +41,9 @@ def module(name: str, *words: object) -> list[str]:
 
 @dataclass
 class Talker:
-    """A program that plays a line, or many; its report is there when it has ended."""
+    """A program that plays one line or many; it has a report when it has ended."""
 
-    said: str  # first of all: where its lines are to be found
+    said: str  # its first output: the ports of its lines
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -53,14 +53,14 @@ class Talker:
 
 @contextmanager
 def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
-    """A program that runs until its standard input ends, and then prints its report as JSON."""
+    """Run a program until its standard input ends; it then prints its report as JSON."""
     words = [str(word) for word in command]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **pipes, **details) as process:
         assert process.stdout is not None
         said = process.stdout.readline()
         if not said.endswith("\n"):
-            raise RuntimeError(f"{Path(words[0]).name} ended before its lines were there")
+            raise RuntimeError(f"{Path(words[0]).name} ended before its lines were ready")
         talker = Talker(said.strip())
         yield talker
         told, _ = process.communicate()
@@ -69,7 +69,7 @@ def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
 
 @contextmanager
 def paced_line(**options: Any) -> Iterator[Talker]:
-    """paced_line.c with these options, such as baudrate=9600, stray=True, silent="3,7"."""
+    """Run paced_line.c with these options, such as baudrate=9600, stray=True, silent="3,7"."""
     command: list[object] = [compiled("players/paced_line.c")]
     for name, value in options.items():
         key = f"--{name.replace('_', '-')}"
@@ -80,7 +80,7 @@ def paced_line(**options: Any) -> Iterator[Talker]:
 
 @contextmanager
 def on_processor(number: int) -> Iterator[None]:
-    """Programs that are started meanwhile stay on that processor, or on the last there is."""
+    """Programs that are started within the block stay on that processor, or on the last one."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {PROCESSORS[min(number, len(PROCESSORS) - 1)]})
     yield

@@ -1,4 +1,4 @@
-"""Tables as text, headed by what is needed to judge them: command, date and machine."""
+"""Tables as text, with a heading for judging them: command, date and machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def heading(what: str) -> None:
-    """Say what is measured, how it was started, when, and on which machine."""
+    """Print the heading of a table: its subject, command, date and machine."""
     print(what)
     print(f"command  {shlex.join(['python', *sys.orig_argv[1:]])}")
     print(f"date     {datetime.now(UTC):%Y-%m-%d %H:%M} UTC")
@@ -37,7 +37,7 @@ def _machine() -> str:
 
 
 def show(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print rows under their columns: text to the left, numbers to the right."""
+    """Print the rows: text is left-aligned, numbers are right-aligned."""
     rows = list(rows)
     cells = [list(columns), *([str(cell) for cell in row] for row in rows)]
     widths = [max(len(line[at]) for line in cells) for at in range(len(columns))]
