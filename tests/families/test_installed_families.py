@@ -6,6 +6,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
+from multidrop.cli import main
 from multidrop.families import YD1000, registry
 from multidrop.families.registry import GROUP, find_model
 
@@ -17,13 +18,24 @@ def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
 
 
 def test_a_family_of_a_package_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(monkeypatch, acme="toy:Toy", broken="no_such_module:Drive")
-    assert find_model("acme").__name__ == "Toy"
+    installed(monkeypatch, toy="toy:Toy", broken="no_such_module:Drive")
+    assert find_model("toy").__name__ == "Toy"
 
 
 def test_a_built_in_family_goes_before_an_installed_one(monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, yd1000="toy:Toy")
     assert find_model("yd1000") is YD1000
+
+
+def test_models_lists_installed_families_and_warns_of_broken_ones(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed(monkeypatch, toy="toy:Toy", broken="no_such_module:Drive", yd1000="toy:Toy")
+    assert main(["models"]) == 0
+    out, err = capsys.readouterr()
+    assert [line.partition(" ")[0] for line in out.splitlines()].count("toy") == 1
+    assert err.count("\n") == 1
+    assert "model 'broken' of package" in err
 
 
 @pytest.mark.parametrize(
@@ -39,6 +51,10 @@ def test_a_built_in_family_goes_before_an_installed_one(monkeypatch: pytest.Monk
         ),
         ({"acme": "toy:missing"}, r"model 'acme' of package .* cannot be loaded: AttributeError"),
         ({"acme": "toy:__doc__"}, r"model 'acme' of package .* is not a subclass of multidrop.Drive"),
+        (
+            {"acme": "toy:Toy"},
+            r"model 'acme' of package .* has model = 'toy': name its entry point so",
+        ),
         ({"acmes": "toy:Toy"}, r"there is no model 'acme'; did you mean acmes"),
     ],
 )

@@ -12,7 +12,7 @@ from enum import Flag
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
@@ -22,7 +22,7 @@ from multidrop.drive.request import read_limit, stated_limit
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
 from multidrop.families import MODELS
-from multidrop.families.registry import SHIPPED, find_model, is_users_own, shipped_family
+from multidrop.families.registry import SHIPPED, find_model, installed_models, is_users_own, shipped_family
 from multidrop.planning.suggestions import ReadingGain, reading_gain
 from multidrop.plant.loader import load_plant
 
@@ -37,13 +37,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
-        families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
+        families = [*MODELS.values(), *map(shipped_family, SHIPPED), *_installed()]
         summaries = [_summary(family) for family in families]
         print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
     else:
         family = _family(arguments.model, arguments.drive)
         print_text(json.dumps(facts(family), indent=2) if arguments.json else sheet(family))
     return 0
+
+
+def _installed() -> Iterator[type[Drive]]:
+    """Yield the families of other packages; warn of those that cannot be loaded."""
+    for name in installed_models():
+        try:
+            yield find_model(name)
+        except ValueError as failure:
+            warn(str(failure))
 
 
 def _family(model: str, drive: str | None) -> type[Drive]:

@@ -55,11 +55,17 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     if not colon and text.endswith(".py"):
         path = text
     if not path.endswith(".py"):
-        known = (*MODELS, *SHIPPED, *(point.name for point in entry_points(group=GROUP)))
+        known = (*MODELS, *SHIPPED, *installed_models())
         near = difflib.get_close_matches(text.lower(), known, n=2)
         hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
         raise ValueError(f"there is no model {text!r}; {hint} (or write path/to/file.toml or file.py:Class)")
     return _drive(_load((relative_to or Path()) / path), path, name if colon else "")
+
+
+def installed_models() -> list[str]:
+    """Return the names of families in other installed packages, but those of a built-in or shipped family."""
+    names = {point.name for point in entry_points(group=GROUP)}
+    return sorted(names - {*MODELS, *SHIPPED})
 
 
 def installed_family(name: str) -> type[Drive] | None:
@@ -83,6 +89,10 @@ def installed_family(name: str) -> type[Drive] | None:
     if not (isinstance(found, type) and issubclass(found, Drive) and found.registers):
         raise ValueError(
             f"model {name!r} of package {packages[0]} is not a subclass of multidrop.Drive with registers"
+        )
+    if found.model != name:
+        raise ValueError(
+            f"model {name!r} of package {packages[0]} has model = {found.model!r}: name its entry point so"
         )
     return found
 
