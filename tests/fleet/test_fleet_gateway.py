@@ -157,7 +157,7 @@ def test_it_ends_in_good_order_though_all_servers_are_gone(tmp_path: Path) -> No
                 assert time.monotonic() < ends, log.read_text()
                 time.sleep(0.05)
             one.nodes[0].kill()
-            while "no line is polled" not in log.read_text():
+            while "all lines are closed" not in log.read_text():
                 assert time.monotonic() < ends, log.read_text()
                 time.sleep(0.05)
             gateway.terminate()

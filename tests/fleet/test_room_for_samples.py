@@ -72,7 +72,7 @@ def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, 
     with cluster(tmp_path / "nats", number) as small:
         status, out, err = run("fleet", "init", "--nats", ",".join(small.urls))
     assert (status, out, err.count("\n")) == (1, "", 1)
-    assert "the NATS servers have no room for so many samples: keep less by" in err
+    assert "the NATS servers have no room for so many samples: keep less with" in err
 
 
 @pytest.mark.long
@@ -81,12 +81,14 @@ def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> N
         with_client(one, lambda client: create_stream(client, replicas=1))
         _, out, err = run("fleet", "init", "--nats", one.urls[0], "--json")
         assert json.loads(out)["samples_bytes"] is None
-        assert "the stream of samples has no limit: when it fills the servers no line is polled; `nats" in err
+        assert (
+            "the stream of samples has no limit: when it fills the servers, no line is polled; `nats" in err
+        )
     with cluster(tmp_path / "other", 1) as one:
         with_client(one, lambda client: create_stream(client, replicas=1, most_bytes=8_000_000))
         _, _, err = run("fleet", "init", "--nats", one.urls[0], "--keep", "9 MB")
         assert (
-            "the stream of samples keeps 8.0 MB still; `nats stream edit samples --max-bytes 9000000`" in err
+            "the stream of samples still keeps 8.0 MB; `nats stream edit samples --max-bytes 9000000`" in err
         )
         assert "the stream of samples" not in run("fleet", "init", "--nats", one.urls[0])[2]
 

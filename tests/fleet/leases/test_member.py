@@ -395,7 +395,7 @@ def test_weak_sessions_are_given_up_one_after_another(
             members = running.members
             for member in members.values():
                 await lose_a_path(member)
-                assert "a new session begins soon" in member.trouble
+                assert "a new lease starts soon" in member.trouble
             monkeypatch.setattr(member_module, "WEAK_NS", 0)
             began = {name: member.lease.session for name, member in members.items()}
             await until(lambda: members["a"].lease.session > began["a"], "a's new session")

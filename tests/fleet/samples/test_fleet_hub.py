@@ -146,7 +146,7 @@ def test_a_server_that_is_behind_ends_no_reading_of_all(
             return sink.rows()
 
     if is_behind_for > 3:
-        with pytest.raises(StreamError, match=r"messages 1 to 1 of the stream are not given now"):
+        with pytest.raises(StreamError, match=r"messages 1 to 1 of the stream cannot be read now"):
             asyncio.run(live())
     else:
         assert exchanges_in(asyncio.run(live())) == list(range(5, 10))
@@ -230,13 +230,13 @@ def test_missing_or_doubled_messages_are_logged_and_counted(
     assert told[:4] == [
         "b.x: messages 1 to 2 are missing",
         "a.x: messages 3 to 4 are missing",
-        "a.x: message 5 came again behind 5 and is left out",
-        "a.x: message 4 came again behind 5 and is left out",
+        "a.x: message 5 came again after 5 and is ignored",
+        "a.x: message 4 came again after 5 and is ignored",
     ]
-    assert told[4].startswith("a.x: message 6 is left out: 10 bytes are not a message of samples")
+    assert told[4].startswith("a.x: message 6 is ignored: 10 bytes are not a message of samples")
     assert told[5:] == [
-        "a.x: its spool has lost 70 rows since it began",
-        "message 10 of the stream, by c.x, has no number and is left out",
+        "a.x: its spool has lost 70 rows since its start",
+        "message 10 of the stream, by c.x, has no number and is ignored",
     ]
 
 
@@ -479,7 +479,7 @@ def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Post
     one.close()
     assert other.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
-        NotThisHubs, match="made at then, and this one was created at now: name another database"
+        NotThisHubs, match="created at then, and this one was created at now: name another database"
     ):
         other.begin("now")
     other.close()

@@ -359,13 +359,13 @@ def test_rights_that_do_not_suffice(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         url = servers.urls[0]
 
         async def live() -> None:
-            with pytest.raises(StreamError, match="refuses these credentials, or nothing, of himself"):
+            with pytest.raises(StreamError, match="refuses these credentials, or the lack of any"):
                 await connect([url], user="gateway-2", password="wrong")
             client = await connect([url], user="gateway-2", password="x")
             await create_stream(client, replicas=1)
             assert await publish(client, subject_of("gateway-2", "b"), b"", {}) == 1
             with pytest.raises(
-                StreamError, match=r"rights of this connection do not suffice: .*samples\.gateway-1"
+                StreamError, match=r"this connection lacks rights: .*samples\.gateway-1"
             ):
                 await publish(client, subject_of("gateway-1", "b"), b"", {})
             await client.close()

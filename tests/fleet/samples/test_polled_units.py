@@ -193,5 +193,5 @@ def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path:
 
 @pytest.mark.slow
 def test_a_file_of_a_hub_is_read_by_its_folder(kept: Path) -> None:
-    with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder by"):
+    with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder with"):
         multidrop.open_recording(min((kept / "rows").iterdir()))

@@ -110,7 +110,7 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
     """An old server fails the test, even if its version is ignored."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
-        sentence = re.escape("claimants at once; no lease is safe there")
+        sentence = re.escape("claimants at once: no lease is safe there")
         with pytest.raises(FleetError, match=sentence):
             asyncio.run(_init(old.urls))
 
@@ -153,7 +153,7 @@ def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Pa
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]
         down.kill()
-        with pytest.raises(FleetError, match=f"^{down.url} does not answer, and what is made now"):
+        with pytest.raises(FleetError, match=f"^{down.url} does not answer, and new buckets would"):
             asyncio.run(_init(three.urls))
         down.start()
         three.wait()
@@ -280,7 +280,7 @@ def test_a_wrong_clock_is_logged(
     asyncio.run(_check(fleet))
     [said] = caplog.messages
     assert words in said
-    assert said.endswith("set it, for samples have its time")
+    assert said.endswith("set it, because samples have its time")
 
 
 async def _check(fleet: Cluster) -> None:
