@@ -408,6 +408,7 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
         until(are_two, "both")
         for name in ("gw-b", "gw-a"):
             fleet.running[name].kill()
+            fleet.running[name].wait()
             until(lambda name=name: name not in fleet.status()["gateways"], "its end")  # type: ignore[misc]
             fleet.wait_for_polling()
             fleet.start(name, **ahead[name])
