@@ -364,9 +364,7 @@ def test_rights_that_do_not_suffice(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             client = await connect([url], user="gateway-2", password="x")
             await create_stream(client, replicas=1)
             assert await publish(client, subject_of("gateway-2", "b"), b"", {}) == 1
-            with pytest.raises(
-                StreamError, match=r"this connection lacks rights: .*samples\.gateway-1"
-            ):
+            with pytest.raises(StreamError, match=r"this connection lacks rights: .*samples\.gateway-1"):
                 await publish(client, subject_of("gateway-1", "b"), b"", {})
             await client.close()
 
