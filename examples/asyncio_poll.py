@@ -1,4 +1,4 @@
-"""Poll beside other tasks of an asyncio program: `python examples/asyncio_poll.py [SECONDS]`."""
+"""Poll in an asyncio program with other tasks: `python examples/asyncio_poll.py [SECONDS]`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ async def count(poller: Poller) -> None:
 
 
 async def tick() -> None:
-    """Do something else meanwhile."""
+    """Do other work at the same time."""
     while True:
         await asyncio.sleep(0.2)
         print("tick")

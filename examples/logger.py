@@ -34,7 +34,7 @@ poll = ["output_frequency"]
 
 
 def record(plant: Plant, seconds: float, out: Path) -> int:
-    """Record into Arrow, which bears a crash, and convert at the end. Return the number of rows."""
+    """Record into Arrow, which survives a crash, and convert at the end; return the number of rows."""
     safe = out.with_suffix(".arrows")
     with Poller(plant) as poller, open_writer(safe, plant.metadata()) as writer:
         for batch in poller.batches(seconds=seconds):
@@ -44,7 +44,7 @@ def record(plant: Plant, seconds: float, out: Path) -> int:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--plant", help="simulated drives without it")
+    parser.add_argument("--plant", help="default: simulated drives")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path("log.parquet"))
     arguments = parser.parse_args()

@@ -1,6 +1,6 @@
-"""Find the drive that suffers on a noisy line: `python examples/noise_hunt.py [SECONDS]`.
+"""Find the drive that loses values on a noisy line: `python examples/noise_hunt.py [SECONDS]`.
 
-All that went over the line is kept in `noise/`.
+The folder `noise/` gets captures of the whole traffic.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FAULTS = Faults(seed=7, flip=0.05, drop=0.02, noise=0.1)
 
 
 def hunt(plant: Plant, seconds: float, directory: Path) -> Counter[tuple[str, str]]:
-    """Poll, and return how many values each drive lost for which reason; captures go to `directory`."""
+    """Poll, and write captures to `directory`; return the number of lost values by drive and reason."""
     lost: Counter[tuple[str, str]] = Counter()
     poller = Poller(plant)
     lines = list(poller.buses)

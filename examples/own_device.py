@@ -1,4 +1,4 @@
-"""Declare a device, play it, read it and write to it: `python examples/own_device.py`."""
+"""Declare a device, simulate it, read it and write to it: `python examples/own_device.py`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Alarm(IntFlag):
 
 
 class AirHandler(Drive):
-    """Air handler AH-20, manual 3.1: its holding registers."""
+    """Air handler AH-20: the holding registers of its manual, section 3.1."""
 
     title = "AH-20"
     response_delay = 0.01  # s

@@ -1,6 +1,6 @@
 """Run a pump for some seconds, and stop it however the program ends: `python examples/pump.py [SECONDS]`.
 
-Try Ctrl-C: standard error says that the pump is being stopped, and the loop ends once it stands.
+Try Ctrl-C: standard error reports that the pump is being stopped, and the loop ends when it stands still.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from multidrop.sim import Simulator, Wire, simulated
 
 
 def run(port: str, seconds: float) -> None:
-    """Start the pump of address 1 at this port, show what it does, and stop it."""
+    """Start the pump with address 1 at this port, print its state, and stop it."""
     with Bus(port, audit="pump.jsonl", stop_on_exit=True) as bus:  # also on Ctrl-C and SIGTERM
         pump = bus.attach(ErmanERG220, address=1, name="pump")
         pump.set_frequency(30.0)

@@ -1,4 +1,4 @@
-"""Play the drives of a plant file, so that the examples run without hardware. Not needed with real ports."""
+"""Simulate the drives of a plant file, so that the examples run without hardware."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from multidrop.sim import Simulator, Wire, simulated
 
 @contextmanager
 def simulated_plant(text: str, wire_of: Callable[..., Wire] = Wire) -> Iterator[Plant]:
-    """Yield the plant that the text describes; `{ports}` in it is a directory for simulated ports.
+    """Simulate the plant of this plant file's text, and yield it; `{ports}` becomes a temporary directory.
 
-    `wire_of` makes a wire of simulated drives and `port`, the path of the link to it.
+    `wire_of` makes a wire from simulated drives and `port`, the path of its port.
     """
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
