@@ -67,11 +67,9 @@ COLLISIONS: Sequence[Collision] = (interleaved, overlaid, cut_off, one_after_ano
 
 
 class SharedPair:
-    """A pair with the clients' ports `ours` and `theirs`; `sent` is what our client sent, before any
-    collision.
+    """A pair with the clients' ports `ours` and `theirs`; `sent` has our client's bytes before collisions.
 
-    If `holds(said)` returns True for our client's bytes, a collision destroys them, and our client receives
-    `says`.
+    If `holds(said)` returns True for our client's bytes, they are lost, and the others send `says` instead.
     """
 
     def __init__(self, drives: str, baudrate: int, seed: int) -> None:

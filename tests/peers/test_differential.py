@@ -92,9 +92,7 @@ def has_other_data(said: SampleFrame) -> bool:
 
 @dataclass(frozen=True)
 class Rule:
-    """A known difference: we reject what others accept (stricter), or the reverse (looser), or decode it
-    otherwise.
-    """
+    """A known difference: stricter (only we reject a frame), looser (the reverse), or decoded otherwise."""
 
     kind: str
     judges: tuple[str, ...]

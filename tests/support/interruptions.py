@@ -91,9 +91,7 @@ def interrupted_before(nth: int, failure: type[BaseException] = Interruption) ->
 
 
 def every(step: int, act: Callable[[int], bool]) -> int:
-    """Call `act` with 1, 1 + step and so on until it is not interrupted; return the number of interrupted
-    calls.
-    """
+    """Call `act` with 1, 1 + step and so on until it is not interrupted; return how often it was."""
     for times in count():
         if not act(1 + times * step):
             return times

@@ -2,8 +2,8 @@
 
     python member_process.py URLS NAME...
 
-Each output line is JSON. When a gateway's number of lines changes: {"gateway": ..., "at": CLOCK_MONOTONIC
-in s, "lines": number}. For each input line, of every gateway: {"gateway": ..., "polled": [...]}.
+Each output line is JSON. When a gateway's number of lines changes: {"gateway": ..., "at": CLOCK_MONOTONIC in
+s, "lines": number}. For each input line, of every gateway: {"gateway": ..., "polled": [...]}.
 """
 
 from __future__ import annotations

@@ -24,8 +24,7 @@ class Responder:
     """Responders behind ports, run by one thread; `ports` are the names that a client opens.
 
     A pty is opened under a link in `directory`, so that it can vanish and come back. Alternatively each line
-    has
-    a listening socket, with raw bytes or with Telnet's serial port option.
+    has a listening socket, with raw bytes or with Telnet's serial port option.
     """
 
     def __init__(
@@ -278,9 +277,7 @@ class ReceivedFrame:
 
 
 def split(buffer: bytes) -> tuple[bytes, DriveRequest | None, bytes]:
-    """Return the first frame, its request (None if its checksum is wrong), and the rest; without a frame,
-    b"".
-    """
+    """Return the first frame (or b""), its request (None if its checksum is wrong), and the rest."""
     if buffer[:1] == b":":
         end = buffer.find(b"\n") + 1
         frame, rest = buffer[:end], buffer[end:]
@@ -344,11 +341,9 @@ def _delixi_reply(drive: ResponderDrive, asked: DriveRequest, frame: bytes, exce
 class ResponderLine:
     """The line of a port, with its faults.
 
-    Each entry of the list of troubles affects one of the next requests: "mute" executes without a reply,
-    "deaf"
-    ignores, "late" replies after the following request, and a number replies with that exception.
-    `deaf_until`
-    and `delay` (s) stay in effect.
+    Each entry of `troubles` affects one of the next requests: "mute" executes without a reply,
+    "deaf" ignores, "late" replies after the following request, and a number replies with that exception.
+    `deaf_until` and `delay` (s) stay in effect.
     """
 
     def __init__(self, drives: Sequence[ResponderDrive]) -> None:

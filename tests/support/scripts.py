@@ -37,11 +37,9 @@ class Wire:
     """A drive whose replies the test sets.
 
     `says` has a value for each register's name, or a list of values for successive reads, whose last one
-    stays; an
-    exception in it is raised. `loses` has the exceptions of the first writes of a frame, and `turns` updates
-    `says` after a frame. Later reads return a written value unless `says` has another. Register rules hold as
-    on
-    a bus; their reads are not counted in `reads`.
+    stays; an exception in it is raised. `loses` has the exceptions of the first writes of a frame, and
+    `turns` updates `says` after a frame. Later reads return a written value unless `says` has another.
+    Register rules hold as on a bus; their reads are not counted in `reads`.
     """
 
     def __init__(
