@@ -1,9 +1,9 @@
-/* The least that an exchange can cost: write, poll, read, nothing looked at. */
+/* The minimum cost of an exchange: write, poll and read, without checks. */
 #define _GNU_SOURCE
 #include <poll.h>
 #include <unistd.h>
 
-/* `n` exchanges of an 8-byte request and a 25-byte reply; how many succeeded. */
+/* Make `n` exchanges of an 8-byte request and a 25-byte reply; return the number of good ones. */
 int bare_exchanges(int fd, int n)
 {
     static const unsigned char request[8] = {0x01, 0x03, 0x00, 0x00, 0x00, 0x0A, 0xC5, 0xCD};

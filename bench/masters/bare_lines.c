@@ -1,5 +1,5 @@
-/* The yardstick for many lines: the least that a client of them all can do. Write, epoll, read; one
- * exchange at a time on each line, and nothing is looked at but the reply's length. Prints JSON. */
+/* The baseline for many lines: a client that does the minimum. It writes, waits with epoll and reads, with
+ * one exchange at a time on each line, and checks only the reply's length. Prints JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
 

@@ -1,5 +1,5 @@
-/* The yardstick: the least that a master can do that keeps the silence. Write, poll, read as bytes
- * come, wait; nothing is looked at but the reply's length. Prints JSON. */
+/* The baseline: a master that does the minimum and keeps the silence. It writes, polls, reads the bytes as
+ * they come, waits, and checks only the reply's length. Prints JSON. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <errno.h>
@@ -89,7 +89,7 @@ static int open_line(const char *path)
     return fd;
 }
 
-/* Return 1 if a reply of so many bytes came within the time-out; sleep for the first `asleep_ns`. */
+/* Return 1 if a reply of that many bytes came within the time-out; sleep for the first `asleep_ns`. */
 static int exchange(int fd, const uint8_t *request, size_t expected, int64_t asleep_ns)
 {
     uint8_t reply[256];

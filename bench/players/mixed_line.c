@@ -1,9 +1,9 @@
 /* Drives of different families on one line at the pace of a real wire, as they see it.
  *
- * Each argument is a drive: ADDRESS:FRAMING:BAUDRATE:CHARACTER_NS:DELAY_NS:SILENCE_NS. It hears only
- * what is sent at its own baud rate, answers whatever it can be asked to read, and every byte of the
- * reply is handed over when its last bit would have come. Plays on a new pty, whose path it prints,
- * until standard input ends; then prints as JSON what came, and when. */
+ * Each argument is a drive: ADDRESS:FRAMING:BAUDRATE:CHARACTER_NS:DELAY_NS:SILENCE_NS. It receives only
+ * requests at its own baud rate, and answers every read. Each byte of a reply is written when its last bit
+ * would have arrived. Plays on a new pty, whose path it prints, until standard input ends. Then it prints
+ * the requests and their times as JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
 #include "raw_pty.h"
@@ -20,7 +20,7 @@
 enum { MOST_DRIVES = 247 };
 
 static const int64_t TOLERANCE_NS = 20000; /* a request this much too early still counts as in time */
-static const int64_t SPIN_NS = 80000;      /* a sleep ends so much before its deadline */
+static const int64_t SPIN_NS = 80000;      /* a sleep ends this long before its deadline */
 
 struct drive {
     int address, framing;
@@ -33,10 +33,10 @@ static struct drive drives[MOST_DRIVES];
 static int count;
 
 static struct {
-    long requests, early, refused, cycles; /* a cycle is over when the first request comes again */
+    long requests, early, refused, cycles; /* a cycle ends when the first request comes again */
     struct md_message first;
     int64_t first_ns, last_ns, cycles_ns;
-    int64_t exchange_ns, ideal_ns; /* of the request under way, without the silence; of all before */
+    int64_t exchange_ns, ideal_ns; /* of the current request, without the silence; of all earlier ones */
 } seen;
 
 static int64_t now_ns(void)
@@ -66,7 +66,7 @@ static unsigned baudrate_of(int fd)
     return md_port_get(fd, &settings) ? 0 : settings.baudrate;
 }
 
-/* Return the address that is asked by the frame at the beginning of `bytes`; `used` is its length. */
+/* Return the drive to which the frame at the start of `bytes` is addressed; `used` is its length. */
 static struct drive *asked(int fd, const uint8_t *bytes, size_t len, struct md_message *request, int *used)
 {
     unsigned baudrate = baudrate_of(fd);
@@ -88,13 +88,13 @@ static int make_reply(const struct drive *drive, const struct md_message *reques
                                .start = request->start};
     int bits = request->function == 1 || request->function == 2;
     if (drive->framing == MD_DELIXI && request->function == 3)
-        reply.start = 1; /* no drive is in state 0 */
+        reply.start = 1; /* 0 is not a state of a drive */
     reply.data_len = (uint16_t)(drive->framing == MD_DELIXI ? 4 : bits ? (request->count + 7) / 8
                                 : 2 * request->count);
     return md_build_reply(drive->framing, &reply, out, room);
 }
 
-/* The time from which the line is silent again. */
+/* Send the reply; return the time from which the line is silent again. */
 static int64_t answer(int fd, struct drive *drive, const struct md_message *request, int64_t end_ns)
 {
     uint8_t reply[MD_MOST_FRAME];
@@ -117,7 +117,7 @@ static int64_t answer(int fd, struct drive *drive, const struct md_message *requ
 
 /* ---- the line ---- */
 
-/* A request that came; the line had been silent since quiet_ns, and was to be for silence_ns. */
+/* Count a request. The line was silent since quiet_ns; the required silence is silence_ns. */
 static void note(const struct md_message *request, int64_t came_ns, int64_t quiet_ns, int64_t silence_ns)
 {
     if (seen.requests++ == 0) {

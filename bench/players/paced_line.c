@@ -1,8 +1,8 @@
 /* A line of Modbus RTU drives at the pace of a real wire, as its drives see it.
  *
- * Plays addresses 1..N on a new pty, whose path it prints, until standard input ends; then prints as
- * JSON what came, and when. A request is deemed to be on the wire for its characters' time from when
- * it was seen here; every byte of the reply is handed over when its last bit would have come. */
+ * Plays addresses 1..N on a new pty, whose path it prints, until standard input ends. Then it prints the
+ * requests and their times as JSON. A request counts as being on the wire for the time of its characters,
+ * from its arrival here. Each byte of a reply is written when its last bit would have arrived. */
 #define _GNU_SOURCE
 #include "raw_pty.h"
 #include <arpa/inet.h>
@@ -23,8 +23,8 @@
 enum { MOST_DRIVES = 247, REQUEST = 8 };
 
 static const int64_t TOLERANCE_NS = 20000; /* a request this much too early still counts as in time */
-static const int64_t SPIN_NS = 80000;      /* a sleep ends so much before its deadline */
-static const int64_t STALE_NS = 50000000;  /* a request that takes longer is none */
+static const int64_t SPIN_NS = 80000;      /* a sleep ends this long before its deadline */
+static const int64_t STALE_NS = 50000000;  /* a request that takes longer is discarded */
 
 static struct {
     long baudrate, bits, drives, registers, delay_us, settle_ms; /* baudrate 0: no waits at all */
@@ -34,7 +34,7 @@ static struct {
 
 static int64_t character_ns, silence_ns, delay_ns;
 
-/* ---- what is measured ---- */
+/* ---- measurements ---- */
 
 struct samples {
     int64_t *at;
@@ -42,10 +42,10 @@ struct samples {
 };
 
 static struct samples lateness, excess;
-static int64_t settled_ns, first_ns, last_ns; /* of requests: counted from, first, last */
+static int64_t settled_ns, first_ns, last_ns; /* of requests: start of counting, first, last */
 static int64_t pending_ideal_ns, ideal_ns;
 static long answered, unanswered, early, given_up, refused, registers, per_drive[MOST_DRIVES + 1];
-static int is_crossed; /* a request came before the reply to the one before was over */
+static int is_crossed; /* a request came before the previous reply was complete */
 
 static void add(struct samples *samples, int64_t sample)
 {
@@ -141,7 +141,7 @@ static uint16_t crc16(const uint8_t *bytes, size_t len)
     return (uint16_t)crc;
 }
 
-/* The reply to FC03: register r of address a holds 256 * a + r. An exception where there is none. */
+/* Build the reply to FC03: register r of address a is 256 * a + r. A missing register is an exception. */
 static size_t make_reply(const uint8_t *request, uint8_t *out)
 {
     unsigned start = (unsigned)(request[2] << 8 | request[3]),
@@ -175,7 +175,7 @@ static int has_request(int fd)
     return poll(&ready, 1, 0) > 0;
 }
 
-/* The time at which the last byte was handed over. */
+/* Send the reply; return the time at which the last byte was written. */
 static int64_t send_reply(int fd, const uint8_t *reply, size_t len, int64_t begin_ns)
 {
     size_t step = options.whole || !character_ns ? len : 1;
@@ -193,7 +193,7 @@ static int64_t send_reply(int fd, const uint8_t *reply, size_t len, int64_t begi
     return now;
 }
 
-/* A request that was seen at begun_ns, perhaps with the next one; since when the line is silent again. */
+/* Answer a request that came at begun_ns, perhaps with the next one; return when the silence starts. */
 static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t quiet_ns, int has_next)
 {
     uint8_t reply[300];
@@ -209,7 +209,7 @@ static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t 
         if (quiet_ns && character_ns) {
             int is_early = begun_ns < quiet_ns + silence_ns - TOLERANCE_NS;
             early += is_early;
-            given_up += is_early && is_crossed; /* its master no longer waited for the reply */
+            given_up += is_early && is_crossed; /* the master no longer waited for the reply */
             add(&excess, begun_ns - quiet_ns - silence_ns);
         }
     }
@@ -247,9 +247,9 @@ static int open_tcp(void)
     return fd;
 }
 
-/* Bytes and when they came; 0 when standard input or the client has ended. Sleeps until they come: to
- * spin here keeps the kernel's worker, who carries a pty's bytes, from its processor. A request is
- * thus seen some 30 us late, as the master sees a reply. */
+/* Read bytes and their time; return 0 when standard input or the client has ended. Sleeps until they come:
+ * spinning would keep the kernel's worker, which carries a pty's bytes, from its processor. So a request is
+ * seen some 30 us late, like a reply at the master. */
 static ssize_t hear(int fd, uint8_t *bytes, size_t room, int64_t *came_ns)
 {
     struct pollfd ready[2] = {{.fd = fd, .events = POLLIN}, {.fd = 0, .events = POLLIN}};

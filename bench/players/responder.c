@@ -1,5 +1,5 @@
-/* A server that answers at once: 10 registers to every 8-byte request on a new pty, whose path it
- * prints. Runs until standard input ends. */
+/* A server that answers every 8-byte request at once with 10 registers, on a new pty, whose path it prints.
+ * Runs until standard input ends. */
 #define _GNU_SOURCE
 #include "raw_pty.h"
 

@@ -1,12 +1,11 @@
-/* Drives at the far ends of any number of lines, in one thread; what they do is scheduled, reply by
- * reply, so that it costs little however many lines there are.
+/* Drives at the far ends of any number of lines, in one thread. Each reply is scheduled, so that even many
+ * lines cost little.
  *
- * Every address holds 256 * address + register, and for function 04 the register 128 further on. A
- * reply comes at once, or when it would have been whole on a wire of --baudrate. Some of them come
- * later by up to --late-us and never by more, are lost, or come twice. All of a line come --path-us later,
- * in order, and what comes in the first --stall-us of each --stall-every-us at the end of that. Lines are
-  * descriptors that were inherited, or
- * new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
+ * Each register's value is 256 * address + register, and 128 more for function 04. A reply comes at once, or
+ * when it would have been complete on a wire of --baudrate. Some replies are late by up to --late-us, never
+ * by more; some are lost, and some come twice. All replies of a line come --path-us later, in order. Those
+ * due in the first --stall-us of each --stall-every-us come at the end of that time. Lines are inherited
+ * descriptors, or new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
 #include "raw_pty.h"
@@ -36,9 +35,9 @@ struct line {
     uint8_t received[256];
 };
 
-/* Replies on their way: a heap, the one that is due first at 0. */
+/* Pending replies: a heap, with the earliest one at 0. */
 struct reply {
-    int64_t due_ns, last_ns; /* it comes then or never */
+    int64_t due_ns, last_ns; /* after this time it is lost */
     int fd;
     uint16_t len;
     uint8_t bytes[MOST_REPLY];
@@ -98,7 +97,7 @@ static void hand_over(const struct reply *reply)
         lost++;
         return;
     }
-    (void)!write(reply->fd, reply->bytes, reply->len); /* a client that is gone hears nothing */
+    (void)!write(reply->fd, reply->bytes, reply->len); /* the client may have ended */
 }
 
 static int happens(long permille)
@@ -123,7 +122,7 @@ static void make_reply(struct reply *reply, const uint8_t *request)
     reply->bytes[reply->len - 1] = (uint8_t)(crc >> 8);
 }
 
-/* Return the time at which bytes that enter the line's path now come out of it. */
+/* Return the time at which bytes that enter the line's path at `at_ns` leave it. */
 static int64_t through_path(struct line *line, int64_t at_ns)
 {
     int64_t due_ns = at_ns + options.path_us * 1000;
@@ -132,7 +131,7 @@ static int64_t through_path(struct line *line, int64_t at_ns)
         if (since_ns < options.stall_us * 1000)
             due_ns += options.stall_us * 1000 - since_ns;
     }
-    if (due_ns <= line->last_due_ns) /* the heap keeps no order of those that are due together */
+    if (due_ns <= line->last_due_ns) /* the heap does not keep the order of equal times */
         due_ns = line->last_due_ns + 1;
     line->last_due_ns = due_ns;
     return due_ns;
@@ -149,7 +148,7 @@ static void answer(struct line *line, const uint8_t *request, int64_t came_ns)
     }
     if (happens(options.twice_permille) && reply.len <= MOST_REPLY / 2) {
         twice++;
-        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* one behind the other, as on a wire */
+        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* one after the other, as on a wire */
         reply.len = (uint16_t)(2 * reply.len);
     }
     reply.due_ns = came_ns + (REQUEST + reply.len) * character_ns + options.delay_us * 1000;
