@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
 from multidrop.cli import main
-from multidrop.families import YD1000, registry
+from multidrop.families import YD1000
 from multidrop.families.registry import GROUP, find_model
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
     """Have these entry points installed: by name, "module:attribute"; a name may end in "__" to be twice."""
     points = [EntryPoint(name.rstrip("_"), value, GROUP) for name, value in values.items()]
-    monkeypatch.setattr(registry, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted))
+    monkeypatch.setattr(
+        importlib.metadata, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted)
+    )
 
 
 def test_a_family_of_a_package_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:

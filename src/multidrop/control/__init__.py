@@ -1,4 +1,7 @@
-"""Control: everything that is written to a drive, and every stop."""
+"""Control: everything that is written to a drive, and every stop.
+
+The gateways' service is in `multidrop.control.commands`, which loads asyncio.
+"""
 
 from multidrop.control.audit_log import AuditLog as AuditLog
 from multidrop.control.audit_log import read_audit as read_audit
@@ -9,14 +12,6 @@ from multidrop.control.command_results import CommandResult as CommandResult
 from multidrop.control.command_results import in_one_text as in_one_text
 from multidrop.control.command_results import result_of_failure as result_of_failure
 from multidrop.control.command_results import with_name as with_name
-from multidrop.control.commands import LineStop as LineStop
-from multidrop.control.commands import RepeatedStops as RepeatedStops
-from multidrop.control.commands import begin_command as begin_command
-from multidrop.control.commands import carry_out_verb as carry_out_verb
-from multidrop.control.commands import stop_drive_by as stop_drive_by
-from multidrop.control.commands import stop_line as stop_line
-from multidrop.control.commands import typed_value as typed_value
-from multidrop.control.commands import write_register as write_register
 from multidrop.control.eeprom_ledger import Ledger as Ledger
 from multidrop.control.outcome import Effect as Effect
 from multidrop.control.outcome import Outcome as Outcome

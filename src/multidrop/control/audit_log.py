@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import IO, Any
 
 from multidrop.iso_time import format_time
-from multidrop.supervisor import in_time
 
 OPENING_S = 5.0  # within which the disk must open the file
 
@@ -52,6 +51,7 @@ class AuditLog:
 
 def _opened(path: Path) -> IO[bytes]:
     """Open it with a time limit, because a disk may hang."""
+    from multidrop.supervisor import in_time  # loads asyncio: 4 MB that a poller without a log saves
 
     def open_file() -> IO[bytes]:
         return path.open("a+b", buffering=0)  # one call, one write: processes do not mix their lines

@@ -16,14 +16,17 @@ import importlib.util
 import logging
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import entry_points
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from threading import RLock
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from multidrop.drive import Drive
 from multidrop.families import MODELS
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 GROUP = "multidrop.families"  # of entry points of other packages; a built-in name goes before theirs
 _SHIPPED = Path(__file__).parent / "shipped"
@@ -64,7 +67,7 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
 
 def installed_models() -> list[str]:
     """Return the names of families in other installed packages, but those of a built-in or shipped family."""
-    names = {point.name for point in entry_points(group=GROUP)}
+    names = {point.name for point in _entry_points()}
     return sorted(names - {*MODELS, *SHIPPED})
 
 
@@ -73,7 +76,7 @@ def installed_family(name: str) -> type[Drive] | None:
 
     Raises ValueError if two packages have it, or if it cannot be loaded.
     """
-    points = [*entry_points(group=GROUP, name=name)]
+    points = [point for point in _entry_points() if point.name == name]
     if not points:
         return None
     packages = [point.dist.name if point.dist else point.value for point in points]
@@ -95,6 +98,12 @@ def installed_family(name: str) -> type[Drive] | None:
             f"model {name!r} of package {packages[0]} has model = {found.model!r}: name its entry point so"
         )
     return found
+
+
+def _entry_points() -> Iterable[EntryPoint]:
+    from importlib.metadata import entry_points  # takes 2 MB, and few plants need it
+
+    return entry_points(group=GROUP)
 
 
 def is_users_own(family: type[Drive]) -> bool:

@@ -20,17 +20,19 @@ from multidrop import Bus, BusError, Drive, Plant, WriteForbidden
 from multidrop.control import (
     CommandOutcome,
     CommandResult,
+    in_one_text,
+    noted_first,
+    result_of_failure,
+    written_by,
+)
+from multidrop.control.commands import (
     LineStop,
     RepeatedStops,
     begin_command,
     carry_out_verb,
-    in_one_text,
-    noted_first,
-    result_of_failure,
     stop_drive_by,
     stop_line,
     write_register,
-    written_by,
 )
 from multidrop.drive import verb_arguments
 from multidrop.gateway.clock import boottime_ns, monotonic_ns

@@ -5,7 +5,6 @@ Rows gather in the core, in chunks of bounded number, and are taken from there, 
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import logging
 import threading
@@ -154,6 +153,8 @@ class RowSource:
         A batch is taken only when it is yielded: if the task is cancelled, rows that wait stay for the next
         taker, also after the poller is closed.
         """
+        import asyncio  # takes 4 MB, which other programs save
+
         is_over = False
         while not is_over:
             is_over = self._over.is_set()

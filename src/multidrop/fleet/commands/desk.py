@@ -14,7 +14,8 @@ from contextlib import suppress
 from typing import Any
 
 from multidrop import Unsupported
-from multidrop.control import CommandResult, begin_command, written_by
+from multidrop.control import CommandResult, written_by
+from multidrop.control.commands import begin_command
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     CommandAnswer,

@@ -13,7 +13,8 @@ from functools import partial
 from typing import NamedTuple
 
 from multidrop import Drive, WriteForbidden
-from multidrop.control import CommandResult, carry_out_verb, stop_drive_by, typed_value, write_register
+from multidrop.control import CommandResult
+from multidrop.control.commands import carry_out_verb, stop_drive_by, typed_value, write_register
 from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, CommandRequest
 from multidrop.fleet.leases.rules import SECOND

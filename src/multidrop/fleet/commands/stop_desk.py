@@ -13,7 +13,8 @@ from functools import partial
 from hashlib import sha256
 from typing import Any
 
-from multidrop.control import LineStop, RepeatedStops, stop_line, written_by
+from multidrop.control import written_by
+from multidrop.control.commands import LineStop, RepeatedStops, stop_line
 from multidrop.fleet.commands.desk import HOLD_S, WAY
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
