@@ -297,7 +297,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "a drive of another bus": (
         lambda bus, rig: Toy(5).read(Toy.status),
         ValueError,
-        "toy@5 is not attached to this bus: use bus.attach(...)",
+        "toy@5 is not attached to a bus: use bus.attach(...)",
     ),
     "another family's register is read": (
         lambda bus, rig: rig.read(InvtCHE.output_current),
@@ -352,7 +352,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
     "a register is named by its number": (
         lambda bus, rig: rig.register(5),
         TypeError,
-        "a register has a name, such as 'speed', and 5 is none",
+        "a register has a name, such as 'speed', not 5",
     ),
     "a name is attached": (
         lambda bus, rig: bus.attach("innovert-ibd", 2),

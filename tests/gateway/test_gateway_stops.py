@@ -288,7 +288,7 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
         def fail(*arguments: object, **more: object) -> None:
             raise ZeroDivisionError
 
-        for broken in ("hub.take", "hub.seen", "events.look", "frames.note_news", "recent.tick"):
+        for broken in ("hub.take", "hub.seen", "alarms.look", "frames.note_news", "recent.tick"):
             name, method = broken.split(".")
             monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
         until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
@@ -303,14 +303,14 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     held, entered = threading.Event(), []
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
-        bus = gateway.gateway.bus("hall")
+        pump = gateway.gateway.bus("hall").drives[0]
 
         def hang(*arguments: object) -> None:
             entered.append(arguments)
             held.wait()
             raise ValueError("it was held up")
 
-        monkeypatch.setattr(bus, "try_write", hang)
+        monkeypatch.setattr(type(pump), "try_write", hang)
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         found: list[str] = []
 
@@ -480,7 +480,7 @@ def test_verbs_and_writes_report_their_results(tmp_path: Path) -> None:
         told = gateway.command(
             "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
         ).json
-        assert told["text"] == "control takes the number of a choice, not 1.5"
+        assert told["text"] == "control takes a choice's name or its whole number, not 1.5"
         told = gateway.command(
             "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
         ).json

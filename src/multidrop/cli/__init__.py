@@ -215,7 +215,7 @@ def _parsed(
 
     A stop ignores the word behind an unknown option too: it may be the option's value, so it names no drive.
     """
-    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may come between positionals
+    arguments, unknown = _intermixed(parser, words)
     if not unknown:
         return arguments, []
     if command not in STOPS:
@@ -226,8 +226,18 @@ def _parsed(
     for before, word in zip(["", *words[:-1]], words, strict=True):
         is_value = before in options and "=" not in before and not word.startswith("-")
         (left_out if is_value or word in options else kept).append(word)
-    arguments, surplus = parser.parse_known_intermixed_args(kept)
+    arguments, surplus = _intermixed(parser, kept)
     return arguments, [*left_out, *surplus]
+
+
+def _intermixed(parser: argparse.ArgumentParser, words: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Parse words with options between positionals. Raises KeyboardInterrupt, which argparse may replace."""
+    try:
+        return parser.parse_known_intermixed_args(words)
+    except AttributeError as failure:
+        if isinstance(failure.__context__, KeyboardInterrupt):
+            raise failure.__context__ from None
+        raise
 
 
 def _fail(sentences: str, status: int) -> int:

@@ -240,7 +240,7 @@ def test_frame_of_a_previous_process_is_refused(tmp_path: Path) -> None:
         assert gateway.frame_number() != seen
         body = {**START, "seen": seen}
         told = gateway.post("/api/act", body, authorization=gateway.bearer(Right.WRITE)).json
-        assert (told["done"], "none of the last 5 s" in told["text"]) == (False, True)
+        assert (told["done"], "is not from the last 5 s" in told["text"]) == (False, True)
         assert commands(gateway) == []
 
 

@@ -153,10 +153,10 @@ def test_viewing_does_not_read_a_silent_drive(gateway: Served) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
     gateway.await_state("pump-2", "silent")
     asked: list[object] = []
-    bus = gateway.gateway.bus("hall")
+    pump = next(each for each in gateway.gateway.bus("hall").drives if each.name == "pump-2")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drive_reads, "PAUSE_S", 0.0)
-        patch.setattr(bus, "read", lambda *arguments: asked.append(arguments))
+        patch.setattr(pump, "read", lambda *arguments: asked.append(arguments))
         for _ in range(20):
             assert gateway.get("/api/drive/pump-2").json["values"] == {}
     assert asked == []
