@@ -1,4 +1,4 @@
-"""The directives `multidrop-help` and `multidrop-models`: all that the command line says of itself."""
+"""The directives `multidrop-help` and `multidrop-models`: the help texts of the command line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDTH = "92"
 
 
 def printed(*words: str) -> str:
-    """Return what a command prints. Raises RuntimeError when it fails."""
+    """Return the output of a command. Raises RuntimeError if it fails."""
     out = StringIO()
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = WIDTH
@@ -36,7 +36,7 @@ def printed(*words: str) -> str:
 
 
 class Sections(Directive):
-    """A section for each name, with what a command prints of it."""
+    """A section for each name, with the output of a command for it."""
 
     def run(self) -> list[nodes.Node]:
         found: list[nodes.Node] = []

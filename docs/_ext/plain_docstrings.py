@@ -1,6 +1,6 @@
 """Show docstrings as they are written here: paragraphs, lists, indented code, names in backticks.
 
-None of them is reStructuredText, so all that reStructuredText would take for markup is escaped.
+They are not reStructuredText, so characters that it would read as markup are escaped.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ def to_rst(lines: list[str]) -> list[str]:
 
 
 def _paragraph(lines: list[str]) -> list[str]:
-    """Return a paragraph; one that is indented, or is a table, stays as it is."""
+    """Return a paragraph; an indented one, or a table, is kept as it is."""
     if lines[0].startswith((" ", "|")):
         return ["::", "", *(f"    {line}" for line in lines)]
     return list(_with_items(lines))
 
 
 def _with_items(lines: list[str]) -> Iterator[str]:
-    """Yield lines of text; each `- ` or `name: ` at the margin, with a line of its own, begins an item."""
+    """Yield lines of text; each line that starts with `- ` or `name: ` at the margin starts an item."""
     is_list = False
     for number, line in enumerate(lines):
         begins = re.match(r"- |\w[\w, ]*: ", line) if _is_list(lines) else None
@@ -47,9 +47,9 @@ def _is_list(lines: list[str]) -> bool:
 
 
 def _escaped(line: str) -> str:
-    """Return the line with its names in backticks as code, and nothing else as markup."""
+    """Return the line with its names in backticks as code, and all other markup escaped."""
     parts = line.split("`")
-    if len(parts) % 2 == 0:  # a name goes on in the next line: shown as it stands
+    if len(parts) % 2 == 0:  # a name continues on the next line: keep the backtick
         return re.sub(r"([\\*_|`])", r"\\\1", line)
     plain = [re.sub(r"([\\*_|])", r"\\\1", part) for part in parts[::2]]
     code = [f"``{part.strip()}``" if part.strip() else "" for part in parts[1::2]]

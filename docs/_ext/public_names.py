@@ -4,8 +4,8 @@
     Bus Poller
     ```
 
-documents these, and with the option `:rest:` and no names all others of the package that no earlier directive
-on the page has documented.
+documents these names. With the option `:rest:` instead of names, it documents all public names of the package
+that no earlier directive on the page has documented.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import multidrop
 
 
 def public(package: ModuleType) -> list[str]:
-    """Return a package's public names: `__all__`, or what its file defines or imports as itself."""
+    """Return a package's public names: `__all__`, or the names that its file defines or re-exports."""
     if hasattr(package, "__all__"):
         return list(package.__all__)
     tree = ast.parse(Path(str(package.__file__)).read_text("utf-8"))
@@ -42,7 +42,7 @@ def _defined(node: ast.stmt) -> Iterator[str]:
         yield from (target.id for target in node.targets if isinstance(target, ast.Name))
 
 
-IN_PARTS = {"Drive", "Poller"}  # their bases have no users of their own
+IN_PARTS = {"Drive", "Poller"}  # whose base classes are not documented separately
 INTERNAL = "forked, leave, part, tended, peer, peers"  # methods that other rooms call
 
 

@@ -12,7 +12,7 @@ STEP, TOP, LEFT, WIDTH, HEIGHT = 90, 40, 330, 170, 40  # of the boxes, in px
 
 
 def names(kind: str) -> list[str]:
-    """Return the names of a core's enum, in order, without the one that counts them."""
+    """Return the names of an enum of the core, in order, without its count."""
     elements = ffi.typeof(f"enum {kind}").elements
     return [elements[number].removeprefix("MD_").replace("_", " ").lower() for number in sorted(elements)][
         :-1
@@ -54,7 +54,7 @@ def _edge(start: int, end: int, events: list[str]) -> Iterator[str]:
     leave, reach = (begin + HEIGHT / 2 + 6 * s for s in (side, -side))
     reach += arrive - begin
     yield f'<path d="M{edge} {leave:g}C{edge + bend} {leave:g} {edge + bend} {reach:g} {edge} {reach:g}"/>'
-    if end or start == len(STATES) - 1:  # all ways back to the first state are of the same event
+    if end or start == len(STATES) - 1:  # all arrows to the first state have the same event
         yield _text(edge + 0.78 * bend, middle + 4, label, "start" if side > 0 else "end")
 
 

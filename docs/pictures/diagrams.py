@@ -1,4 +1,4 @@
-"""Timing diagrams as SVG: lanes from left to right, each with what is on the wire at which time."""
+"""Timing diagrams as SVG: lanes that show the traffic on the wire from left to right."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COLOURS = {"request": "#0072B2", "reply": "#009E73", "late": "#D55E00", "echo": 
 
 @dataclass(frozen=True)
 class Span:
-    """A box in a lane, from `begin` to `end` in the diagram's own unit of time."""
+    """A box in a lane, with its times in the diagram's own unit."""
 
     begin: float
     end: float
@@ -32,7 +32,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Diagram:
-    """Lanes by name, marks, and how long all of it takes."""
+    """Lanes by name, marks, and the total time."""
 
     length: float
     lanes: Sequence[tuple[str, Sequence[Span]]]
@@ -40,7 +40,7 @@ class Diagram:
     note: str = ""
 
 
-# Times in ms at 9600 baud, 8N1: a read of ten registers, response delay 2 ms (not to scale where it says so).
+# Times in ms at 9600 baud, 8N1: a read of ten registers, response delay 2 ms (not to scale if it says so).
 DIAGRAMS = {
     "exchange": Diagram(
         46,

@@ -1,7 +1,7 @@
-"""Make the pictures of README and docs: `python docs/pictures/make.py`, or some of them by name.
+"""Make the pictures of README and docs, or only the named ones: `python docs/pictures/make.py [NAME]...`.
 
-The timing diagrams are drawn from the tables in `diagrams.py`. The demo's screen and the plot are taken from
-the programs themselves, on a simulated line: they take a minute and are never twice the same. Needs
+The timing diagrams are drawn from the tables in `diagrams.py`. The demo's screen and the plot come from the
+programs themselves, on a simulated line. They take a minute and differ each time. Needs
 `pip install '.[plot,monitor]'`.
 """
 
@@ -54,7 +54,7 @@ def demo_screen() -> str:
 
 
 def _drawn(directory: str) -> str:
-    """Return all that the demo writes to a terminal of this size."""
+    """Return the demo's output on a terminal of this size."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ.update(TERM="xterm-256color", COLORTERM="truecolor", COLUMNS=str(WIDTH), LINES=str(HEIGHT))
@@ -72,7 +72,7 @@ def _drawn(directory: str) -> str:
 
 
 def _last_screen(drawn: str) -> str:
-    """Return what stands on the screen before the program leaves it."""
+    """Return the last screen before the program closes it."""
     on_screen, _, _ = drawn.partition("\x1b[?1049l")
     last = on_screen.split("\x1b[H")[-1]
     return re.sub(r"\x1b\[\?\d+[hl]", "", last).replace("\r", "")
@@ -86,11 +86,11 @@ def _svg(screen: str) -> str:
     for line in screen.split("\n"):
         console.print(Text.from_ansi(line), no_wrap=True, overflow="crop")
     picture = console.export_svg(title="multidrop demo", unique_id="demo")
-    return re.sub(r"\s*@font-face \{.*?\}\n", "\n", picture, flags=re.DOTALL)  # loaded from nowhere
+    return re.sub(r"\s*@font-face \{.*?\}\n", "\n", picture, flags=re.DOTALL)  # do not load fonts
 
 
 def plot(out: Path) -> None:
-    """Record two simulated motors that start and stop, and have `multidrop plot` draw them."""
+    """Record two simulated motors that start and stop, and draw them with `multidrop plot`."""
     from multidrop import Plant, Poller, open_writer
 
     with TemporaryDirectory() as directory:

@@ -1,6 +1,6 @@
 """Take the picture of the gateway's page: `python docs/pictures/page.py`.
 
-It shows the plant of invented values that the page's tests use, after a minute. Needs `pip install '.[test]'`
+It shows the plant of the page's tests, with invented values, after a minute. Needs `pip install '.[test]'`
 and Chromium.
 """
 
@@ -15,7 +15,7 @@ from playwright.sync_api import sync_playwright
 HERE = Path(__file__).parent
 sys.path.append(str(HERE.parents[1] / "tests" / "page"))
 WIDTH, HEIGHT = 1440, 900
-MINUTE_MS = 62_000  # until the plots of a minute are full
+MINUTE_MS = 62_000  # until the one-minute plots are full
 
 
 def main() -> None:
