@@ -1,4 +1,6 @@
-"""Random frames, whole and damaged: libmodbus and pymodbus agree with us on them, or a rule says why not."""
+"""Compare the decoding of random frames, whole and damaged, with libmodbus and pymodbus; rules list
+differences.
+"""
 
 from __future__ import annotations
 
@@ -255,7 +257,7 @@ def compare(said: SampleFrame, ours: Understood | Verdict, theirs: Understood | 
     return [Difference(said, ours, theirs)]
 
 
-NUMBER = 3000  # of frames in each comparison
+NUMBER = 3000  # frames in each comparison
 RTU, ASCII = Framing.RTU, Framing.ASCII
 framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 
@@ -273,7 +275,7 @@ def answered(said: SampleFrame) -> Verdict:
 
 
 def trimmed(message: Message) -> Message:
-    """Without the bits that fill the last byte up: nobody is told them."""
+    """Return the message without the padding bits of the last byte."""
     rest = message.count % 8
     if message.function not in BITS or not message.data or not rest:
         return message
@@ -295,8 +297,8 @@ def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Libmodbus:
 
 
 @pytest.mark.long
-def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -> None:
-    """It answers, and changes its registers, as our reading of the request demands."""
+def test_requests_decode_as_in_libmodbus_server(libmodbus: Libmodbus) -> None:
+    """Check that its replies and registers change as our decoding of the request requires."""
     requests = frames(1, RTU, NUMBER, replies=False)
     differences = []
     answers = 0
@@ -305,7 +307,7 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
         ours = message if isinstance(message, str) else expected(used, message)
         if isinstance(theirs, Understood) and isinstance(message, Message) and theirs.reply:
             used, _ = parse_reply(RTU, theirs.reply, message)
-            assert used == len(theirs.reply), said  # what it encodes, we take
+            assert used == len(theirs.reply), said  # we accept its encoding
             theirs = replace(theirs, reply=theirs.reply[1:-2])
             answers += 1
         differences += compare(said, ours, theirs)
@@ -314,7 +316,7 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
 
 
 @pytest.mark.long
-def test_requests_and_replies_as_libmodbus_s_client_has_them(libmodbus: Libmodbus) -> None:
+def test_requests_and_replies_equal_libmodbus_client(libmodbus: Libmodbus) -> None:
     replies = [frame for frame in frames(2, RTU, NUMBER, replies=True) if frame.request.function != 0x08]
     differences = []
     values = 0
@@ -336,7 +338,7 @@ def name(framing: Framing) -> str:
 
 @pytest.mark.long
 @framings
-def test_requests_as_pymodbus_s_server_understands_them(framing: Framing) -> None:
+def test_requests_decode_as_in_pymodbus_server(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     differences = []
     for said in frames(3, framing, NUMBER, replies=False):
@@ -347,7 +349,7 @@ def test_requests_as_pymodbus_s_server_understands_them(framing: Framing) -> Non
 
 @pytest.mark.long
 @framings
-def test_replies_as_pymodbus_s_client_understands_them(framing: Framing) -> None:
+def test_replies_decode_as_in_pymodbus_client(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     differences = []
     for said in frames(4, framing, NUMBER, replies=True):
@@ -357,7 +359,7 @@ def test_replies_as_pymodbus_s_client_understands_them(framing: Framing) -> None
 
 @pytest.mark.slow
 @framings
-def test_replies_that_pymodbus_encodes_are_ours_byte_by_byte(framing: Framing) -> None:
+def test_replies_encode_as_in_pymodbus(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     whole = [frame for frame in frames(5, framing, NUMBER, replies=True) if not frame.damage]
     for said in whole:

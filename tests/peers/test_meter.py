@@ -1,4 +1,4 @@
-"""A meter of 40 values, held by a server that we did not write and polled through its family's file."""
+"""Poll a meter of 40 values, simulated by pymodbus, through its family file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ HELD = {
 
 
 def family_file(folder: Path, *, stated: bool) -> Path:
-    """Write the meter's family file, with or without what it states of reading together."""
+    """Write the meter's family file, with or without its read limits and gaps."""
     lines = FAMILY.read_text("utf-8").splitlines(keepends=True)
     path = folder / ("meter.toml" if stated else "unstated.toml")
     path.write_text("".join(line for line in lines if stated or not line.startswith(STATED)), "utf-8")
@@ -47,7 +47,7 @@ def family_file(folder: Path, *, stated: bool) -> Path:
 
 @contextmanager
 def served(folder: Path, *options: str) -> Iterator[str]:
-    """Yield the port behind which pymodbus is the meter."""
+    """Yield the port of a meter that pymodbus simulates."""
     require_module("pymodbus")
     values = folder / "values.json"
     floats = {ADDRESSES[name]: value for name, value in FLOATS.items()}
@@ -73,8 +73,8 @@ def plant_file(folder: Path, port: str, family: Path, *polled: str) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("stated", [True, False], ids=["gaps stated", "nothing stated"])
-def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) -> None:
-    """The server refuses whatever the file does not declare."""
+def test_poll_reads_all_40_values_of_the_server(tmp_path: Path, stated: bool) -> None:
+    """Check all values; the server rejects undeclared registers."""
     assert len(HELD) == 40
     family = family_file(tmp_path, stated=stated)
     rows: list[Row] = []
@@ -87,17 +87,17 @@ def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) 
 
 
 @pytest.mark.slow
-def test_all_40_values_read_by_hand_are_the_server_s(tmp_path: Path) -> None:
+def test_read_many_reads_all_40_values_of_the_server(tmp_path: Path) -> None:
     meter = load_family(FAMILY)
     with served(tmp_path) as port, Bus(port) as bus:
         assert bus.attach(meter, UNIT).read_many(meter.registers.values()) == HELD
 
 
 @pytest.mark.parametrize(("stated", "requests"), [(True, 4), (False, 8)])
-def test_the_plan_of_its_39_floats_at_9600(
+def test_plan_of_39_floats_at_9600(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, requests: int
 ) -> None:
-    """The documentation shows what is printed; 5 ms is the response delay of a file that states none."""
+    """Check the plan in the documentation; 5 ms is the default response delay."""
     family = family_file(tmp_path, stated=stated)
     assert load_family(family).response_delay == 0.005
     assert main(["plan", str(plant_file(tmp_path, "/dev/null", family, *ADDRESSES))]) == 0
@@ -109,7 +109,7 @@ def test_the_plan_of_its_39_floats_at_9600(
 @pytest.mark.parametrize(
     ("stated", "most"), [(True, "at most 80"), (False, "at most 125, the standard's limit")]
 )
-def test_models_says_how_many_registers_one_request_reads(
+def test_models_prints_the_read_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, most: str
 ) -> None:
     assert main(["models", str(family_file(tmp_path, stated=stated))]) == 0

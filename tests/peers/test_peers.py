@@ -1,4 +1,4 @@
-"""Servers that we did not write, read and written through a drive that a user declares."""
+"""Read and write servers by other authors through a drive that a user declares."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
 
 @pytest.fixture(params=COMMANDS)
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, str]]:
-    """Our port, with the server behind it, and the framing that it speaks."""
+    """Give our port with a server behind it, and its framing."""
     command = COMMANDS[request.param](tmp_path)
     with linked_ptys() as (theirs, ours):
         started = [theirs if word == "PORT" else word for word in command]
@@ -73,8 +73,8 @@ def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
 
 @pytest.mark.slow
 @patient
-def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
-    """Registers and coils that nothing declares hold what the servers' own sources say."""
+def test_undeclared_addresses_can_be_read(server: tuple[str, str]) -> None:
+    """Check that undeclared registers and coils have the values of the servers' sources."""
     port, framing = server
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS, framing=framing)
@@ -89,7 +89,7 @@ def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
 
 @pytest.mark.slow
 @patient
-def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
+def test_written_values_are_read_back(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS, framing=framing)
@@ -99,7 +99,7 @@ def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
 
 @pytest.mark.slow
 @patient
-def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
+def test_exception_code_raises_drive_exception(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
         device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS, framing=framing)
@@ -109,7 +109,7 @@ def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
 
 
 @pytest.mark.long
-def test_another_address_is_silence(server: tuple[str, str]) -> None:
+def test_another_address_times_out(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
         device = bus.attach(Device, ADDRESS + 1, framing=framing)
@@ -119,9 +119,7 @@ def test_another_address_is_silence(server: tuple[str, str]) -> None:
 
 @pytest.mark.slow
 @patient
-def test_the_command_line_reads_and_writes_it_too(
-    server: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_line_reads_and_writes(server: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     port, framing = server
     where = [port, DEVICE, str(ADDRESS), "--framing", framing]
     assert main(["write", *where, "frequency", "31.4", "--yes"]) == 0

@@ -1,4 +1,4 @@
-"""Modbus TCP with others' programs: servers that we read and write, and a client that reads our drives."""
+"""Modbus TCP with programs by other authors: servers that we use, and a client of our drives."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def libmodbus(built: Path) -> list[str]:
 
 @pytest.fixture(params=[pymodbus, libmodbus], ids=lambda made: made.__name__)
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """The server's port, as we name it."""
+    """Give the URL of the server's port."""
     made: Callable[[Path], list[str]] = request.param
     with BoundProcess(made(tmp_path), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -68,7 +68,7 @@ def test_registers_and_coils_are_read(server: str) -> None:
 
 @pytest.mark.slow
 @patient
-def test_what_is_written_is_what_is_read_back(server: str) -> None:
+def test_written_values_are_read_back(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(Device, ADDRESS)
         for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
@@ -77,7 +77,7 @@ def test_what_is_written_is_what_is_read_back(server: str) -> None:
 
 @pytest.mark.slow
 @patient
-def test_an_exception_is_the_device_s_refusal(server: str) -> None:
+def test_exception_code_raises_drive_exception(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS)
         with pytest.raises(DriveException, match="illegal address") as refusal:
@@ -86,7 +86,7 @@ def test_an_exception_is_the_device_s_refusal(server: str) -> None:
 
 
 @pytest.mark.slow
-def test_all_values_of_a_poll_are_the_server_s(server: str, tmp_path: Path) -> None:
+def test_poll_reads_all_values_of_the_server(server: str, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         f'[[line]]\nname = "net"\nport = "{server}"\n'
@@ -102,7 +102,7 @@ def test_all_values_of_a_poll_are_the_server_s(server: str, tmp_path: Path) -> N
 
 @pytest.mark.slow
 @patient
-def test_the_command_line_reads_and_writes_it_too(server: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_reads_and_writes(server: str, capsys: pytest.CaptureFixture[str]) -> None:
     where = [server, DEVICE, str(ADDRESS)]
     assert main(["write", *where, "frequency", "31.4", "--yes"]) == 0
     assert main(["read", *where, "frequency", "current"]) == 0
@@ -112,7 +112,7 @@ def test_the_command_line_reads_and_writes_it_too(server: str, capsys: pytest.Ca
 
 
 @pytest.mark.slow
-def test_another_unit_of_pymodbus_is_silence(tmp_path: Path) -> None:
+def test_another_unit_of_pymodbus_times_out(tmp_path: Path) -> None:
     with BoundProcess(pymodbus(tmp_path), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = f"tcp://127.0.0.1:{process.stdout.readline().split()[1]}"

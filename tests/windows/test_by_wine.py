@@ -1,7 +1,7 @@
-"""multidrop on Windows, by Wine: Ctrl-C, names of ports, ports that vanish, consoles, paths.
+"""multidrop on Windows, with Wine: Ctrl-C, port names, ports that vanish, consoles, paths.
 
 `MULTIDROP_WINE=FOLDER pytest -n 0 -m "" tests/windows` runs these; without a folder that `tools/wine make`
-has filled they are left out.
+has filled they are skipped.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def wine() -> Iterator[Wine]:
-    """Wine, with a server that no vanishing terminal takes along: a leader of a session would get it."""
+    """Give Wine with a server that survives vanishing terminals, because it is not their session leader."""
     found = Wine(Path(FOLDER))
     subprocess.run(["wineserver", "-w"], env=found.environment, check=True)
     with BoundProcess(["wineserver", "-f", "-p"], env=found.environment) as server:
@@ -197,7 +197,7 @@ def plant(tmp_path: Path) -> Path:
 # ---- Ctrl-C ----
 
 
-def test_ctrl_c_ends_a_poll_and_its_recording_is_whole(wine: Wine, pump: MotorDrive, plant: Path) -> None:
+def test_ctrl_c_ends_a_poll_with_a_complete_recording(wine: Wine, pump: MotorDrive, plant: Path) -> None:
     out = plant.with_name("запись.arrows")
     with wine.console("-m", "multidrop", "poll", plant, "--out", out) as console:
         console.until(lambda: "ok" in statuses(out))
@@ -220,7 +220,7 @@ with Bus("COM5") as bus:
 """
 
 
-def test_ctrl_c_stops_a_motor_that_is_to_stop_at_exit(wine: Wine, pump: MotorDrive) -> None:
+def test_ctrl_c_stops_a_motor_with_stop_on_exit(wine: Wine, pump: MotorDrive) -> None:
     with wine.console("-c", CLIENT) as console:
         console.until_said("running")
         assert pump.motor.energised
@@ -230,7 +230,7 @@ def test_ctrl_c_stops_a_motor_that_is_to_stop_at_exit(wine: Wine, pump: MotorDri
     assert not pump.motor.energised
 
 
-def test_ctrl_c_cuts_no_stop_short(wine: Wine, pump: MotorDrive) -> None:
+def test_ctrl_c_does_not_interrupt_a_stop(wine: Wine, pump: MotorDrive) -> None:
     pump.motor.deceleration_time = 5.0
     received = ReceivedRequests(pump)
 
@@ -246,7 +246,7 @@ def test_ctrl_c_cuts_no_stop_short(wine: Wine, pump: MotorDrive) -> None:
     assert not pump.motor.energised
 
 
-# A motor that does not turn is waited for, here for as long as Ctrl-C may take.
+# Waits for a motor that does not turn, as long as Ctrl-C may take.
 START = """
 import sys
 import multidrop.cli
@@ -256,10 +256,10 @@ sys.exit(multidrop.cli.main(sys.argv[1:]))
 """
 
 
-def test_ctrl_c_within_a_start_says_what_was_sent_and_how_to_stop_it(
+def test_ctrl_c_during_a_start_reports_sent_frames_and_the_stop_command(
     wine: Wine, pump: MotorDrive, tmp_path: Path
 ) -> None:
-    """The stop that it names is typed as it stands, and stops the motor."""
+    """Type the printed stop command; it stops the motor."""
     vars(pump.motor)["run"] = lambda direction=None: None
     received = ReceivedRequests(pump)
     plant = tmp_path / "hall 2.toml"
@@ -284,7 +284,7 @@ def test_ctrl_c_within_a_start_says_what_was_sent_and_how_to_stop_it(
 
 
 @pytest.mark.parametrize("name", ["COM5", "com5", r"\\.\COM5", "COM10", "com10", r"\\.\COM10"])
-def test_a_port_has_all_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
+def test_port_opens_by_all_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
     wine.link("com10", wine.terminal_of("com5"))
     ran = wine.run("-m", "multidrop", "state", name, "invt-che", 1)
     assert ran.returncode == 0, ran.stderr
@@ -294,20 +294,20 @@ def test_a_port_has_all_its_names(wine: Wine, pump: MotorDrive, name: str) -> No
 @pytest.mark.parametrize(
     ("name", "reason"), [("COM77", "there is no such port"), ("NUL", "it is not a serial port")]
 )
-def test_what_is_no_port_is_a_sentence(wine: Wine, name: str, reason: str) -> None:
+def test_invalid_port_prints_one_sentence(wine: Wine, name: str, reason: str) -> None:
     ran = wine.run("-m", "multidrop", "state", name, "invt-che", 1)
     assert ran.returncode == 1
     (sentence,) = ran.stderr.decode().splitlines()
     assert reason in sentence
 
 
-def test_a_pipe_has_letters_that_its_encoding_lacks_spelt_out(wine: Wine, plant: Path) -> None:
+def test_pipe_escapes_letters_outside_its_encoding(wine: Wine, plant: Path) -> None:
     ran = wine.run("-m", "multidrop", "plan", plant)
     assert ran.returncode == 0, ran.stderr
     assert rb"\u043d\u0430\u0441\u043e\u0441" in ran.stdout
 
 
-def test_a_console_has_them(wine: Wine, plant: Path) -> None:
+def test_console_prints_all_letters(wine: Wine, plant: Path) -> None:
     with wine.console("-m", "multidrop", "plan", plant) as console:
         assert console.status() == 0
         console.until_said("насос")
@@ -318,7 +318,7 @@ def test_a_console_has_them(wine: Wine, plant: Path) -> None:
 
 @pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
 def test_a_port_is_set_to_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
-    """Both are taken, and no terminal shows them on its wire: it has none."""
+    """Check that both are accepted; terminals do not show them on the wire."""
     ran = wine.run("-m", "multidrop", "state", "COM5", "invt-che", 1, "--format", form)
     assert ran.returncode == 0, ran.stderr
 
@@ -334,9 +334,7 @@ OPEN = "from multidrop import Bus\nBus('COM5', rs485={!r})"
         ("kernel", "has no RS-485 mode"),
     ],
 )
-def test_a_terminal_has_no_rts_and_is_not_opened(
-    wine: Wine, pump: MotorDrive, mode: str, reason: str
-) -> None:
+def test_terminal_without_rts_is_not_opened(wine: Wine, pump: MotorDrive, mode: str, reason: str) -> None:
     ran = wine.run("-c", OPEN.format(mode))
     assert ran.returncode == 1
     sentence = ran.stderr.decode().splitlines()[-1]
@@ -346,8 +344,8 @@ def test_a_terminal_has_no_rts_and_is_not_opened(
 # ---- a process that is killed ----
 
 
-def test_what_a_killed_poll_has_recorded_is_read(wine: Wine, pump: MotorDrive, plant: Path) -> None:
-    """The whole of it, and the port is free for the next one."""
+def test_recording_of_a_killed_poll_is_readable(wine: Wine, pump: MotorDrive, plant: Path) -> None:
+    """Check that the recording is complete, and that the port is free again."""
     out = plant.with_name("killed.arrows")
     with wine.console("-m", "multidrop", "poll", plant, "--out", out) as console:
         console.until(lambda: statuses(out).count("ok") > 20)
@@ -393,7 +391,7 @@ def on_com5(wine: Wine) -> Iterator[MotorDrive]:
 
 
 def said_by(console: Console) -> list[str]:
-    """Return what the program has said of itself, sentence by sentence."""
+    """Return the program's own output, by sentence."""
     return re.findall(r"multidrop: .*\S", console.said)
 
 

@@ -1,5 +1,5 @@
-"""mbpoll, libmodbus and pyModbusTCP read and write drives through the gateway: the drives' own words, bit for
-bit, as the simulated drives hold them.
+"""Read and write drives through the gateway with mbpoll, libmodbus and pyModbusTCP: words equal the drives'
+memory.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 SOURCE = Path(__file__).parent / "programs" / "libmodbus_tcp_client.c"
-TYPES = {1: "0", 2: "1", 3: "4", 4: "3"}  # mbpoll's
+TYPES = {1: "0", 2: "1", 3: "4", 4: "3"}  # of mbpoll
 WRITTEN = {5: "0", 6: "4"}
 MBPOLL_CODES = {  # libmodbus's texts for exceptions
     "Illegal function": 1,
@@ -163,13 +163,13 @@ def master_of(name: str, port: int, built: Path) -> Iterator[Master]:
 MASTERS = ["pyModbusTCP", "mbpoll", "libmodbus"]
 METER = Path(__file__).parents[2] / "data" / "families" / "sdm630.toml"
 MODELS = ["innovert-ibd", "invt-che", "delixi-modbus", "yd1000", "erman-er-g-220", str(METER)]
-COMMANDED = 7  # the unit that is written to
+COMMANDED = 7  # the unit that is written
 SETPOINT, CONTROL, STOP = 0x2000, 0x1000, 5  # of a CHE: CHE100 manual v1.4, p. 117
 PATIENCE = 60.0  # s
 
 
 class Lines(NamedTuple):
-    """A poller, as commands see it."""
+    """A poller with the interface that commands use."""
 
     plant: Plant
     poller: Poller
@@ -183,7 +183,7 @@ class Lines(NamedTuple):
 
     @property
     def plant_coming(self) -> None:
-        return None  # nothing is reloaded
+        return None  # no reload here
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         _, known = self.plant.find_drive(drive)
@@ -194,7 +194,7 @@ class Lines(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """The gateway, the drives behind it by unit, and the poller."""
+    """The gateway, its simulated drives by unit, and the poller."""
 
     server: ModbusServer
     drives: dict[int, SimulatedDrive]
@@ -206,7 +206,7 @@ class Rig(NamedTuple):
 
 
 def plant_text(ports: list[str]) -> str:
-    """The plant file: half of the drives on each line, and some registers that are not polled."""
+    """Return a plant file with half of the drives on each line, and some registers that are not polled."""
     models = [*MODELS, "invt-che"]
     text = ""
     for at, port in enumerate(ports):
@@ -245,7 +245,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iter
                 loop = asyncio.get_running_loop()
 
                 def feed(batch: Batch) -> None:
-                    with suppress(RuntimeError):  # at the end, when the loop is closed
+                    with suppress(RuntimeError):  # at the end, after the loop closed
                         loop.call_soon_threadsafe(hub.take, batch)
 
                 poller.on_batch(feed, every=0.02)
@@ -256,7 +256,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iter
 
 
 def fill(drive: SimulatedDrive, chance: random.Random) -> None:
-    """Give each word any bits, half of them few, as small numbers are; but what a document knows."""
+    """Set words to random bits, half of them small numbers, except those with documented values."""
     for register in drive.drive.registers.values():
         for cell in drive.memory.of(register):
             top = 1 if register.table.carrier is Carrier.BIT else 0xFFFF
@@ -267,7 +267,7 @@ def fill(drive: SimulatedDrive, chance: random.Random) -> None:
 
 
 class Chunk(NamedTuple):
-    """Neighbouring readable addresses of a unit, and what is there."""
+    """Adjacent readable addresses of a unit, and their values."""
 
     unit: int
     function: int
@@ -280,7 +280,7 @@ class Chunk(NamedTuple):
 
 
 def chunks(rig: Rig) -> list[Chunk]:
-    """All that the families declare to be readable, in pieces; the numbers are the simulated memory's."""
+    """Return all declared readable addresses in pieces, with the simulated memory's values."""
     found: list[Chunk] = []
     for unit, drive in rig.drives.items():
         readable: set[tuple[int, int]] = set()
@@ -303,7 +303,7 @@ def chunks(rig: Rig) -> list[Chunk]:
 
 
 def patiently(ask: Any, *numbers: int) -> Any:
-    """Ask again where the line's share is used up, or a busy machine lost a reply."""
+    """Call again if the line's share is used up or a busy machine lost a reply."""
     end = monotonic() + PATIENCE
     while (found := ask(*numbers)) in (6, 11) and monotonic() < end:
         sleep(0.1)
@@ -318,7 +318,7 @@ def master(request: pytest.FixtureRequest, rig: Rig, tmp_path: Path) -> Iterator
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_all_words_are_the_drives_own(rig: Rig, master: Master) -> None:
+def test_all_words_equal_the_drives(rig: Rig, master: Master) -> None:
     before = rig.server.answered.copy()
     asked = chunks(rig)
     assert len(asked) > 40
@@ -335,8 +335,8 @@ def test_all_words_are_the_drives_own(rig: Rig, master: Master) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_words_from_rows_are_those_that_the_line_has(rig: Rig, master: Master) -> None:
-    """Every polled register that is whole is answered without the line, and as the line itself answers."""
+def test_cached_words_equal_the_words_of_the_line(rig: Rig, master: Master) -> None:
+    """Check that a complete polled register is answered from the cache with the line's words."""
     before = rig.server.answered["cached"]
     asked = 0
     for unit, drive in rig.drives.items():
@@ -346,7 +346,7 @@ def test_words_from_rows_are_those_that_the_line_has(rig: Rig, master: Master) -
             found = patiently(master.read, unit, register.table.read, register.address, register.words)
             assert found == direct, (unit, register.name)
             asked += 1
-    frequency = rig.drives[2].drive.register("output_frequency").address  # whole, and polled: in the cache
+    frequency = rig.drives[2].drive.register("output_frequency").address  # complete and polled: in the cache
     until(
         lambda: (
             patiently(master.read, 2, 3, frequency, 1) and rig.server.answered["cached"] - before > asked / 2
@@ -355,7 +355,7 @@ def test_words_from_rows_are_those_that_the_line_has(rig: Rig, master: Master) -
 
 
 def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
-    """Return what the line itself has; asked again where a busy machine lost the reply."""
+    """Return the line's own words; retry if a busy machine lost the reply."""
     end = monotonic() + PATIENCE
     data = b""
     while not data:
@@ -379,11 +379,11 @@ def test_a_setpoint_is_written_and_read_back(
     assert patiently(master.read, COMMANDED, 3, SETPOINT, 1) == [value]
 
 
-def test_exceptions_are_told(rig: Rig, master: Master) -> None:
+def test_exception_codes_reach_the_master(rig: Rig, master: Master) -> None:
     writes = len(rig.drives[COMMANDED].counters.writes)
-    assert patiently(master.write, COMMANDED, 6, SETPOINT, 60000) == 3  # over its span
+    assert patiently(master.write, COMMANDED, 6, SETPOINT, 60000) == 3  # above its range
     assert patiently(master.write, COMMANDED, 6, CONTROL, 1) == 3  # FORWARD
-    assert patiently(master.write, 1, 6, 0x0002, 1) == 2  # not a register that can be written
+    assert patiently(master.write, 1, 6, 0x0002, 1) == 2  # not a writable register
     assert patiently(master.write, 4, 6, 0x2000, 1) == 2
     assert master.read(99, 3, 0, 1) == 10
     assert len(rig.drives[COMMANDED].counters.writes) == writes
@@ -393,7 +393,7 @@ def test_a_motor_is_stopped(rig: Rig, master: Master) -> None:
     drive = rig.drives[COMMANDED]
     for address, value in ((CONTROL, STOP), (0xF00A, 1)):
         drive.counters.writes.clear()
-        assert master.write(COMMANDED, 6, address, value) in (0, 5)  # done, or goes on
+        assert master.write(COMMANDED, 6, address, value) in (0, 5)  # done, or still running
         until(lambda: drive.counters.writes)
         assert [(one.name, one.raw) for one in drive.counters.writes][-1] == ("control", STOP)
 
