@@ -280,7 +280,7 @@ def drilled(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill
 
 # ---- the state that `multidrop fleet status` prints ----
 
-LOOK_S = 0.25  # between queries, each of which costs as much CPU as seconds of a gateway
+LOOK_S = 0.25  # between queries; a query costs as much CPU as seconds of a gateway
 
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Poll, record and write in a forked process until killed, and report what is on disk.
+"""Poll, record and write in a forked process until killed, and report the rows and writes on disk.
 
 Each line of standard input starts one: PORT DIRECTORY LIFE NUMBER. It is forked from this process, which has
 imported everything; its id and its exit status are printed. It records into DIRECTORY/LIFE.arrows and .csv,

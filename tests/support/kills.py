@@ -1,4 +1,4 @@
-"""Kill the processes of a test; count what a process holds, to find leaks."""
+"""Kill the processes of a test; count threads and descriptors, to find leaks."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class LineDriver:
 
     @property
     def echo(self) -> int:
-        """Return what is known about the adapter's echo (enum md_echo)."""
+        """Return the adapter's known echo (enum md_echo)."""
         return int(self._line.echo)
 
     @echo.setter

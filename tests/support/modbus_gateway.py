@@ -60,7 +60,7 @@ DONE = CommandResult(CommandOutcome.DONE, "done")
 
 
 class FakeCommands:
-    """Commands that record their calls and return what the test sets."""
+    """Commands that record their calls, with results that the test sets."""
 
     def __init__(self) -> None:
         self.told: CommandResult | Callable[[], Awaitable[CommandResult]] = DONE

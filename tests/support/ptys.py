@@ -16,7 +16,7 @@ from multidrop.core import set_settings
 
 @contextmanager
 def linked_ptys() -> Iterator[tuple[str, str]]:
-    """Give the paths of two ports, each of which receives what is written to the other."""
+    """Give the paths of two ports; each receives the other's bytes."""
     masters, slaves = zip(*(os.openpty() for _ in range(2)), strict=True)
     for slave in slaves:
         tty.setraw(slave)

@@ -169,7 +169,7 @@ class ResponderDrive:
         self._coils[0] = COIL_ON
 
     def hold(self, address: int, value: int) -> None:
-        """Keep this value at every place where the address is read."""
+        """Keep this value for all reads of the address."""
         self._memory[address] = value
 
     def word(self, address: int, function: int) -> int:

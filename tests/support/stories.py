@@ -67,7 +67,7 @@ class Story:
         return self.rows[first:]
 
     def run_motor(self, seconds: float) -> None:
-        """Run for this many seconds, in each of which the motor starts and stops."""
+        """Run for this many seconds; the motor starts and stops in each second."""
         for _ in range(round(seconds)):
             for command in (START, STOP):
                 self.clocked.command(self.motor, command)
@@ -194,7 +194,7 @@ def jittering(seconds: float) -> Delay:
 
 
 def stalling(longest: float) -> Delay:
-    """Return twelve stalls of up to this many seconds, each of which delays everything to its end."""
+    """Return twelve stalls of up to this many seconds, which delay all bytes to their end."""
     random = Random(2)
     begins = [random.uniform(2.0, SECONDS) for _ in range(12)]
     stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
