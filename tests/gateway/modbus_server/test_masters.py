@@ -31,7 +31,7 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-SOURCE = Path(__file__).parent / "programs" / "libmodbus_tcp_client.c"
+SOURCE = Path(__file__).parents[2] / "support" / "programs" / "libmodbus_tcp_client.c"
 TYPES = {1: "0", 2: "1", 3: "4", 4: "3"}  # of mbpoll
 WRITTEN = {5: "0", 6: "4"}
 MBPOLL_CODES = {  # libmodbus's texts for exceptions
