@@ -1,4 +1,4 @@
-"""Attached: the drives of a bus, which carries out their verbs. A drive is on one bus at a time."""
+"""Attached: the drives of a bus; the bus carries out their verbs. A drive is on one bus at a time."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ D = TypeVar("D", bound=Drive)
 
 
 def made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
-    """Return `drive`, or a new drive of this family; `details` override those of the line.
+    """Return `drive`, or, if it is a family, a new drive of that family.
 
-    Raises TypeError for any other object, for a missing address, and for details of an existing drive.
+    `line` and `details` are options of the new drive; `details` override `line`. Raises TypeError for any
+    other object, for a missing address, and for details of an existing drive.
     """
     family = drive if isinstance(drive, type) else type(drive)
     if not issubclass(family, Drive):
@@ -38,7 +39,7 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
 
 
 class BusLink:
-    """Reads and writes of a bus's drives by their own methods."""
+    """The link through which drives of a bus read and write when their own methods are called."""
 
     def __init__(self, exchanges: Exchanges, performer: Performer) -> None:
         self._exchanges = exchanges
@@ -104,7 +105,7 @@ class Attached:
             for other in self.drives:
                 if other.address == drive.address:
                     raise ValueError(f"address {drive.address} is taken by {other.name}")
-            owner = vars(drive).setdefault("bus", self._bus)  # in one step: two buses cannot both have it
+            owner = vars(drive).setdefault("bus", self._bus)  # atomic: two buses cannot both take the drive
             if owner is not self._bus and owner.is_open:
                 raise ValueError(
                     f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or make another"

@@ -1,7 +1,7 @@
-"""AuditLog: a file of JSON lines that only grows, with every write that was sent.
+"""AuditLog: an append-only file of JSON lines that records every write that was sent.
 
-A write is recorded when its outcome is known. A write that was in flight when the process was killed is only
-there if `noted_first` asked for an earlier record. A stop is recorded when it is called, and again for each
+A write is recorded when its outcome is known. If the process is killed while a write is in flight, the write
+is only recorded if it was made within `noted_first`. A stop is recorded when it is called, and again for each
 drive when it ends. A line that a crash or a full disk truncated does not damage the next record.
 """
 
@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from multidrop.iso_time import format_time
 
-OPENING_S = 5.0  # within which the disk must open the file
+OPENING_S = 5.0  # timeout for opening the file
 
 _sync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
@@ -35,7 +35,7 @@ class AuditLog:
             raise OSError(f"{self.path}: there was room for a part of a record only")
 
     def sync(self) -> None:
-        """Return when all records are on the disk. Raises OSError."""
+        """Flush all records to the disk. Raises OSError."""
         _sync(self._file.fileno())
 
     def close(self) -> None:
@@ -50,11 +50,11 @@ class AuditLog:
 
 
 def _opened(path: Path) -> IO[bytes]:
-    """Open it with a time limit, because a disk may hang."""
+    """Open the log with a timeout, because a disk may hang."""
     from multidrop.supervisor import in_time  # loads asyncio: 4 MB that a poller without a log saves
 
     def open_file() -> IO[bytes]:
-        return path.open("a+b", buffering=0)  # one call, one write: processes do not mix their lines
+        return path.open("a+b", buffering=0)  # one write per record: processes do not mix their lines
 
     try:
         return in_time("audit log", OPENING_S, open_file)
@@ -65,9 +65,10 @@ def _opened(path: Path) -> IO[bytes]:
 def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
     """Yield the records of a log in order, without truncated ones. Raises OSError.
 
-    Each has `time` (UTC), `port`, `drive`, `write` and `outcome`. If known, it also has `model`, `address`,
-    `sent` (the newest frame), `frames` (the number of frames of a stop), `held` (the value that the drive
-    holds), `why`, `by` and `way` (see `written_by`). The outcome "called" means that it is about to be sent.
+    Each record has `time` (UTC), `port`, `drive`, `write` and `outcome`. If known, it also has `model`,
+    `address`, `sent` (the newest frame), `frames` (the number of frames of a stop), `held` (the value that
+    the drive holds), `why`, `by` and `way` (see `written_by`). The outcome "called" means that the write is
+    about to be sent.
     """
     with Path(path).open("rb") as lines:
         for line in lines:

@@ -13,14 +13,14 @@ MOST_CHARACTERS = 200
 
 
 class Author(NamedTuple):
-    """Fields of an audit record."""
+    """The author's fields of an audit record: `by` is who wrote, `way` the interface used."""
 
     by: str = ""
     way: str = ""
 
 
 class _Named(NamedTuple):
-    """The author of a block in printable words, and the mistake in the given ones."""
+    """The author of a block in printable text, and the error in the given names, if any."""
 
     author: Author
     mistake: Exception | None
@@ -37,7 +37,7 @@ def present_author() -> Author:
 
 
 def check_author() -> None:
-    """Raise the mistake in the present author's name, as `written_by` says. Not called for stops."""
+    """Raise TypeError or ValueError if the present author's name is invalid. Not called for stops."""
     mistake = _named.get(_NOBODY).mistake
     if mistake is not None:
         raise mistake
@@ -48,11 +48,13 @@ def written_by(who: str, way: str = "") -> Iterator[None]:
     """Record `who` as the author of all writes within the block, and `way` as the interface used.
 
     The audit record of a write or a stop then has `by`, such as "anna", and unless it is empty `way`, such as
-    "web, 10.0.0.7". It applies to this thread, or to this task and `asyncio.to_thread`; other threads, such
-    as those of `run_in_executor`, need a block of their own. The innermost block counts. It grants no rights.
+    "web, 10.0.0.7". The block applies to this thread, or to this task and `asyncio.to_thread`; other threads,
+    such as those of `run_in_executor`, need a block of their own. The innermost block counts. It grants no
+    rights.
 
-    Within the block a write raises TypeError if the name is not text, and ValueError if it is empty, longer
-    than 200 characters or not printable. A stop is sent all the same, and recorded with the printable part.
+    Within the block a write raises TypeError if `who` or `way` is not text, and ValueError if one is longer
+    than 200 characters or not printable, or if `who` is empty. A stop is sent nevertheless, and recorded with
+    the printable part.
     """
     mistake = _mistake("who", who) or (_mistake("way", way) if way != "" else None)
     token = _named.set(_Named(Author(_spelt(who), _spelt(way)), mistake))
@@ -66,8 +68,8 @@ def written_by(who: str, way: str = "") -> Iterator[None]:
 def noted_first() -> Iterator[None]:
     """Within the block, write a record with the outcome "called" to the audit log before each write.
 
-    A second record has the real outcome. If the first one cannot be written, the write raises OSError and is
-    not sent; a stop is always sent. It applies to this thread or task, as `written_by` does.
+    A second record has the real outcome. If the first record cannot be written, the write raises OSError and
+    is not sent; a stop is always sent. The block applies to this thread or task, like that of `written_by`.
     """
     token = _noted_first.set(True)
     try:
@@ -93,6 +95,6 @@ def _spelt(given: object) -> str:
     """Return any object, given as a name, as printable text."""
     try:
         text = given if isinstance(given, str) else repr(given)
-    except Exception:  # it is a caller's own
+    except Exception:  # from the caller's own `__repr__`
         text = type(given).__name__
     return printable(text).strip()[:MOST_CHARACTERS]

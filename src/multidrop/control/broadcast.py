@@ -1,7 +1,7 @@
-"""Broadcaster: write to all drives of a bus at once, if that is harmless to each one.
+"""Broadcaster: write to all drives of a bus with one broadcast, if that is harmless to each drive.
 
-The same address means different things to different families: a stop of one may be the run of another. So
-all drives must be known to be of one family, and must share settings and framing.
+A register address means different things to different families: the stop of one may be the run of another.
+So all drives must be of one family, and must have the same settings and framing.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ class Broadcaster:
     def write(
         self, drives: Sequence[Drive], register: Register[Any] | str, value: Any
     ) -> dict[str, State | BusError]:
-        """Write to all; return each one's state, or the error of reading it. Raises WriteForbidden."""
+        """Broadcast a write; return each drive's state by name, or the error of reading the state.
+
+        Raises WriteForbidden if the write must not be broadcast.
+        """
         if isinstance(register, str):
             if not drives:
                 raise ValueError("no drive is attached to this bus")
@@ -75,7 +78,7 @@ class Broadcaster:
         return {drive.name: self._state(drive) for drive in drives}
 
     def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
-        """Check each drive as before a write to it alone; return the first one's call, restarted."""
+        """Check each drive as for a write to that drive alone; return the first drive's call, restarted."""
         check_author()
         calls = [self._performer.call(drive) for drive in drives]
         for call in calls:
@@ -91,7 +94,10 @@ class Broadcaster:
             return failure
 
     def stop(self, drives: Sequence[Drive]) -> bool:
-        """Broadcast a stop if all drives are known and have one; return True if it may have been sent."""
+        """Broadcast a stop if all drives are confirmed and their family has a broadcast stop.
+
+        Return True if the stop may have been sent.
+        """
         known = all(self._writer.identity_check.is_known(drive) for drive in drives)
         control = drives[0].registers.get("control") if drives else None
         if len(drives) < 2 or not _are_alike(drives) or not known or drives[0].framing is Framing.TCP:
@@ -100,7 +106,7 @@ class Broadcaster:
             return False
         try:
             self._writer.broadcast(drives[0], control, control.broadcast[0])
-        except Exception as failure:  # each drive is still sent its own stop
+        except Exception as failure:  # not raised: the caller also sends each drive its own stop
             return isinstance(failure, Unconfirmed)
         return True
 

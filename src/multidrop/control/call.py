@@ -14,18 +14,18 @@ from multidrop.drive.family import Drive
 from multidrop.errors import CancelledByStop, Expired, Unconfirmed, WriteForbidden
 from multidrop.transport import clock
 
-MOST_CHARACTERS = 64  # of a request and its reply about one register
+MOST_CHARACTERS = 64  # length of a request for one register plus its reply, at most
 
 _log = logging.getLogger("multidrop.control")
 
 
 class Call:
-    """One call of the verb `verb`, or of a plain write.
+    """One call of the verb `verb`, or of a plain write (`verb` is then empty).
 
-    It sends no write after a stop was called, nor when it is late by more than `expiry` seconds. Lateness is
-    the time since the call, minus the time that its own reads, writes and waits may take. So a process that
-    was suspended sends no write, nor does a machine that slept. The first write is not sent after `limit_ns`
-    (CLOCK_BOOTTIME) either.
+    The call sends no write after a stop was called, nor when it is late by more than `expiry` seconds.
+    Lateness is the time since the call, minus the time allowed for its own reads, writes and waits. So
+    nothing is sent late after the process was suspended or the computer slept. The first write is not sent
+    after `limit_ns` (CLOCK_BOOTTIME) either.
     """
 
     def __init__(
@@ -35,25 +35,28 @@ class Call:
         self.permit = permit
         self.verb = verb
         self.sent = ""  # the latest write that may have been sent
-        self.is_confirmed = False  # that write
-        self.unverified: Outcome | None = None  # of that write, until something else is read
+        self.is_confirmed = False  # whether the drive confirmed that write
+        self.unverified: Outcome | None = None  # outcome of that write, until a later read succeeds
         self.expiry = expiry
         self._due_ns = clock.boottime_ns()
         self._limit_ns = limit_ns
 
     def restarted(self) -> Call:
-        """Return the same call with its time restarted. Stops since the first call still end it."""
+        """Return a copy of the call that starts now. A stop since the original call still cancels it."""
         return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property
     def expires_ns(self) -> int:
-        """The CLOCK_BOOTTIME after which it is not sent; includes the rest that the drive needs before."""
+        """The CLOCK_BOOTTIME in ns after which the next write is not sent.
+
+        It allows for the interval that the drive needs between two requests.
+        """
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:
-        """Allow a step this many seconds; only the time beyond them makes the call late."""
+        """Allow `seconds` for the block; only time beyond that makes the call late."""
         begun_ns = clock.boottime_ns()
         try:
             yield
@@ -61,7 +64,7 @@ class Call:
             self._due_ns += min(clock.boottime_ns() - begun_ns, round(seconds * 1e9))
 
     def look(self) -> AbstractContextManager[None]:
-        """Allow the time of one exchange with the drive."""
+        """Return a block like `step` that allows the time of one exchange with the drive."""
         drive = self.drive
         wire = 2 * drive.needed_silence() + MOST_CHARACTERS * drive.settings.character
         return self.step(drive.least_interval + drive.response_timeout + wire)
@@ -84,9 +87,10 @@ class Call:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Log a refusal; on Ctrl-C, add a note on the writes already sent.
+        """Log a WriteForbidden from the block; on Ctrl-C, add a note on the writes already sent.
 
-        If a signal's stops ended the call, raise the signal's own effect, such as KeyboardInterrupt.
+        If the call was cancelled because a signal stops the drives, raise what the signal raises, such as
+        KeyboardInterrupt.
         """
         try:
             yield

@@ -1,4 +1,4 @@
-"""CommandResult: the outcome of a command, stating only certain facts. Pure."""
+"""CommandResult: the outcome of a command, as far as it is certain. No I/O."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ from multidrop.errors import (
 
 
 class CommandOutcome(StrEnum):
-    """The end of a command; UNKNOWN unless its effect is certain."""
+    """The outcome of a command; UNKNOWN unless its effect is certain."""
 
     DONE = "done"
     FAILED = "failed"  # sent, but the drive refused it, or was seen not to do it
     REFUSED = "refused"  # forbidden by the library's rules or the plant's lists; not sent
-    NOT_SENT = "not sent"  # certainly
-    UNKNOWN = "unknown"  # it may have been carried out
-    UNDER_WAY = "under way"  # ask again
+    NOT_SENT = "not sent"  # it is certain that nothing was sent
+    UNKNOWN = "unknown"  # the command may have been carried out
+    UNDER_WAY = "under way"  # not over yet: ask again later
 
 
 class CommandResult(NamedTuple):
-    """The end of a command: `text` is one sentence for a person, `error` the library's error if it failed.
+    """The result of a command.
 
-    `held` is the value that the drive holds after a write, as text with its unit.
+    `text` is one sentence for a person, `error` the library's error if the command failed. `held` is the
+    value that the drive holds after a write, as text with its unit.
     """
 
     outcome: CommandOutcome
@@ -58,7 +59,7 @@ _OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (  # the fir
     (CancelledByStop, CommandOutcome.NOT_SENT),
     (DriveException, CommandOutcome.FAILED),
     (NotVerified, CommandOutcome.FAILED),
-    (NoReply, CommandOutcome.NOT_SENT),  # to a read before the first write
+    (NoReply, CommandOutcome.NOT_SENT),  # raised only by a read before the first write
     (BadReply, CommandOutcome.NOT_SENT),
 )
 _STOP_OUTCOMES = {

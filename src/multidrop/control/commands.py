@@ -29,24 +29,24 @@ from multidrop.drive.register import Register
 from multidrop.errors import NotAttached
 from multidrop.supervisor import supervisor
 
-COMMAND_S = 60.0  # after which a command is reported as hanging; a stop is repeated for 30 s
-AGAIN_S = 0.2  # between turns of stops that have no thread
-TURN_S = 0.2  # length of such a turn; it blocks the loop
-STOP_S = 30.0  # for which such a stop is repeated
-REPEATED_S = 30.0  # that each call is repeated, by its own stop or by others
-BEGINNING_S = 0.25  # within which a called stop may not be under way yet
+COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop may take 30 s)
+AGAIN_S = 0.2  # pause between turns of stops that have no thread
+TURN_S = 0.2  # duration of such a turn, which blocks the event loop
+STOP_S = 30.0  # how long a stop without a thread is repeated
+REPEATED_S = 30.0  # how long each called stop is repeated, by itself or by another stop of its drive
+BEGINNING_S = 0.25  # longest time from a stop's call until it is listed as under way
 
 R = TypeVar("R")
 Results = dict[str, CommandResult]  # by drive
 StopFuture = asyncio.Future[Results]
-StopWork = Callable[[float | None], Results]  # takes for how many seconds stops are repeated; None: as usual
+StopWork = Callable[[float | None], Results]  # argument: how many seconds to repeat stops (None: the default)
 
 
 # ---- on a drive ----
 
 
 def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> CommandResult:
-    """Carry out a verb that may move the motor."""
+    """Carry out a verb that may move the motor; return the result, never raise."""
     try:
         getattr(drive, verb)(**arguments)
     except Exception as failure:  # of any kind: the caller must see it
@@ -55,7 +55,7 @@ def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Com
 
 
 def write_register(drive: Drive, name: str, value: float | str) -> CommandResult:
-    """Write a register; a choice by its name or its raw count."""
+    """Write a register, and return the result, never raise. A choice is given by name or raw count."""
     try:
         register = drive.register(name)
         typed = typed_value(register, value)
@@ -71,7 +71,7 @@ def write_register(drive: Drive, name: str, value: float | str) -> CommandResult
 
 
 def typed_value(register: Register[Any], value: float | str) -> Any:
-    """Return a value as the register takes it. Raises ValueError for a raw count that is not whole."""
+    """Return a value in the register's type. Raises ValueError for a choice's number that is not whole."""
     if isinstance(value, str):
         return register.parse(value)
     if register.values is None:
@@ -82,7 +82,7 @@ def typed_value(register: Register[Any], value: float | str) -> Any:
 
 
 def stop_drive(drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive."""
+    """Stop one drive; return the result by its name."""
     try:
         drive.stop(seconds=seconds)
     except Exception as failure:  # of any kind: everybody must see it
@@ -91,7 +91,7 @@ def stop_drive(drive: Drive, seconds: float | None) -> Results:
 
 
 def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive by another verb than `stop`, such as `coast`."""
+    """Stop one drive with another verb than `stop`, such as `coast`; return the result by its name."""
     try:
         getattr(drive, verb)(seconds=seconds)
     except Exception as failure:  # of any kind: everybody must see it
@@ -100,7 +100,7 @@ def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
 
 
 def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | None) -> Results:
-    """Stop all drives of a line; `bus` returns its bus, `names` are those of the drives meant."""
+    """Stop all drives of the line whose bus `bus` returns; return the results of the drives `names`."""
     try:
         found: Mapping[str, Stopped] = bus().stop_all(seconds=seconds)
     except Exception as failure:  # of any kind: everybody must see it
@@ -113,7 +113,7 @@ def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | Non
 
 
 def in_thread(work: Callable[[], R]) -> asyncio.Future[R]:
-    """Do work in a thread of its own, to its end even if its caller is cancelled.
+    """Do work in a new thread; it continues to its end even if its caller is cancelled.
 
     Raises RuntimeError or MemoryError if the system has no thread left.
     """
@@ -125,10 +125,11 @@ def begin_command(
     limit_ns: Callable[[], float],
     why_not: Callable[[], CommandResult | None],
 ) -> asyncio.Future[CommandResult]:
-    """Carry out a command in a thread, if its first frame leaves before `limit_ns` (CLOCK_MONOTONIC).
+    """Carry out a command in a thread; return a future for its result.
 
-    `why_not` is called in that thread; if it returns a result, that is the end. If the system has no thread
-    left, the result is NOT_SENT.
+    `limit_ns` returns the time of CLOCK_MONOTONIC after which the command's first frame is not sent.
+    `why_not` is called first in that thread; if it returns a result, the command is not carried out. If the
+    system has no thread left, the result is NOT_SENT.
     """
 
     def checked() -> CommandResult:
@@ -148,7 +149,7 @@ def begin_command(
 def begin_stops(works: Sequence[StopWork]) -> list[asyncio.Future[Results]]:
     """Start stops, each in a thread of its own; return a future for each.
 
-    Without a thread a stop is sent all the same: those that are left share one task in the loop.
+    If the system has no thread left, the remaining stops share one task in the event loop.
     """
     begun: list[asyncio.Future[Results]] = []
     try:
@@ -158,14 +159,15 @@ def begin_stops(works: Sequence[StopWork]) -> list[asyncio.Future[Results]]:
     except (RuntimeError, MemoryError):
         left = works[len(begun) :]
         rest = supervisor().start("stop", _stop_without_threads(left))
-        begun += [asyncio.shield(rest) for _ in left]  # it goes on if its callers are cancelled
+        begun += [asyncio.shield(rest) for _ in left]  # the task continues if its callers are cancelled
     return begun
 
 
 async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
-    """Send all stops before waiting for any motor; then repeat them in turns, or in threads that come free.
+    """Send all stops once before waiting for any motor; then repeat them in turns.
 
-    The loop runs between them: a fleet's gateway must renew the lease without which it may not send a stop.
+    As soon as the system has a thread again, a stop continues in one. The event loop runs between the turns,
+    because a fleet's gateway must renew the lease without which it may not send a stop.
     """
     loop = asyncio.get_running_loop()
     found: Results = {}
@@ -193,17 +195,18 @@ async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
 
 
 class LineStop(NamedTuple):
-    """Drives of one line to stop; `whole` stops all of its drives, None if these are not all."""
+    """Drives of one line to stop. `whole` stops all drives of the line; None if `drives` are only some."""
 
     drives: Sequence[Drive]
     whole: StopWork | None = None
 
 
 class RepeatedStops:
-    """Repeats one stop of a drive at a time, however many clients of a server call one; in its loop.
+    """Repeats only one stop per drive at a time, however many clients of a server call one.
 
-    The stop of a silent drive is repeated for 30 s, and each time its line waits for the reply. If every call
-    were repeated, they would delay the stops of other drives, and all reads. `stop` stops one drive.
+    The stop of a silent drive is repeated for 30 s, and each time its line waits for the reply. If the stop
+    of every call were repeated, this would delay the stops of other drives, and all reads. `stop` stops one
+    drive. Use it only in the server's event loop.
     """
 
     def __init__(
@@ -213,13 +216,16 @@ class RepeatedStops:
     ) -> None:
         self._stop = stop
         self._begin = begin
-        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # the newest, and when it was called
-        self._sent: dict[Drive, StopFuture] = {}  # sent once
-        self._waiting: dict[Drive, StopFuture] = {}  # until the one before has its answer
+        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # newest repeated stop, time of its call
+        self._sent: dict[Drive, StopFuture] = {}  # stops that are sent once, in flight
+        self._waiting: dict[Drive, StopFuture] = {}  # stops to send once after the one in flight
         self._tasks: set[StopFuture] = set()
 
     def begin(self, lines: Iterable[LineStop]) -> list[StopFuture]:
-        """Stop these drives side by side; of a drive whose stop is already repeated, send one more."""
+        """Stop these drives in parallel; return the futures of the stops.
+
+        If a drive's stop is already being repeated, send only one more stop to that drive.
+        """
         works: list[StopWork] = []
         stopped: list[list[Drive]] = []
         once: list[Drive] = []
@@ -238,14 +244,14 @@ class RepeatedStops:
         return [*begun, *(self.send_once(drive) for drive in once)]
 
     def note(self, drives: Iterable[Drive], stops: StopFuture) -> None:
-        """Note that a repeated stop of these drives is under way."""
+        """Record that `stops` is repeating the stops of these drives."""
         self._repeated = {drive: one for drive, one in self._repeated.items() if not one[0].done()}
         self._repeated |= dict.fromkeys(drives, (stops, _now()))
 
     def of(self, drive: Drive) -> StopFuture | None:
-        """Return the repeated stop of this drive, if one is under way.
+        """Return the future that is repeating this drive's stop; None if there is none.
 
-        A whole line's stop may be over for this drive, and go on for others alone.
+        A whole line's stop may be over for this drive and continue only for others; then it is None too.
         """
         stops, called = self._repeated.get(drive, (None, 0.0))
         if stops is None or stops.done():
@@ -255,18 +261,18 @@ class RepeatedStops:
         return stops if goes_on or _now() - called < BEGINNING_S else None
 
     def divided(self, drives: Iterable[Drive]) -> tuple[list[Drive], list[Drive]]:
-        """Return the drives whose stop must be started, and those whose stop is sent once more."""
+        """Divide drives into those whose stop must be started, and those whose stop is already repeated."""
         drives = [*drives]
         again = [drive for drive in drives if self.of(drive) is not None]
         return [drive for drive in drives if drive not in again], again
 
     def send_once(self, drive: Drive) -> StopFuture:
-        """Send a stop once more, and return the result of the repeated one.
+        """Send one more stop; return a future for the result of the repeated stop.
 
-        If that one is given up before this call's time is over, another one is repeated in its place.
+        If the repeated stop gives up before REPEATED_S after this call, start another one.
         """
         task = asyncio.ensure_future(self._send_and_await(drive))
-        self._tasks.add(task)  # it goes on if its caller is cancelled
+        self._tasks.add(task)  # the task continues if its caller is cancelled
         task.add_done_callback(self._tasks.discard)
         return asyncio.shield(task)
 
@@ -283,7 +289,7 @@ class RepeatedStops:
         return {drive.name: result}
 
     def _soon(self, drive: Drive) -> StopFuture:
-        """Send it now; or once the frame before it is answered, together with all that wait for that."""
+        """Send a stop now; if one is in flight, send one after it for all calls that wait."""
         if drive not in self._sent:
             return self._send(drive)
         if drive not in self._waiting:
@@ -298,7 +304,7 @@ class RepeatedStops:
 
     async def _send_after(self, before: StopFuture, drive: Drive) -> Results:
         await asyncio.wait([before])
-        del self._waiting[drive]  # later callers are sent after this one
+        del self._waiting[drive]  # a later call needs another stop, sent after this one
         return await self._send(drive)
 
     def _forget(self, drive: Drive, sent: StopFuture) -> None:

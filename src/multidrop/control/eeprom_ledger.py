@@ -29,7 +29,7 @@ LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPR
 class LedgerCell:
     """One register of one drive in a ledger.
 
-    `port` is the port's identity (see port_identity), `spelt` its name, which older entries use.
+    `port` is the port's identity (see port_identity). `spelt` is the port's name, as in older entries.
     """
 
     port: str
@@ -41,7 +41,7 @@ class LedgerCell:
 
 @dataclass(frozen=True)
 class Wear:
-    """The writes of a cell, counted at some time."""
+    """The number of writes to a cell."""
 
     cell: LedgerCell
     writes: int  # in all
@@ -52,7 +52,7 @@ class Wear:
 def default_path() -> Path:
     """Return the path for state that survives restarts (XDG base directory specification).
 
-    A user without a home, as in a container, gets a path that cannot be written; stops do not need it.
+    A user without a home, as in a container, gets a path that cannot be written. Stops work without it.
     """
     try:
         state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
@@ -76,10 +76,11 @@ class Ledger:
         return self
 
     def enter(self, cell: LedgerCell, now: float, least_interval: float) -> str:
-        """Count a write that is about to be sent; or return why it must not be sent, without counting it.
+        """Count a write that is about to be sent, and return "".
 
-        Check and entry are one transaction, so two processes cannot both use the last of the budget. Raises
-        OSError if the file cannot be kept.
+        If the write must not be sent, return the reason and do not count it. `now` is UTC in s;
+        `least_interval` is the shortest time in s between two writes. Check and count are one transaction, so
+        two processes cannot both use the last of the budget. Raises OSError if the file cannot be written.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
@@ -100,9 +101,9 @@ class Ledger:
         return ""
 
     def note(self, cells: Sequence[LedgerCell], now: float) -> None:
-        """Count stops, which no budget limits, in one transaction.
+        """Count stops in one transaction, without a limit.
 
-        Waits if another process has locked the file. Raises OSError if the file cannot be kept.
+        Waits up to 5 s if another process has locked the file. Raises OSError if it cannot be written.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
@@ -110,7 +111,7 @@ class Ledger:
             ledger.commit()
 
     def wear(self, now: float) -> list[Wear]:
-        """Return every cell that was ever written, the most written in the last year first."""
+        """Return every cell ever written, sorted by writes in the last year, most first."""
         if not self.path.exists():
             return []
         with self._opened() as ledger:
@@ -122,7 +123,10 @@ class Ledger:
         return sorted(found, key=_by_wear)
 
     def wear_of(self, port: str, address: int, model: str, now: float) -> list[Wear]:
-        """Return the cells of one drive, at a port of this name or identity; `model` is its `ledger_name`."""
+        """Return the wear of one drive's cells.
+
+        `port` is the port's name or identity, `model` the drive's `ledger_name`, `now` UTC in s.
+        """
         place = (of_name(port), address, model)
         return [one for one in self.wear(now) if (one.cell.port, one.cell.address, one.cell.model) == place]
 

@@ -1,7 +1,8 @@
-"""ExitHook: stop the drives of all buses that asked for it before this process ends.
+"""ExitHook: before this process ends, stop the drives of all buses with `stop_on_exit`.
 
-A process has one, for its exit and for SIGINT, SIGTERM and SIGHUP. A signal only starts the last acts, which
-run in threads of their own: a handler that waited for them could wait for a lock of the thread it interrupts.
+A process has one hook, for its exit and for SIGINT, SIGTERM and SIGHUP. The signal handler only starts the
+last acts, which run in threads of their own. It does not wait for them, because they may need a lock that the
+interrupted thread holds.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from multidrop.core.fork import register_at_fork
 from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-IMPATIENT = 3  # signals within a second that give up waiting for the stops
-HANDLING_S = 0.05  # the longest time until a signal is handled
+IMPATIENT = 3  # number of signals within a second that end the wait for the stops
+HANDLING_S = 0.05  # longest time until a signal is handled
 PACKAGE = __name__.partition(".")[0]
-MOST_NAMES = 20  # of drives in a message
+MOST_NAMES = 20  # limit of drives named in a message
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
 REPLACED = (
     "%s will not stop the drives: the program has set its own handler since. They are stopped when the bus "
@@ -37,9 +38,9 @@ STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives u
 
 
 def _ending() -> tuple[signal.Signals, ...]:
-    """Return the signals to take.
+    """Return the signals to handle.
 
-    SIGHUP, of a terminal that was closed, is one unless the program handles it or nohup ignores it.
+    They include SIGHUP (the terminal was closed) unless the program handles it or nohup ignores it.
     """
     if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
         return (*_SIGNALS, signal.SIGHUP)
@@ -47,7 +48,7 @@ def _ending() -> tuple[signal.Signals, ...]:
 
 
 def _send(number: int, ident: int) -> None:
-    """Send the signal to the main thread, which is where Windows always delivers it."""
+    """Send the signal to the main thread. On Windows, signals always go to the main thread."""
     if sys.platform == "win32":
         signal.raise_signal(number)
     else:
@@ -55,7 +56,7 @@ def _send(number: int, ident: int) -> None:
 
 
 def _print_error(sentence: str) -> None:
-    """Write a sentence to standard error at once; skip it if that is closed or would block."""
+    """Write a sentence to standard error, unbuffered; skip it if standard error is closed or would block."""
     with suppress(OSError, ValueError):
         if sys.platform == "win32" or select.select([], [2], [], 0)[1]:
             os.write(2, f"multidrop: {sentence}\n".encode(errors="backslashreplace"))
@@ -70,9 +71,9 @@ _log = logging.getLogger("multidrop.control")
 
 
 class LastAct:
-    """Work that is done once at the end, by a thread that already waits for it.
+    """Work that is done once at the process's end, by a thread that is started in advance.
 
-    `drives` returns the names of the drives that it stops.
+    `drives` returns the names of the drives that the work stops.
     """
 
     def __init__(
@@ -86,9 +87,9 @@ class LastAct:
         self._on_begin = begin
         self._work = work
         self._on_over = over
-        self._calls: SimpleQueue[None] = SimpleQueue()  # unlike an Event, a signal handler may use it
+        self._calls: SimpleQueue[None] = SimpleQueue()  # unlike an Event, safe in a signal handler
         self._over = threading.Event()
-        self.is_cut_short = False  # the wait for it was given up
+        self.is_cut_short = False  # whether a signal ended the wait for the work
         threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
 
     @property
@@ -96,18 +97,18 @@ class LastAct:
         return self.is_cut_short or self._over.is_set()
 
     def begin(self) -> None:
-        """Start it without waiting."""
+        """Start the work without waiting."""
         self._on_begin()
         self._calls.put(None)
 
     def finish(self) -> None:
-        """Start it, and wait until it is done."""
+        """Start the work, and wait until it is done."""
         self.begin()
-        while not self.is_over:  # handle signals that other threads received
+        while not self.is_over:  # short waits, so that signals received by other threads are handled
             self._over.wait(HANDLING_S)
 
     def forget(self) -> None:
-        """Give it up in the child of a fork; the parent does it."""
+        """Mark the work as given up in a forked child; the parent does the work."""
         self._over = threading.Event()
         self.is_cut_short = True
 
@@ -123,17 +124,17 @@ class LastAct:
 
 
 class ExitHook:
-    """Starts all last acts at exit or on a signal, and holds the signal until they are over.
+    """Starts all last acts at exit or on a signal, and delays the signal's effect until they are over.
 
-    Standard error says at once which drives are being stopped, and how to give up. After the stops the signal
-    has its earlier effect; IMPATIENT signals within a second cut the wait short.
+    Standard error immediately says which drives are being stopped, and how to end the wait. After the stops
+    the signal has the effect it had before this hook. IMPATIENT signals within a second end the wait.
     """
 
     def __init__(self) -> None:
-        self._acts: list[LastAct] = []  # changed in one step, because any thread may add and remove lines
-        self._before: dict[signal.Signals, Any] = {}  # their handlers before ours
+        self._acts: list[LastAct] = []  # changed atomically, because any thread may add and remove acts
+        self._before: dict[signal.Signals, Any] = {}  # the handlers before ours
         self._has_taken = False
-        self._held: int | None = None  # the first signal
+        self._held: int | None = None  # the first signal, while its effect is delayed
         self._came: list[float] = []  # times of recent signals
         self._passing = threading.Lock()
         self._has_passed = False
@@ -156,13 +157,13 @@ class ExitHook:
     ) -> LastAct:
         """Do `work` before the process ends; `begin` is called first, possibly in a signal handler.
 
-        Raises ValueError outside the main thread, unless the signals are already taken.
+        Raises ValueError outside the main thread, unless our signal handlers are already installed.
         """
         self.take_signals()
         act = LastAct(begin, work, self._one_is_over, drives)
         self._acts.append(act)
         try:
-            self.take_signals()  # another bus may have returned them at its end
+            self.take_signals()  # another bus that was closed meanwhile may have restored the old handlers
         except ValueError:
             self._acts.remove(act)
             raise
@@ -172,33 +173,33 @@ class ExitHook:
         return act
 
     def take_signals(self) -> None:
-        """Install our handler; the one before it is called after the stops.
+        """Install our signal handlers; the earlier handlers are called after the stops.
 
-        Raises ValueError outside the main thread, unless the signals are already taken.
+        Raises ValueError outside the main thread, unless ours are already installed.
         """
         if self._has_taken and threading.current_thread() is not threading.main_thread():
             return
         for number in _ending():
             had = signal.getsignal(number)
             if had != self._on_signal:
-                self._before[number] = had  # first, because the signal may come at once
+                self._before[number] = had  # before installing ours: the signal may arrive immediately
                 signal.signal(number, self._on_signal)
         self._has_taken = True
 
     def _warn_of_replaced(self) -> None:
-        """Log which of the signals stop no drive because the program has set its own handler since."""
+        """Log which signals will not stop drives, because the program has replaced our handler."""
         if lost := [number.name for number in _SIGNALS if signal.getsignal(number) != self._on_signal]:
             _log.warning(REPLACED, " and ".join(lost))
 
     def finish(self, act: LastAct) -> None:
-        """Do it now, and remove it."""
+        """Carry out a last act now, and remove it."""
         act.finish()
         with suppress(ValueError):  # another thread has already removed it
             self._acts.remove(act)
         self.rest()
 
     def rest(self) -> None:
-        """In the main thread, restore the handlers if no last act is left."""
+        """If no last act is left, restore the earlier handlers. Does nothing outside the main thread."""
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
             if self._acts:  # another one was added in between
@@ -212,7 +213,7 @@ class ExitHook:
             act.finish()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Start the last acts. Takes no lock, because the main thread may hold it."""
+        """Start the last acts. Takes no lock that the interrupted main thread may hold."""
         now = time.monotonic()
         if number in _SIGNALS:  # a closing terminal may send several SIGHUPs
             self._came = [*(at for at in self._came if now - at < 1.0), now]
@@ -234,7 +235,7 @@ class ExitHook:
             self._pass_on(number, frame)
 
     def _one_is_over(self) -> None:
-        """Once all last acts are over, send the held signal to the main thread."""
+        """Once all last acts are over, send the delayed signal to the main thread."""
         with self._passing:
             held, ident = self._held, threading.main_thread().ident
             if self._has_passed or held is None or ident is None:
@@ -245,16 +246,19 @@ class ExitHook:
         _send(held, ident)
 
     def await_effect(self) -> None:
-        """In the main thread, wait until a held signal has its effect, such as KeyboardInterrupt."""
+        """Wait until a delayed signal has its effect, such as KeyboardInterrupt.
+
+        Does nothing outside the main thread.
+        """
         if threading.current_thread() is not threading.main_thread():
             return
         while self._held is not None:
             time.sleep(HANDLING_S)
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
-        """Give the signal its earlier effect.
+        """Give the signal the effect it had before this hook.
 
-        If the program has set a handler since, which called ours, that one is not called again.
+        If the program has since installed a handler that calls ours, do not call that handler again.
         """
         installed, before = signal.getsignal(number), self._before.get(signal.Signals(number))
         self._let_go()
@@ -278,9 +282,9 @@ class ExitHook:
 
 
 def without_internals(interruption: BaseException) -> None:
-    """Cut an interruption's traceback before its first frame of this package.
+    """Cut an interruption's traceback before the first frame of this package.
 
-    A command that the stops cancelled is not shown as its cause.
+    Also remove a BusError as its context: such a call was only cancelled by the stops.
     """
     if isinstance(interruption.__context__, BusError):
         interruption.__context__ = None
@@ -292,13 +296,13 @@ def without_internals(interruption: BaseException) -> None:
 
 
 def give_signals_back() -> None:
-    """In the main thread, restore the handlers if no bus has to be stopped at exit."""
+    """If no bus has to be stopped at exit, restore the earlier signal handlers (main thread only)."""
     if _hook is not None:
         _hook.rest()
 
 
 def await_signal() -> None:
-    """In the main thread, wait until a signal that started the stops has its effect."""
+    """Wait until a signal that started stops has its effect (main thread only)."""
     if _hook is not None:
         _hook.await_effect()
 

@@ -1,7 +1,7 @@
 """IdentityCheck and EchoCheck: find out which device answers at a drive's address.
 
-IdentityCheck confirms that it is of its declared family. EchoCheck distinguishes a drive's confirmation from
-its adapter's echo: many confirmations are copies of their requests, and so is an echo.
+IdentityCheck confirms that the device is of its declared family. EchoCheck tells a drive's confirmation from
+its adapter's echo, because many confirmations are, like an echo, copies of their requests.
 """
 
 from __future__ import annotations
@@ -30,20 +30,23 @@ from multidrop.families import MODELS
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 
-SURE = 2  # times that a drive must answer like another family before a stop is withheld
+SURE = 2  # number of checks in a row that must find another family before a stop is withheld
 
 Timed = Callable[[], AbstractContextManager[None]]
-Suspicion = tuple[str, bool]  # why it may be of another family; whether that is certain
+Suspicion = tuple[str, bool]  # why a drive may be of another family; whether that is certain
 
 
 class EchoCheck:
-    """Reads from drives that show whether the line's adapter repeats what it sends."""
+    """Reads registers to find out whether the line's adapter echoes what it sends."""
 
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
 
     def read_any(self, drive: Drive, attempts: int, *, insists: bool = False, timeout: float = 0.0) -> None:
-        """Read one register: its reply is never a copy of its request. An exception is a reply too."""
+        """Read one register, because a read's reply is never a copy of its request.
+
+        A Modbus exception counts as a reply. Does nothing if the drive has no readable register.
+        """
         readable = (register for register in drive.registers.values() if register.readable)
         register = drive.echo_probe or next(readable, None)
         if register is not None:
@@ -51,19 +54,19 @@ class EchoCheck:
                 self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
 
     def probe(self, drive: Drive, *, insists: bool = False) -> None:
-        """Read once, so that the line learns whether the copy of a request was an echo.
+        """Read a register once, so that the line learns whether a received copy of a request was an echo.
 
-        Another client that sends the same request looks like an echo. Without this read the line would then
-        ignore the drive's confirmations of writes, which are copies too.
+        The same request from another client looks like an echo. Without this read, the line would then take
+        the drive's confirmations of writes, which are also copies, for echoes and ignore them.
         """
         with suppress(NoReply, BadReply, LineError, NotAttached, NotMaster):
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
 
     def why_doubtful(self, drive: Drive) -> str:
-        """Return why the reply to a write may be the adapter's echo; "" if it is not.
+        """Return why the reply to a write may be the adapter's echo; "" if it is the drive's.
 
-        An echo may start at any time, and the drive may be dead, so a register is read after the write. If
-        the adapter is known to echo, the core has already distinguished the two.
+        An adapter may start to echo at any time while the drive is dead, so a register is read after the
+        write. If the adapter is known to echo, the core has already separated echo and reply.
         """
         line = self._exchanges.line
         if line.has_echo:
@@ -76,17 +79,17 @@ class EchoCheck:
 
 
 class _Confirmed(NamedTuple):
-    """The circumstances when a drive was confirmed to be of its family."""
+    """The line's state when a drive was confirmed to be of its family."""
 
-    port: object  # as it was opened
-    silences: int  # unanswered requests until then
-    pauses: int  # pauses in polling until then
+    port: object  # the open port; another object after it is reopened
+    silences: int  # number of unanswered requests until then
+    pauses: int  # number of pauses in polling until then
     at_ns: int
-    slept_ns: int  # time that the machine had slept
+    slept_ns: int  # time that the computer had slept until then
 
 
 class IdentityCheck:
-    """The drives that were checked since their port was opened."""
+    """Checks drives against their declared family, and remembers the results until the port is reopened."""
 
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges
@@ -100,7 +103,7 @@ class IdentityCheck:
         return last is not None and last.port is self._exchanges.line.queue
 
     def _was_heard(self, drive: Drive) -> bool:
-        """Return True if it was confirmed on this port, and was never silent for PAUSE_NS since."""
+        """Return True if the drive was confirmed on this port, and not silent for PAUSE_NS since then."""
         last = self._known.get(drive)
         if last is None or last.port is not self._exchanges.line.queue:
             return False
@@ -109,7 +112,7 @@ class IdentityCheck:
         return last.pauses == peer.pauses and idle_ns + _slept_ns() - last.slept_ns < PAUSE_NS
 
     def _has_answered_all(self, drive: Drive) -> bool:
-        """Return True if it answered every request since it was confirmed."""
+        """Return True if the drive answered every request since it was confirmed."""
         last = self._known.get(drive)
         return last is not None and last.silences == self._exchanges.peer(drive).silences
 
@@ -121,11 +124,12 @@ class IdentityCheck:
     # ---- before a write that may move a motor ----
 
     def check(self, drive: Drive, timed: Timed = nullcontext) -> None:
-        """Check once. Raises WriteForbidden if it is of another family, NoReply if it does not answer.
+        """Check that the drive is of its declared family, unless the last check still holds.
 
-        Reads at least one value, so that an adapter's echo is detected before it could pass for the drive's
-        confirmation. The check is repeated after the port was reopened, after a missing reply, and after
-        PAUSE_NS without a reply, because the drive may have been replaced. Each read is within `timed`.
+        Raises WriteForbidden if the drive is of another family, NoReply if it does not answer. A check no
+        longer holds if the port was reopened, a reply was missing, or the drive was silent for PAUSE_NS: it
+        may have been replaced. Reads at least one value, so that an adapter's echo is detected before it
+        could pass for the drive's confirmation. Each read is within a block of `timed`.
         """
         was_heard = self._was_heard(drive)
         if was_heard and self._has_answered_all(drive):
@@ -152,7 +156,7 @@ class IdentityCheck:
         self._know(drive, port, silences, was_heard=was_heard)
 
     def _know(self, drive: Drive, port: object, silences: int, *, was_heard: bool) -> None:
-        """Note that it was confirmed now; `was_heard` if it never fell silent before."""
+        """Record that the drive was confirmed now; `was_heard` is False if it was silent before."""
         before, pauses = self._known.get(drive), self._exchanges.peer(drive).pauses
         if not was_heard or before is None or before.pauses != pauses:
             _forget_setpoint(drive)
@@ -166,15 +170,15 @@ class IdentityCheck:
     # ---- before a stop ----
 
     def check_before_stop(self, drive: Drive) -> None:
-        """Check once, without waits. Raises WriteForbidden only on proof of another family.
+        """Check once per open port, without waits. Raises WriteForbidden only on proof of another family.
 
         Raises CheckAgain after the first suspicion: call this again after the stops of other drives.
 
-        The stop of one family may be another's run. But a failed check is no proof: a parameter such as an
-        address or a baud rate may hold a value that is not in force, and a reply may belong to an earlier
-        request. Then the stop is sent. It is withheld only if `identify` fails SURE times in a row, every
-        request was answered so far, and either another built-in family recognises the drive, or `identify`
-        itself is certain: it raised WriteForbidden with the rule ANOTHER_FAMILY.
+        A stop word of one family may mean run in another. But a failed check is not proof: a parameter such
+        as an address or a baud rate may hold a value that is not in force yet, and a reply may belong to an
+        earlier request. In such a case the stop is sent. The stop is withheld only if `identify` fails SURE
+        times in a row, every request was answered so far, and either another built-in family recognises the
+        drive, or `identify` is certain (it raised WriteForbidden with the rule ANOTHER_FAMILY).
         """
         port = self._exchanges.line.queue
         if self.is_known(drive) or self._stoppable.get(drive, self) is port:
@@ -191,7 +195,7 @@ class IdentityCheck:
         self._stoppable[drive] = port
 
     def _is_in_step(self, drive: Drive) -> bool:
-        """Return True if a reply from its address can only belong to the present request."""
+        """Return True if a reply from the drive's address can only belong to the present request."""
         peer = self._exchanges.peer(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
@@ -230,7 +234,7 @@ class IdentityCheck:
         for family in MODELS.values():
             if isinstance(drive, family) or not family.identify_recognises:
                 continue
-            with suppress(ValueError):  # it cannot be on this line
+            with suppress(ValueError):  # a drive of that family cannot be on this line
                 other = family(
                     drive.address, framing=drive.framing, baudrate=settings.baudrate, format=settings.format
                 )
@@ -260,7 +264,7 @@ def _forget_setpoint(drive: Drive) -> None:
 
 
 def _slept_ns() -> int:
-    """Return for how long the machine has slept so far."""
+    """Return how long the computer has slept since it was started, in ns."""
     return int(clock.boottime_ns() - clock.now_ns())
 
 

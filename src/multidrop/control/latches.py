@@ -18,7 +18,7 @@ POLL_S = 0.005  # between checks for the end of stops
 
 
 class Latches:
-    """A latch for each drive of a bus, and the stops under way."""
+    """The latches of a bus's drives, one per drive, and the bus's unfinished stops."""
 
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
@@ -27,7 +27,7 @@ class Latches:
         self._forget_stops()
 
     def _forget_stops(self) -> None:
-        # by stop: the number of its thread, and its drives
+        # for each unfinished stop: the identifier of its thread, and its drives
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
@@ -42,12 +42,12 @@ class Latches:
         return latch
 
     def end(self, drives: Iterable[Drive]) -> None:
-        """Cancel all calls that move these drives before their removal, and refuse new ones."""
+        """Cancel all calls that move these drives, and refuse new ones, before the drives are removed."""
         for drive in drives:
             self.latch(drive).shut(REMOVED)
 
     def remove(self, drive: Drive) -> None:
-        """Cancel this drive's calls, and wait for its stops under way."""
+        """Cancel this drive's calls, wait for its unfinished stops, and remove its latch."""
         self.end([drive])
         self.await_stops([drive])
         self._latches.pop(drive, None)
@@ -59,7 +59,7 @@ class Latches:
             latch.shut(LEFT)
 
     def await_stops(self, drives: Collection[Drive] | None = None) -> None:
-        """Wait for the stops of some drives, or all; the calling thread's own stops do not count."""
+        """Wait until these drives (by default all) have no unfinished stop of another thread."""
         own, asked = threading.get_ident(), None if drives is None else frozenset(drives)
         while any(
             thread != own and (asked is None or not asked.isdisjoint(stopped))
@@ -81,10 +81,10 @@ class Latches:
             self.latch(drive).rise(STOPPED)
 
     def begin(self, stop: object, drives: Sequence[Drive]) -> None:
-        """Cancel the calls of these drives, refuse new ones and keep the drives attached, until `over`.
+        """Start a stop: until `over`, cancel and refuse calls of these drives, and keep the drives attached.
 
-        May be repeated. Neither this nor `over` takes a lock, and a signal's exception comes between their
-        steps, never within one.
+        May be repeated. Neither `begin` nor `over` takes a lock. Each step of them is atomic, so an exception
+        that a signal handler raises leaves no step half done.
         """
         self._stops[stop] = threading.get_ident(), frozenset(drives)
         for drive in drives:
@@ -92,7 +92,7 @@ class Latches:
                 latch.hold(stop, STOPPED)
 
     def over(self, stop: object) -> None:
-        """Release the drives. May be repeated, and called without `begin`."""
+        """End a stop, and accept calls of its drives again. May be repeated, and called without `begin`."""
         for latch in [*self._latches.values()]:
             latch.let_go(stop)
         self._stops.pop(stop, None)

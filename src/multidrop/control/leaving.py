@@ -37,7 +37,10 @@ class Leaving:
         return self._last_act is not None
 
     def stop_on_exit(self) -> None:
-        """Stop all drives at the end. Raises ValueError outside the main thread, the first time."""
+        """Stop all drives when the bus is closed or the process ends.
+
+        The first call raises ValueError outside the main thread.
+        """
         if self._last_act is None:
             self._last_act = exit_hook().add(
                 self._latches.shut,
@@ -46,13 +49,13 @@ class Leaving:
             )
 
     def begin(self) -> None:
-        """Cancel all calls, and start to stop the drives if `stop_on_exit` was called."""
+        """Cancel all calls; if `stop_on_exit` was called, start stopping the drives without waiting."""
         self._latches.shut()
         if self._last_act is not None:
             self._last_act.begin()
 
     def finish(self) -> None:
-        """Do the same, and wait for all stops under way."""
+        """Do the same as `begin`, and wait for all unfinished stops."""
         self.begin()
         if self._last_act is not None:
             exit_hook().finish(self._last_act)
@@ -60,9 +63,9 @@ class Leaving:
             self._latches.await_stops()
 
     def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
-        """Cancel the calls of drives that are about to be detached, and wait for their stops.
+        """Cancel the calls of drives that are about to be detached, and wait for their unfinished stops.
 
-        The drives `to_stop` are stopped first if `stop_on_exit` was called.
+        If `stop_on_exit` was called, stop the drives `to_stop` before that wait.
         """
         self._latches.end(drives)  # before the stops: a start after them would not be stopped
         if to_stop and self.stops:

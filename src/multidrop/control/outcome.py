@@ -14,14 +14,15 @@ class Effect(Enum):
     DONE = "done"
     TAKEN_AS = "taken as"  # the drive holds another value
     REFUSED = "refused by the drive"
-    UNCONFIRMED = "unconfirmed"  # no answer: it may have happened
+    UNCONFIRMED = "unconfirmed"  # no reply: the write may have had its effect
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One write's effect: `held` is the value read back, None if that is not possible.
+    """The effect of one write.
 
-    `failure` is the error that `Drive.write` raises for it.
+    `asked` is the value written, `held` the value read back (None if it could not be read). `failure` is the
+    error that `Drive.write` raises for this outcome.
     """
 
     drive: str
@@ -55,15 +56,15 @@ class Outcome:
 
 
 class Seen(Enum):
-    STOPPED = "stopped"  # and seen to stand still
+    STOPPED = "stopped"  # the motor was seen to stand
     SENT = "sent but unknown"
-    REFUSED = "refused by the drive"  # each time that it was sent
+    REFUSED = "refused by the drive"  # every time it was sent
     FAILED = "failed"  # no stop was sent
 
 
 @dataclass(frozen=True)
 class Stopped:
-    """One drive's stop: its result, its duration, and why the motor was not seen to stop."""
+    """The result of one drive's stop, its duration in s, and why the motor was not seen to stop."""
 
     drive: str
     seen: Seen

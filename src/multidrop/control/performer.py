@@ -34,7 +34,7 @@ from multidrop.transport.exchange import Exchanges
 _log = logging.getLogger("multidrop.control")
 
 
-# failures of a read, which leave the effect of the write before it unknown
+# if a read fails with one of these, the effect of the write before that read is unknown
 _ENDING = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 
 
@@ -43,7 +43,10 @@ class _Over(Exception):
 
 
 class Performer:
-    """Carries out scripts on one bus; a write must be sent within `expiry` seconds of its call."""
+    """Carries out scripts on one bus.
+
+    A write expires if it cannot be sent within `expiry` seconds of its call.
+    """
 
     def __init__(
         self, exchanges: Exchanges, writer: Writer, stopper: Stopper, latches: Latches, expiry: float
@@ -55,9 +58,9 @@ class Performer:
         self._expiry = expiry
 
     def call(self, drive: Drive, verb: str = "", seen: int | None = None) -> Call:
-        """Return a new call; a stop from now on cancels its writes, and its time starts now.
+        """Return a new call that expires from now on, and that any stop of the drive from now on cancels.
 
-        `seen` is the drive's number of stops so far, if the call started earlier.
+        For a call that started earlier, `seen` is the drive's number of stops at that time.
         """
         permit = self._latches.latch(drive).permit(seen)
         if self._latches.is_shut:
@@ -65,9 +68,10 @@ class Performer:
         return Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
 
     def move(self, script: Script[Any], call: Call) -> Any:
-        """Carry out a verb that may move the motor; a stop ends it at any step.
+        """Carry out the script of a verb that may move the motor; return the script's result.
 
-        Raises CancelledByStop if a stop came before the first write, Unconfirmed if it came later.
+        Raises CancelledByStop if a stop was called before the script's first write, and Unconfirmed if one
+        was called after it.
         """
         with call.noted():
             call.check(f"the {call.verb}")
@@ -83,7 +87,10 @@ class Performer:
             return result
 
     def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
-        """Carry out a plain write. One that stops the motor is sent at once, past all other rules."""
+        """Carry out a plain write; return its outcome.
+
+        A write that stops the motor cancels other calls, and is sent immediately and without other checks.
+        """
         raw = raw_count(drive, register, value)
         check_plain(drive, register, raw)
         step = Write(register, value)
@@ -108,7 +115,7 @@ class Performer:
             return self._writer.raw(drive, request, call)
 
     def check_identity(self, drive: Drive) -> None:
-        """Check once that a drive is of its family; the first check also logs its watchdog."""
+        """Check that a drive is of its declared family, unless it is known; also log its watchdog."""
         if not self._writer.identity_check.is_known(drive):
             self._look_at_identity(drive, self.call(drive))
 
@@ -121,7 +128,10 @@ class Performer:
                 _log.info("%s: %s", drive.name, self.watchdog(drive))
 
     def watchdog(self, drive: Drive) -> str:
-        """Return a sentence on what the motor does if this client dies, as far as the drive says."""
+        """Return a sentence on what the motor does if this client dies.
+
+        It uses the drive's `communication_timeout` if that can be read, else the family's text.
+        """
         register = drive.registers.get("communication_timeout")
         if register is None or not register.readable:
             return drive.watchdog
@@ -134,10 +144,10 @@ class Performer:
         return f"its watchdog ({register.name}) acts {register.format(held)} after the last message"
 
     def perform(self, script: Script[Any], call: Call) -> Any:
-        """Carry out a script's steps.
+        """Carry out a script's steps; return its result.
 
-        If a read fails after a write, raises Unconfirmed: NoReply would mean that the write was not sent,
-        and DriveException that the drive refused it.
+        Raises Unconfirmed if a read fails after a write. The read's own error would mislead: NoReply means
+        that the write was not sent, and DriveException that the drive refused the write.
         """
         unseen: list[Exception] = []  # failures of steps other than writes
         cancelled: list[CancelledByStop] = []
@@ -177,9 +187,10 @@ class Performer:
 
 
 def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
-    """End a script after a stop was called: at its next write, or at any step if it may move a motor.
+    """Raise CancelledByStop in the script if a stop was called, and _Over if the script continues anyway.
 
-    A harmless write may still follow: it undoes an earlier one.
+    A verb's script ends at any step, another script at its next write. An `Insist` step is always carried
+    out, because it is harmless and undoes an earlier write.
     """
     if isinstance(step, Insist) or not (call.verb or isinstance(step, Write)) or call.permit.is_good:
         return

@@ -1,4 +1,4 @@
-"""Staggered starts of several motors, and setpoints in steps for one."""
+"""Staggered starts of several motors, and ramps of one motor's setpoint."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
 from multidrop.errors import WriteForbidden
 
-HEARD_S = PAUSE_NS / 2e9  # after PAUSE_NS of silence a drive may have lost its power (identity.py)
+# interval in s between reads of waiting drives: one silent for PAUSE_NS may have lost its power (identity.py)
+HEARD_S = PAUSE_NS / 2e9
 
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
-    If one fails, stop it and all that were started before, and raise its failure. A drive whose stop is
+    If a start fails, stop that drive and all started before it, and raise the failure. A drive whose stop is
     called on any thread during this call is not started. Drives that wait for their turn are read regularly,
-    because a setpoint that cannot be read back counts as lost after a silence.
+    because after a silence a setpoint that cannot be read back is assumed lost.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s: it must be 0 or more")
@@ -51,20 +52,20 @@ def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float) -> float
         if unheard_s >= HEARD_S:
             unheard_s = 0.0
             for drive in waiting:
-                with suppress(Exception):  # its start will report it
+                with suppress(Exception):  # the drive's start will report the failure
                     drive.identify()
     return unheard_s
 
 
 def _stop(drives: Sequence[Drive]) -> None:
-    """Stop all in parallel: they may be on several buses, and one may be silent.
+    """Stop all drives, each on a thread, because they may be on several buses and one may be silent.
 
-    If the system has no thread left, the others are each sent a stop before any is waited for. On an
-    interruption those without a thread are sent a stop once more.
+    If the system has no thread left, each of the remaining drives is sent one stop first, and then each is
+    stopped in turn. On an interruption the remaining drives are each sent a stop again.
     """
 
     def stop(drive: Drive, seconds: float | None = None) -> None:
-        with suppress(Exception):  # of any kind: the others are stopped too
+        with suppress(Exception):  # whatever failed, the other drives must be stopped
             drive.stop(seconds=seconds)
 
     threads: list[threading.Thread] = []
@@ -90,9 +91,9 @@ def _stop(drives: Sequence[Drive]) -> None:
 def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0.5) -> None:
     """Change the setpoint to `hz` in steps, one every `every` seconds, at `rate` Hz/s.
 
-    The default rate is the drive's own (maximum frequency / acceleration time), which is also the highest.
-    Raises WriteForbidden if each step would be stored in EEPROM, or the rate is unknown. If the drive would
-    not take `hz`, raises as `set_frequency` before the first step.
+    The default and highest rate is the drive's own: maximum frequency / acceleration time. Raises
+    WriteForbidden if each step may be stored in EEPROM, or if the rate is unknown. If `hz` is not allowed,
+    raises the error of `set_frequency` before the first step.
     """
     drive.perform(_ramp(drive, hz, rate, every))
 
@@ -124,7 +125,7 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
 
 
 def _check(drive: Drive, hz: float) -> Script[None]:
-    """Raise now if this setpoint is not allowed; else the ramp would run up to the limit first."""
+    """Raise if this setpoint is not allowed; without this check, the ramp would first run up to the limit."""
     script = drive.set_frequency.script(hz)
     try:
         step = next(script)
@@ -137,7 +138,7 @@ def _check(drive: Drive, hz: float) -> Script[None]:
 
 
 def _own_rate(drive: Drive) -> Script[float | None]:
-    """Return the slope of the drive's own ramp in Hz/s; None if it is unknown."""
+    """Return the rate of the drive's own ramp in Hz/s; None if it is unknown."""
     most = drive.option.get("maximum_frequency")
     if most is None and "maximum_frequency" in drive.registers:
         most = yield from read(drive.register("maximum_frequency"))

@@ -26,9 +26,9 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line
 
-CALLED = "called"  # the outcome of a stop that is about to be sent
-CALLED_S = 0.05  # the longest that a stop waits for its record
-CLOSING_NS = 1_000_000_000  # the longest that closing waits for records of other threads
+CALLED = "called"  # outcome in the record of a stop that is about to be sent
+CALLED_S = 0.05  # longest time that a stop waits for its record
+CLOSING_NS = 1_000_000_000  # longest time that closing waits for other threads' records
 
 _log = logging.getLogger("multidrop.control")
 _audit_thread = AsideThread("multidrop audit")
@@ -36,7 +36,7 @@ _ledger_thread = AsideThread("multidrop ledger")
 
 
 class WriteRecords:
-    """Records of one line's writes; stops are queued until `catch_up`."""
+    """Records of one line's writes. Records of stops are queued until `catch_up`."""
 
     def __init__(self, line: Line, ledger: Ledger, audit: AuditLog | None) -> None:
         self.audit = audit
@@ -48,7 +48,10 @@ class WriteRecords:
         self._writers: list[None] = []  # threads in `catch_up`; a list needs no lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
-        """Count a write in the ledger before it is sent. Raises WriteForbidden if it must not be sent."""
+        """Count a write in the ledger before it is sent. Raises WriteForbidden if the budget is used up.
+
+        Raises it too if the last write of an EEPROM register was less than LEAST_INTERVAL ago.
+        """
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
         ledger = self._ledger.at(self._line.identity)
         why = ledger.enter(self._cell(drive, register), clock.utc_ns() / 1e9, least)
@@ -76,11 +79,11 @@ class WriteRecords:
     def log_later(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Queue the record until `catch_up` or `catch_up_aside`, and log it aside."""
+        """Queue the record until `catch_up` or `catch_up_aside`, and log it on the log thread."""
         self._put(self._record(drive, request, what, effect.value, why, held), partial(log_aside, _log))
 
     def note_called(self, drive: Drive, request: Message, what: str) -> None:
-        """Within `noted_first`, record that this is about to be sent. Raises OSError if that fails."""
+        """Within `noted_first`, record that this write is about to be sent. Raises OSError if that fails."""
         if self.audit is None or not is_noted_first():
             return
         record = self._record(drive, request, what, CALLED, "", None)
@@ -90,7 +93,10 @@ class WriteRecords:
             raise OSError(f"{what} was not sent: the audit log cannot be written: {self.audit_trouble}")
 
     def note_stops_called(self, verb: str, drives: Sequence[Drive]) -> None:
-        """Record that these drives are about to be stopped; wait CALLED_S at most, once for a hung disk."""
+        """Record that these drives are about to be stopped, and wait up to CALLED_S for the record.
+
+        After a wait that timed out, do not wait again while the disk hangs.
+        """
         of_one = {"model": drives[0].model, "address": drives[0].address} if len(drives) == 1 else {}
         names = ", ".join(drive.name for drive in drives)
         self._put({"drive": names, **of_one, "write": verb, "outcome": CALLED}, partial(log_aside, _log))
@@ -123,7 +129,7 @@ class WriteRecords:
         return record | {"outcome": outcome} | known
 
     def _put(self, record: dict[str, Any], log: Callable[..., None], text: str = "") -> None:
-        """Queue a record for the audit log, and log it, as `text` if given."""
+        """Queue a record for the audit log, and pass a sentence (by default made from it) to `log`."""
         record = self._complete(record)
         if self.audit is not None:
             self._unlogged.append((clock.utc_ns(), record))
@@ -139,19 +145,19 @@ class WriteRecords:
         return {"port": self._line.port, **record, **author}
 
     def catch_up(self) -> None:
-        """Write and count all that is queued; a failure is logged as a warning."""
+        """Write the queued records and count the queued writes; log a failure as a warning."""
         self._write_queued()
         self._count_queued()
 
     def catch_up_aside(self) -> None:
-        """Do the same soon, on separate threads."""
+        """Start the same work on separate threads, without waiting."""
         if self._uncounted:
             _ledger_thread.put(self._count_queued)
         if self._unlogged:
             _audit_thread.put(self._write_queued)
 
     def flush(self, seconds: float) -> None:
-        """Do the same, and wait up to `seconds` for each thread."""
+        """Do the work of `catch_up` on separate threads, and wait up to `seconds` for each thread."""
         self.catch_up_aside()
         for thread in (_audit_thread, _ledger_thread):
             if not thread.hangs(seconds) and not thread.flush(seconds) and not thread.hangs(seconds):
@@ -160,7 +166,7 @@ class WriteRecords:
     def _write_queued(self) -> None:
         self._writers.append(None)  # before taking a record, so that `close` waits for this thread
         try:
-            with suppress(IndexError):  # another thread may take them too
+            with suppress(IndexError):  # the queue is empty; other threads may empty it too
                 while True:
                     self._append(*self._unlogged.popleft())
         finally:
@@ -181,7 +187,7 @@ class WriteRecords:
         try:
             audit.add(at_ns, record)
             self.audit_trouble = ""
-        except (OSError, ValueError) as failure:  # ValueError: it was closed
+        except (OSError, ValueError) as failure:  # ValueError: the file was closed
             self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
             log_aside(_log, logging.WARNING, "the audit log cannot be written: %s", self.audit_trouble)
 
@@ -197,7 +203,7 @@ class WriteRecords:
         )
 
     def close(self) -> None:
-        """Write the queue and close the log; wait only briefly for a disk that hangs."""
+        """Write the queued records and close the log; wait only briefly for a disk that hangs."""
         self.flush(CLOSING_NS / 1e9)
         given_up_ns = clock.now_ns() + CLOSING_NS
         while self._writers and clock.now_ns() < given_up_ns:

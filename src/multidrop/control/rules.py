@@ -1,6 +1,6 @@
-"""Rules of a register that must hold before it is written.
+"""Checks of the rules for writing a register.
 
-A violation is `WriteForbidden` with the register, the rule and the place in the manual.
+A write that breaks a rule raises `WriteForbidden` with the register, the rule and the place in the manual.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ def _refusal(
 
 
 def raw_count(drive: Drive, register: Register[T], value: T) -> float:
-    """Return the raw count to send. Raises WriteForbidden or TypeError if it cannot be written."""
+    """Return the raw count to send for `value`.
+
+    Raises WriteForbidden if the register or the value cannot be written, TypeError for a value's wrong type.
+    """
     check_own(drive, register)
     if register.never:
         raise refused(drive, register, register.never)
@@ -44,11 +47,11 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this may command the motor and the drive's class is not confirmed.
+    """Raise WriteForbidden if this write may command the motor and the drive's class is not confirmed.
 
-    A stop needs no confirmation. Other counts that a family file declares harmless do.
+    A stop needs no confirmation. In a family file, other counts that are declared harmless need one.
     """
-    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
+    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # its addresses may be wrong
     if is_harmless(register, raw):
         if is_unproven and not is_stop(drive, register, raw):
             drive.check_confirmed(register.name)
@@ -57,9 +60,9 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden unless a plain write may do this: only verbs move a motor or reset a fault.
+    """Raise WriteForbidden if this write needs a verb, as one that moves a motor or resets a fault.
 
-    A command that does not move the motor by itself needs a drive whose class is confirmed.
+    A command that does not move the motor by itself is allowed if the drive's class is confirmed.
     """
     if is_harmless(register, raw) or not register.commands:
         check_known(drive, register, raw)
@@ -86,23 +89,26 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden for a broadcast to an unconfirmed user family, unless it is a stop."""
+    """Raise WriteForbidden if the drive's class is not confirmed and this broadcast is not a stop."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 
 
 def is_stop(drive: Drive, register: Register[Any], raw: float) -> bool:
-    """Return True for a harmless count of a family that has a stop."""
+    """Return True if the raw count is harmless and the family has a stop."""
     return is_harmless(register, raw) and _has(drive, "stop")
 
 
 def is_harmless(register: Register[Any], raw: float) -> bool:
-    """Return True if this may be sent at any time, even to a silent drive, as a stop may."""
+    """Return True if this raw count may be sent at any time, like a stop, even to a silent drive."""
     return register.harmless is not None and raw in register.harmless
 
 
 def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
-    """Read the registers and the motor state that the rules depend on; raise WriteForbidden."""
+    """Read the registers and the motor state that the rules depend on.
+
+    Raises WriteForbidden if `value` is out of their bounds or the motor does not stand although it must.
+    """
     for name, sign, word in ((register.at_least, 1, "below"), (register.at_most, -1, "above")):
         bound = (yield from _bound(drive, name)) if name else None
         if bound is not None and (value - bound) * sign < 0:
@@ -113,7 +119,7 @@ def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
 
 
 def _bound(drive: Drive, name: str) -> Script[float | None]:
-    """Return the value of a register, or of an option; None if it was not declared."""
+    """Return the value of the option or register of this name; None for an option that was not given."""
     if name in drive.options:
         return drive.option.get(name)
     register: Register[float] = drive.register(name)
@@ -132,14 +138,20 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
 
 
 def _not_now(drive: Drive, register: Register[Any], rule: str) -> WriteForbidden:
-    """Return the error for a rule that the manual may not print; it names the register's place."""
+    """Return the error for a rule that depends on the drive's state.
+
+    The manual may not state the rule itself, so the error names the register's place.
+    """
     where = f" (in the manual, {register.name} is {register.place})" if register.place else ""
     sentence = f"{register.name} of {drive.name} is not written: {rule}{where}"
     return WriteForbidden(sentence, register=register.name, rule=rule, place=register.place)
 
 
 def wears(drive: Drive, register: Register[Any]) -> Kept:
-    """Return how a write to this register is kept; if that is not stated, it may wear an EEPROM."""
+    """Return where the drive keeps a value written to this register: RAM, EEPROM or unknown.
+
+    Treat unknown like EEPROM, which a write wears.
+    """
     if register.ram_address is not None or register.name in drive.ram or register.kept is Kept.RAM:
         return Kept.RAM
     is_bit = register.table.carrier is Carrier.BIT

@@ -1,6 +1,6 @@
-"""Stopper: stop one drive or all of a bus, and repeat each stop until the motor is seen to stand.
+"""Stopper: stop one drive or all drives of a bus, and repeat each stop until the motor is seen to stand.
 
-Several stops take turns step by step, so that none waits for another motor's ramp.
+Several stops take turns step by step, so that no stop waits for another motor's ramp.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
-LEAST_S = 30.0  # for which a stop is repeated by default
-PAUSE_S = 0.2  # before it is repeated
-AT_ONCE = 8  # steps without a good reply until the line is shared with polling
-SHARE = 1.5  # time left to polling after such a step, in units of the step's own time
-MOST_STEPS = 8  # of a stop that is sent once more after an interruption
+LEAST_S = 30.0  # how long a stop is repeated by default
+PAUSE_S = 0.2  # pause before a repetition
+AT_ONCE = 8  # number of steps without a good reply until the line is shared with polling
+SHARE = 1.5  # time left to polling after such a step, as a multiple of the step's duration
+MOST_STEPS = 8  # limit of steps when a stop is sent again after an interruption
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
-NO_ROOM = (MemoryError, OSError)  # the system may have memory or descriptors again soon
-REGAIN_NS = 500_000_000  # between attempts of stops to reopen a lost port
+NO_ROOM = (MemoryError, OSError)  # temporary: the system may soon have memory or descriptors again
+REGAIN_NS = 500_000_000  # interval between attempts of stops to reopen a lost port
 
 _log = logging.getLogger("multidrop.control")
 
@@ -58,9 +58,10 @@ Do = Callable[["StopAttempt", Step], Any]
 class StopAttempt:
     """One drive's stop, repeated until it is confirmed and the motor is seen to stop.
 
-    It is repeated for `seconds`. By default that is LEAST_S, and an attempt that started by then may take as
-    long as the ramp. After AT_ONCE steps without a good reply it leaves more than half of the line's time to
-    others. `ready` returns the time before which the drive must not be sent to.
+    The stop is repeated for `seconds`. With None it is repeated for LEAST_S, and a repetition that started by
+    then may last as long as the motor's ramp. After AT_ONCE steps without a good reply, it leaves more than
+    half of the line's time to others. `ready` returns the time (in s) before which no request may be sent to
+    the drive.
     """
 
     def __init__(
@@ -75,17 +76,17 @@ class StopAttempt:
         self.ready = ready
         self.due = begun
         self.failure: Exception | None = None
-        self.is_sent = False  # a stop was sent to it
+        self.is_sent = False  # whether a stop was sent that the drive did not refuse
         self._begun = begun
         self._seconds = seconds
         self._make = script
-        self.times_sent = 0  # including those that the drive refused
+        self.times_sent = 0  # number of stops sent, including those that the drive refused
         self._unanswered = 0  # steps without a good reply
         self.is_over = False
-        self.ended = begun  # time of its end
+        self.ended = begun  # when the attempt ended
         self.interruption: BaseException | None = None  # raised by the script to end the program
-        self.frame: Message | None = None  # the latest that was sent
-        self._times_in_doubt = 0  # frames that an interruption or the system may have prevented
+        self.frame: Message | None = None  # the latest request that was sent
+        self._times_in_doubt = 0  # number of frames that may or may not have been sent
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
@@ -98,7 +99,7 @@ class StopAttempt:
         self._resume: Callable[[], Step] = lambda: next(script)
 
     def note_frame(self, drive: Drive, request: Message, *outcome: object) -> None:
-        """Note its newest frame, for the audit record."""
+        """Keep the newest request for the audit record."""
         self.frame = request
 
     def note_broadcast(self) -> None:
@@ -120,7 +121,7 @@ class StopAttempt:
             else:
                 begun = now()
                 is_answered = self._carry_out(step, do)
-                self.due = max(self.due, now())  # behind all others that are due
+                self.due = max(self.due, now())  # the other due stops go first
                 if not is_answered:
                     self._share_line(begun, now())
         except StopIteration:
@@ -132,7 +133,10 @@ class StopAttempt:
         return False
 
     def _next_step(self) -> Step:
-        """Resume the script. SystemExit and the like are kept until all stops are over."""
+        """Resume the script; return its next step.
+
+        If the script raises SystemExit or the like, keep it until all stops are over; raise Unconfirmed.
+        """
         try:
             return self._resume()
         except StopIteration:
@@ -154,7 +158,7 @@ class StopAttempt:
         self._resume = lambda: script.send(None)
 
     def _share_line(self, begun: float, now: float) -> None:
-        """Delay the next step after one without a good reply, unless the stop's time would end."""
+        """After a step without a good reply, delay the next one, unless the stop's time would end first."""
         self._unanswered += 1
         limit = LEAST_S if self._seconds is None else self._seconds
         due = now + SHARE * (now - begun)
@@ -162,7 +166,7 @@ class StopAttempt:
             self.due = due
 
     def _carry_out(self, step: Step, do: Do) -> bool:
-        """Carry out a step, and resume the script with its result; return False without a good reply."""
+        """Carry out a step, and pass its result to the script; return False if there was no good reply."""
         script = self._script
         if isinstance(step, Pulse) and (step.register.name, step.value) in self._pulses:
             reason = "it is a pulse that was already sent once"
@@ -209,18 +213,18 @@ class StopAttempt:
         return True
 
     def _log_unsent(self, failure: NotMaster) -> None:
-        """Log it at once as critical, because no other process stops this motor."""
+        """Log immediately, as critical, that no stop was sent: no other process stops this motor."""
         if not self.is_sent:
             log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
 
     def once_more(self, do: Do) -> None:
         """Send the stop again without waits, because its caller was interrupted.
 
-        Reads before the write are carried out; reads after it fail as if unanswered.
+        Reads before the script's first write are carried out; for later reads the script gets NoReply.
         """
         self._begin()
         is_written = False
-        with suppress(Exception):  # its end, too
+        with suppress(Exception):  # StopIteration too
             for _ in range(MOST_STEPS):
                 step = self._next_step()
                 if isinstance(step, Wait):
@@ -252,7 +256,7 @@ class StopAttempt:
         return unknown
 
     def result(self) -> Stopped:
-        """Return its result at its end."""
+        """Return the result of the stop, once it is over."""
         known, seconds = self.known, self.ended - self._begun
         if known is None:
             return Stopped(self.drive.name, Seen.STOPPED, seconds)
@@ -264,7 +268,7 @@ class StopAttempt:
         return Stopped(self.drive.name, seen, seconds, why)
 
     def so_far(self) -> str:
-        """Return its progress so far; the text stays the same until something changes."""
+        """Return a sentence on the progress so far; it stays the same until something changes."""
         why = f": {self.failure}" if self.failure else ""
         if self._is_confirmed:
             return f"{self.drive.name}: the stop was confirmed, but the motor is not yet seen to stand{why}"
@@ -277,11 +281,11 @@ class StopAttempt:
         return f"{least}" if least == most else f"{least} to {most}"
 
     def is_in_doubt(self) -> bool:
-        """Return True if it is unknown whether some of its frames were sent."""
+        """Return True if it is unknown whether some of the stop's frames were sent."""
         return self._times_in_doubt > 0
 
     def break_off(self) -> str:
-        """Note that its caller no longer waits, and return its progress."""
+        """End the stop because its caller was interrupted; return a sentence on its progress."""
         self.is_sent |= self._times_in_doubt > 0
         if self.failure is None:
             self.failure = Unconfirmed(self.drive.name, "the stop", "its caller was interrupted")
@@ -291,7 +295,7 @@ class StopAttempt:
 
 
 def _noting_return(make: Callable[[], Script[Any]], returned: list[bool]) -> Script[None]:
-    """Carry out a script, and note that it returned: a signal or MemoryError may also end it."""
+    """Carry out a script, and append to `returned` if it ended by itself, not by a signal or MemoryError."""
     yield from make()
     returned.append(True)
 
@@ -302,7 +306,7 @@ def _is_worth_repeating(failure: Exception) -> bool:
 
 
 class StopRun:
-    """Stops that were called together, and their state until each is over.
+    """The stops of one call, for one drive or several.
 
     The caller repeats `carry_out` after MemoryError or OSError, and calls `interrupted` after other failures.
     """
@@ -326,7 +330,7 @@ class StopRun:
         self.attempts: list[StopAttempt] = []
 
     def carry_out(self) -> None:
-        """Carry out the unfinished stops, until each motor is seen to stop or its time is over."""
+        """Carry out the unfinished stops, until each motor is seen to stop or the time for it is over."""
         self._tries += 1
         if self._tries > 1:
             clock.sleep(PAUSE_S)
@@ -340,7 +344,7 @@ class StopRun:
         self._release()
 
     def _begin(self) -> None:
-        """Once: cancel other calls, record this one, and create the attempts."""
+        """Cancel other calls; the first time, also create the attempts and record that a stop was called."""
         stopper = self._stopper
         stopper.latches.begin(self, self._drives)
         if not self.attempts and self._drives:
@@ -362,9 +366,9 @@ class StopRun:
         self._stopper.latches.over(self)
 
     def interrupted(self, interruption: BaseException) -> None:
-        """Send each unfinished stop once more, and add its progress to the interruption.
+        """Send each unfinished stop again, once, and add a note on its progress to the interruption.
 
-        A second interruption ends this.
+        A second interruption ends this, and then has the notes.
         """
         latest = interruption
         try:
@@ -394,7 +398,7 @@ class StopRun:
         return found
 
     def result(self) -> None:
-        """Raise the failure if the motor was not seen to stop."""
+        """Raise the first failure of a stop whose motor was not seen to stop."""
         self.found()
         for attempt in self.attempts:
             if attempt.known is not None:
@@ -404,7 +408,7 @@ class StopRun:
 class Stopper:
     """Stops the drives of one bus.
 
-    With `is_tended` a poller reopens a lost port, and stops wait for that; else stops reopen it.
+    If `is_tended` is set, a poller reopens a lost port and stops wait for that; otherwise stops reopen it.
     """
 
     def __init__(self, exchanges: Exchanges, writer: Writer, latches: Latches) -> None:
@@ -412,12 +416,15 @@ class Stopper:
         self.latches = latches
         self.records = writer.records
         self.under_way: dict[StopRun, list[StopAttempt]] = {}
-        self._regain_ns = 0  # time of the next attempt
+        self._regain_ns = 0  # earliest time of the next attempt to reopen the port
         self._exchanges = exchanges
         self._writer = writer
 
     def so_far(self) -> dict[str, str]:
-        """Return the progress of each drive's stop under way; of several, the one that was sent most."""
+        """Return the progress of the unfinished stops, by drive.
+
+        If a drive has several stops, the one that was sent most often counts.
+        """
         attempts = [
             each for stops in self.under_way.copy().values() for each in stops.copy() if not each.is_over
         ]
@@ -426,20 +433,20 @@ class Stopper:
     def stop(
         self, drive: Drive, verb: str, make: Callable[[], Script[Any]], seconds: float | None
     ) -> StopRun:
-        """Return a stop of this drive that is repeated for `seconds`."""
+        """Return a new stop of this drive, not started yet, that will be repeated for `seconds`."""
         return StopRun(self, verb, [drive], lambda drive: make(), seconds)
 
     def stop_all(
         self, drives: Sequence[Drive], broadcast: Callable[[], bool], seconds: float | None
     ) -> StopRun:
-        """Return parallel stops of all these drives.
+        """Return new stops of all these drives, not started yet.
 
-        `broadcast` is called first, and returns True if it has sent a stop to all of them.
+        `broadcast` is called before them, and returns True if it may have sent a stop to all the drives.
         """
         return StopRun(self, "stop", drives, lambda drive: drive.stop.script(), seconds, broadcast)
 
     def do(self, stop: StopAttempt, step: Step) -> Any:
-        """Carry out a step. A stop's first write must not delay those of others; a later one may."""
+        """Carry out a step of a stop. Only writes after the first may wait for a late reply."""
         self._regain()
         if isinstance(step, Read):  # once: without a reply the stop is sent again
             return self._exchanges.value(stop.drive, step.register, 1)
@@ -448,15 +455,15 @@ class Stopper:
         return self._writer.insist(stop.drive, step, timeout, stop.note_frame).value
 
     def insist(self, drive: Drive, step: Write) -> Outcome:
-        """Write a count that stops the motor; reopen a lost port first."""
+        """Write a count that stops the motor, after reopening a lost port; return the outcome."""
         self._regain()
         try:
             return self._writer.insist(drive, step)
-        except CheckAgain:  # no other stop waits
+        except CheckAgain:  # immediately, because no other stop waits
             return self._writer.insist(drive, step)
 
     def ready(self, drive: Drive) -> float:
-        """Return the time before which the drive must not be sent to."""
+        """Return the time (in s) before which no request may be sent to the drive."""
         peer = self._exchanges.peers.get(drive)
         return peer.ready_ns / 1e9 if peer else 0.0
 
@@ -468,7 +475,7 @@ class Stopper:
 
 
 def _due(stop: StopAttempt) -> float:
-    """Return when its next step is due, including the rest that its drive needs."""
+    """Return when the stop's next step is due, including the pause that its drive needs."""
     return max(stop.due, stop.ready())
 
 
@@ -477,9 +484,9 @@ def _now() -> float:
 
 
 def _limit(seconds: float | None) -> float | None:
-    """Return the time as a float: other number types may not add to a time.
+    """Return a stop's time limit as a float, because other number types may not add to a float.
 
-    An invalid time does not prevent the stop: it is logged, and the stop is repeated as without one.
+    An invalid limit does not prevent the stop: log a warning and return None, which means no limit.
     """
     if seconds is None:
         return None
@@ -497,7 +504,7 @@ def _limit(seconds: float | None) -> float | None:
 
 
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
-    """Carry out the stops, a step of each in turn; call `end` at the end of each, at least once."""
+    """Carry out the stops in turn, one step at a time; call `end` at least once when a stop is over."""
     waiting = [stop for stop in stops if not stop.is_over]
     while waiting:
         stop = min(waiting, key=_due)  # the one that has been due for longest

@@ -1,4 +1,4 @@
-"""Time limit of writes: a deadline for the calls within a block."""
+"""Deadlines for writes: `written_before` sets one for the calls within a block."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ def _called(limit: Limit) -> float:
 def written_before(limit: Limit) -> Iterator[None]:
     """Within the block, raise Expired if a call's first write cannot be sent by the time of `limit`.
 
-    `limit` is called at the start of each call. It returns a time in ns, as `time.monotonic_ns()` does; 0 is
-    always past. A stop that is called later ends the call by itself, so a program that makes `limit` return 0
-    when it sees a stop misses none. Sleep of the machine within the block counts. The later writes of a verb
-    have the bus's own `expiry`. Stops are always sent.
+    `limit` is called at the start of each call. It returns a time in ns on the clock of
+    `time.monotonic_ns()`; 0 is always past. A stop that is called after that cancels the call, so a program
+    whose `limit` returns 0 once it has seen a stop misses none. Time that the computer sleeps within the
+    block counts. A verb's later writes expire by the bus's own `expiry`. Stops are always sent.
 
-    It applies to this thread, or to this task and `asyncio.to_thread`. If `limit` is not a function, each
-    call but a stop raises TypeError.
+    The block applies to this thread, or to this task and `asyncio.to_thread`. If `limit` is not a function,
+    each call except a stop raises TypeError.
     """
     outer = _limit.get()
-    slept_ns = clock.boottime_ns() - clock.now_ns()  # in this order it is never too long
+    slept_ns = clock.boottime_ns() - clock.now_ns()  # read in this order, the difference is never too large
     token = _limit.set(lambda: min(outer(), _called(limit) + slept_ns))
     try:
         yield

@@ -34,11 +34,11 @@ from multidrop.errors import (
 from multidrop.transport import clock
 from multidrop.transport.exchange import Exchanges, good_reply
 
-ACKNOWLEDGED = 5  # exception code: accepted, but takes longer
+ACKNOWLEDGED = 5  # exception code: the device accepted the request, but needs more time
 
 
 class Writer:
-    """Sends everything that is written to the drives on a line."""
+    """Sends all writes to the drives on a line."""
 
     def __init__(self, exchanges: Exchanges, records: WriteRecords) -> None:
         self.records = records
@@ -49,7 +49,10 @@ class Writer:
     # ---- writing ----
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
-        """Write once, by all rules except those of plain writes. Raises CancelledByStop or Expired."""
+        """Check all rules except those for plain writes, and write once; return the outcome.
+
+        Raises CancelledByStop or Expired if the write was not sent.
+        """
         check_author()
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
@@ -67,7 +70,7 @@ class Writer:
                     if register.name == drive.setpoint_name:
                         drive.commanded = asked
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
-            call.check(_in_words(register, asked))  # before counting it
+            call.check(_in_words(register, asked))  # do not count a write that will not be sent
         self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
         if kept is not Kept.RAM:
             self.records.count(drive, register, kept)
@@ -78,9 +81,9 @@ class Writer:
     ) -> Outcome:
         """Write a stop, or a count that is harmless at any time, past all rules and the ledger's budget.
 
-        Raises WriteForbidden only on proof that the drive is of another family. On a line with late replies
-        it waits up to `timeout` seconds for its own reply. `log` records it; by default it is queued until
-        `catch_up`.
+        Raises WriteForbidden only on proof that the drive is of another family. On a line with late replies,
+        waits up to `timeout` seconds for its own reply. `log` records the write; by default, the record is
+        queued until `catch_up`.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -93,7 +96,10 @@ class Writer:
                 self.records.count_later(drive, register)
 
     def verified(self, drive: Drive, outcome: Outcome) -> Outcome:
-        """Return the outcome after another read from the drive: the write's reply may be an echo."""
+        """Return the outcome, changed to UNCONFIRMED if the write's reply may be the adapter's echo.
+
+        To find that out, another register is read, unless the outcome is already certain.
+        """
         if outcome.effect is not Effect.DONE or outcome.held is not None:
             return outcome
         why = self._echo.why_doubtful(drive)
@@ -105,7 +111,10 @@ class Writer:
         return replace(outcome, effect=Effect.UNCONFIRMED, failure=unknown)
 
     def raw(self, drive: Drive, request: Message, call: Call) -> bytes:
-        """Send any request once, past all rules except its call's; return the data of the reply."""
+        """Send any request once; return the data of the reply.
+
+        No rule applies except that the call must be neither cancelled nor expired.
+        """
         check_author()
         frame = build_request(drive.framing, request)
         what = f"raw request {frame.hex(' ').upper()}"
@@ -131,7 +140,7 @@ class Writer:
         return reply.data
 
     def broadcast(self, drive: Drive, register: Register[Any], raw: float, call: Call | None = None) -> None:
-        """Write to all drives at once, by the table of one drive; without a call it is a stop."""
+        """Broadcast a write of one of this drive's registers. Without a call, the write is a stop."""
         request = write_request(drive, register, raw, address=0)
         what = _in_words(register, register.decode(raw))
         if call:
@@ -156,7 +165,7 @@ class Writer:
         timeout: float,
         log: Callable[..., None],
     ) -> Outcome:
-        """Send it once for its call; without a call it is a stop, which insists."""
+        """Send a write once, and return its outcome. Without a call it is a stop, sent with `insists`."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
@@ -210,7 +219,7 @@ class Writer:
         completion: Completion,
         call: Call | None,
     ) -> Outcome:
-        """Return the outcome by the reply and by the value read back."""
+        """Return the outcome according to the reply and the value read back."""
         lost: BusError | None = None
         held, unread = None, None
         try:
@@ -253,7 +262,7 @@ class Writer:
 
     @contextmanager
     def _logged(self, drive: Drive, request: Message, what: str, log: Callable[..., None]) -> Iterator[None]:
-        """Record the write even if its outcome never comes: the port failed, or Ctrl-C was pressed."""
+        """If the block fails and the write may have been sent, record it as unconfirmed."""
         try:
             yield
         except BaseException as failure:
@@ -277,7 +286,7 @@ def _is_unsent(failure: BaseException) -> bool:
 
 
 def _is_under_way(failure: DriveException) -> bool:
-    """Return True for exception 05: accepted, but takes longer (application protocol V1.1b3, 7)."""
+    """Return True for exception 05, accepted but not done yet (Modbus application protocol V1.1b3, 7)."""
     return failure.code == ACKNOWLEDGED and failure.meaning == Drive.exceptions[ACKNOWLEDGED]
 
 

@@ -1,9 +1,9 @@
-"""Choose proofs: requests to a drive whose replies cannot be taken for each other's.
+"""Choose proofs: requests to a drive whose replies cannot be mistaken for one another.
 
-After a time-out a reply may still come, at any time and to any outstanding request. A late reply can never
-be mistaken for the reply to a proof. When that has come, all late replies have come too, or never will,
-because a line and the path to it keep the order. Replies differ by function, by length, in Delixi's
-own protocol by parameter, and otherwise by the values that two registers are known to hold.
+After a timeout a reply may still come, at any time and to any outstanding request. A late reply can never be
+mistaken for the reply to a proof. Once the reply to a proof has come, no earlier reply can still come,
+because a line and the path to it keep the order. Replies differ by function, by length, in Delixi's own
+protocol by parameter, and otherwise by the values that two registers are known to hold.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register
 from multidrop.planning.blocks import Block, all_requests
 
-MOST_PROOFS = 4  # each costs memory for every drive
+MOST_PROOFS = 4  # limit per drive, because each proof uses memory
 
-RawRange = tuple[int, int]  # the least and the most that the one register of a reply holds
+RawRange = tuple[int, int]  # lowest and highest raw count of the only register in a reply
 
 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
-    """Return blocks to read from this drive, with the raw counts that the reply is known to hold.
+    """Return the blocks to read from this drive as proofs.
 
-    The last one is the least likely to be polled. A family whose replies are all alike has none.
+    Each has the range of raw counts that its reply is known to hold, or None. The last block is the least
+    likely to be polled. If all replies of the family look alike, the list is empty.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -33,7 +34,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     ]
     if known:
         found = [*known, *found[1:]]
-    if probe := drive.echo_probe:  # a possible echo proves too little
+    if probe := drive.echo_probe:  # its reply cannot be mistaken for an echo
         found = [(Block.of(drive, [probe]), None), *found]
     if len(found) >= MOST_PROOFS:
         return [*found[: MOST_PROOFS - 1], found[-1]]
@@ -42,9 +43,9 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return registers whose replies differ in shape: the first few, and the last one.
+    """Return registers whose replies differ in shape: the first MOST_PROOFS, and the last.
 
-    Readings come first, because they are polled anyway, the shortest requests before others.
+    Readings come first, because they are polled anyway, and shorter requests before longer ones.
     """
     readable: list[Register[Any]] = [register for register in family.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]
@@ -59,7 +60,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _shape(first: Register[Any], count: int) -> Hashable:
-    """Return the properties of a request that its reply shows."""
+    """Return the properties of a request that can be recognised in its reply."""
     if first.table.carrier is Carrier.LONG:
         return first.table.read, first.address
     if first.table.carrier is Carrier.BIT:

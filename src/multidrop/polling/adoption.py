@@ -1,7 +1,7 @@
-"""Adoption: how the lines of a poller become those of another plant, while they are polled.
+"""Adoption: change the lines of a poller to those of another plant, while they are polled.
 
-All mistakes are found before anything changes. Then lines and drives leave, staying lines change, and new
-ports are opened. Lines without changes are not touched.
+All mistakes are found before anything changes. Then lines and drives are removed, kept lines are changed, and
+new ports are opened. Lines without changes are not touched.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from multidrop.polling.polled_line import PolledLine
 
 
 class DriveChanges(NamedTuple):
-    """Changes to the drives of a line that stays."""
+    """Changes to the drives of a kept line."""
 
     leaving: list[PolledDrive]
     joining: list[PolledDrive]
-    repolled: list[PolledDrive]  # staying drives with changed registers or rates
+    repolled: list[PolledDrive]  # kept drives with changed registers or rates
 
 
 def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
-    """Raise PlantError with all mistakes of a plant, which a program may have built.
+    """Raise PlantError with all mistakes of a plant, because a program may have built it.
 
-    `is_free` returns False for a drive that is on another bus. Drives take their ports' framing.
+    `is_free` returns False for a drive that is on another bus. Drives get the framing of their ports.
     """
     found: list[str] = []
     names: dict[tuple[str, object], str] = {}
@@ -64,7 +64,7 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
             for poll in polled.polls:
                 found += _mistakes(at, partial(_check_polled, drive, poll.register))
     if found:
-        raise PlantError(tuple(dict.fromkeys(found)))  # many registers may have the same one
+        raise PlantError(tuple(dict.fromkeys(found)))  # without duplicates: registers may share a mistake
 
 
 def _check_polled(drive: Drive, register: Register[Any]) -> None:
@@ -87,7 +87,7 @@ def has_same_port(line: PlantLine, other: PlantLine) -> bool:
 
 
 def is_same_drive(drive: Drive, other: Drive) -> bool:
-    """Return True where both describe one drive in the same way."""
+    """Return True if both objects describe the same drive with the same options."""
     return drive is other or _description(drive) == _description(other)
 
 
@@ -107,7 +107,7 @@ def _description(drive: Drive) -> tuple[object, ...]:
 
 
 def drive_changes(present: Iterable[PolledDrive], wanted: Iterable[PolledDrive]) -> DriveChanges:
-    """Return the changes to a line's drives; staying drives remain the same objects."""
+    """Return the changes to a line's drives; kept drives remain the same objects."""
     left = list(present)
     changes = DriveChanges(left, [], [])
     for polled in wanted:
@@ -126,25 +126,25 @@ GONE = "its line is polled no more"
 
 @dataclass(frozen=True)
 class Staying:
-    """A line whose port stays open, and its new description."""
+    """A kept line, whose port stays open, and its new description."""
 
     line: PolledLine
     wanted: PlantLine
     drives: DriveChanges
 
     def await_stops(self) -> None:
-        """End all motion commands of the leaving drives, and wait for their stops.
+        """Cancel the calls of the leaving drives, and wait for their stops.
 
-        With `stop_on_exit`, drives whose address stays free are stopped first. At an address
-        that is declared as another drive now, the old family's stop may mean something else. All stops of
-        theirs are waited for before one leaves: else it could not be stopped while another's motor runs out.
+        With `stop_on_exit`, drives whose address is not used by a joining drive are stopped first; for a
+        joining drive, the old family's stop could mean something else. All stops are over before any drive
+        is removed, because a removed drive could not be stopped while another motor still ramps down.
         """
         taken = {polled.drive.address for polled in self.drives.joining}
         leaving = [polled.drive for polled in self.drives.leaving]
         self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives; wait for the last exchange of those whose name is among `names`."""
+        """Remove the leaving drives, and wait for the last exchange of those whose name is in `names`."""
         leaving = [polled.drive for polled in self.drives.leaving]
         for drive in leaving:
             self.line.remove(drive)
@@ -164,11 +164,14 @@ class Staying:
         return bool(self.drives.leaving or self.drives.joining)
 
     def is_free(self, leaving: Mapping[str, Staying]) -> bool:
-        """Return True unless a drive that joins has the name of one that is to leave another line."""
+        """Return False if a joining drive has the name of a drive that has yet to leave another line."""
         return all(leaving.get(polled.drive.name, self) is self for polled in self.drives.joining)
 
     def take_in(self) -> None:
-        """Poll the new drives and registers. Raises LineError if the port cannot have a drive's settings."""
+        """Start polling the new drives and registers.
+
+        Raises LineError if the port cannot have a drive's settings.
+        """
         self.line.declared, self.line.switching = self.wanted, self.wanted.switching
         for polled in self.drives.repolled:
             self.line.set_polls(polled)
@@ -180,14 +183,14 @@ class Staying:
 
 @dataclass(frozen=True)
 class Coming:
-    """A line to be opened, and the line that has its port now, or None."""
+    """A line to open, and the present line that uses its port, or None."""
 
     wanted: PlantLine
     before: PolledLine | None
 
 
 class Adoption:
-    """The change of a poller's lines to another plant. Raises ValueError for a mistake in that plant."""
+    """A change of a poller's lines to another plant. Raises ValueError for a mistake in the plant."""
 
     def __init__(self, lines: LineSet, plant: Plant) -> None:
         self._lines = lines
@@ -198,7 +201,7 @@ class Adoption:
         self._check()
 
     def _pair(self) -> None:
-        """Match each wanted line with a present one: by its name, or else by its port."""
+        """Match each wanted line with a present line, by name or else by port."""
         named = {line.name: line for line in self._lines}
         found = {
             wanted.name: line
@@ -246,7 +249,7 @@ class Adoption:
     # ---- carrying it out ----
 
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
-        """Change the lines; return the failures of absent ports, by line name."""
+        """Change the lines; return the errors of ports that could not be opened or set up, by line name."""
         self._let_go()
         failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])
@@ -261,10 +264,11 @@ class Adoption:
         self._lines.let_go(self._going, GONE)
 
     def _change(self) -> dict[str, LineError]:
-        """Change the lines that stay, each in one go: an exchanged drive can be stopped whatever opens.
+        """Change the kept lines one by one; return the errors of ports, by line name.
 
-        One whose drives have names that leave on others waits for these, and its own can be stopped until
-        then. Lines that wait for each other change together, once all their stops are over.
+        If a joining drive has the name of a drive that leaves another line, that other line is changed first.
+        Lines that wait for each other are changed together, once all their stops are over. This happens
+        before any port is opened, so that a slow port never delays the stop of an exchanged drive.
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for line in self._plant.lines for polled in line.drives}
@@ -289,7 +293,10 @@ class Adoption:
         return failures
 
     def _open(self, start: bool) -> dict[str, LineError]:
-        """Open the new lines; those with an absent port wait for it like lost ones."""
+        """Open the new lines; return the errors of ports, by line name.
+
+        A line whose port is absent waits for the port, like a line with a lost port.
+        """
         failures: dict[str, LineError] = {}
         for place, bus in self._lines.open([coming.wanted for coming in self._coming]):
             coming = self._coming[place]
@@ -305,7 +312,10 @@ class Adoption:
         return failures
 
     def _put(self, coming: Coming, bus: Bus, start: bool) -> None:
-        """Poll a line on this bus. Raises LineError if the port cannot have a drive's settings."""
+        """Add a line with this bus, and poll it if `start` is set.
+
+        Raises LineError if the port cannot have a drive's settings.
+        """
         if coming.before:
             bus.remember(coming.before.bus)
         line = self._lines.add(replace(coming.wanted, drives=()), bus)

@@ -1,9 +1,9 @@
-"""Rows of samples and misses: columns for Arrow's users, and single rows for people.
+"""Rows of samples and misses: as columns for Arrow, and as single rows for people.
 
-`batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library that speaks the Arrow
-PyCapsule interface takes a batch as it is, though multidrop needs none: `pyarrow.record_batch(batch)`,
-`duckdb.sql("from batch")`. `pandas.DataFrame(batch)` does not know the interface, and would go through the
-rows with times as plain integers: that is refused. For NumPy, with NaN for every miss:
+`batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library with the Arrow PyCapsule
+interface can read a batch directly: `pyarrow.record_batch(batch)`, `duckdb.sql("from batch")`. multidrop
+itself needs no such library. `pandas.DataFrame(batch)` does not use the interface and would read row by row,
+with times as plain integers, so it raises TypeError. For NumPy, with NaN for every miss:
 `nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
 """
 
@@ -25,9 +25,9 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Row(NamedTuple):
-    """A sample, or a miss, which has no value and a status that says why."""
+    """A sample, or a miss: a row without a value, whose status is the reason."""
 
-    time_ns: int  # UTC: the request was sent
+    time_ns: int  # UTC at which the request was sent
     monotonic_ns: int
     uncertainty_ns: int | None  # the drive took the value between time_ns and time_ns + uncertainty_ns
     drive: str
@@ -45,7 +45,7 @@ ROW_COLUMNS = ("time", *Row._fields[1:])  # names of the columns that hold rows
 
 
 def shown_span(rows: Sequence[Row]) -> str:
-    """Return the number of rows and drives and the span of time, for a repr."""
+    """Return a text with the number of rows and drives and the time span, for a repr."""
     if not rows:
         return "no rows"
     first, last = min(row.time_ns for row in rows), max(row.time_ns for row in rows)
@@ -58,23 +58,23 @@ def shown_span(rows: Sequence[Row]) -> str:
 
 
 class BatchColumns(NamedTuple):
-    """Columns of a batch as they lie in memory: read-only one-dimensional memoryviews, without a copy.
+    """Columns of a batch as read-only one-dimensional memoryviews, without a copy.
 
-    All have a number for each row (shape `(len(batch),)`), but for `valid`. A view, and any object made
-    from it without a copy, such as `numpy.asarray(view)`, stays as it is while it is held, also when the
-    batch is gone and the poller closed: only then is its memory used again. The names are tuples; a code is
-    the place of its name in them. A name's code stays the same for all batches of one poller, in which later
-    batches may know more names.
+    Each column except `valid` has one number per row (shape `(len(batch),)`). A view stays unchanged while it
+    or any object made from it without a copy, such as `numpy.asarray(view)`, exists, even after the batch is
+    deleted and the poller closed. `drives`, `registers` and `statuses` are tuples of names; a code is the
+    index of its name. A name's code is the same in all batches of one poller; later batches may have more
+    names.
     """
 
-    time: memoryview  # int64 (format "q"): UTC in ns; the request was sent
-    monotonic_ns: memoryview  # int64
-    uncertainty_ns: memoryview  # int64; without meaning for a miss
+    time: memoryview  # int64 (format "q"): UTC in ns at which the request was sent
+    monotonic_ns: memoryview  # int64: the same time of CLOCK_MONOTONIC
+    uncertainty_ns: memoryview  # int64; undefined for a miss
     drive: memoryview  # uint16 ("H"): a code in `drives`
     register: memoryview  # uint16: a code in `registers`
-    value: memoryview  # float64 ("d"), in the register's unit; without meaning for a miss
+    value: memoryview  # float64 ("d"), in the register's unit; undefined for a miss
     status: memoryview  # uint16: a code in `statuses`; 0 is "ok", any other a miss
-    valid: memoryview  # uint8 ("B"), a bit for each row, the least significant first: 1 where status is 0
+    valid: memoryview  # uint8 ("B"), a bit for each row, least significant first: 1 if status is 0
     drives: tuple[str, ...]
     registers: tuple[str, ...]
     statuses: tuple[str, ...]
@@ -94,19 +94,19 @@ class Rows(ArrowTable):
         """Return the rows as a nanoarrow array."""
 
     def wide(self, *columns: str) -> WideRows:
-        """Return a column for each `drive.register`, or for these alone, and a row for each time.
+        """Return a table with a row for each time and a column for each `drive.register`, or only `columns`.
 
         The registers of one request share a row, and a miss is null: see `WideRows`. Raises ValueError for
-        a column that cannot be there.
+        an unknown column.
         """
         return WideRows(self, columns, self._may_have() if columns else ())
 
     def _may_have(self) -> Collection[str]:
-        """Return columns of the wide form that are known though they may have no row."""
+        """Return the names of valid columns of the wide form, even if they have no row."""
         return ()
 
     def __array__(self, *how: object, **details: object) -> NoReturn:
-        """Refuse to be one array, which `pandas.DataFrame(batch)` would take. Raises TypeError."""
+        """Raise TypeError, because `pandas.DataFrame(batch)` would convert the rows to one array."""
         raise TypeError(
             "rows are columns of several types, not one array: take them with batch.to_pandas(), "
             "batch.to_polars(), or what speaks Arrow, such as pyarrow.record_batch(batch)"
@@ -123,7 +123,7 @@ class Rows(ArrowTable):
 
 
 class Batch(Rows):
-    """Rows that the core made, and the names whose numbers they hold."""
+    """Rows from the core, with the names for the numbers in them."""
 
     def __init__(self, columns: Columns, drives: Names, registers: Names) -> None:
         self._columns = columns
@@ -143,9 +143,9 @@ class Batch(Rows):
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
 
     def columns(self) -> BatchColumns:
-        """Return the columns as they lie in memory, and the names of their codes.
+        """Return the columns, without a copy, and the names of their codes.
 
-        Without a copy: much cheaper than a Row for programs that go through many rows.
+        For many rows this is much cheaper than a `Row` for each.
         """
         time, sent, uncertainty, drive, register, value, status, valid = (
             self._columns.array(name).toreadonly()
@@ -155,7 +155,7 @@ class Batch(Rows):
         return BatchColumns(time, sent, uncertainty, drive, register, value, status, valid, *names)
 
     def at(self, places: Sequence[int]) -> Batch:
-        """Return a copy of the rows at these places."""
+        """Return a copy of the rows at these indices."""
         return Batch(PickedColumns(self._columns, places), self._drives, self._registers)
 
     def parts(self) -> tuple[Columns, Names, Names]:
@@ -208,7 +208,7 @@ def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
 
 @cache
 def schema() -> Any:
-    """Return the columns of every batch and of every recording."""
+    """Return the Arrow schema of every batch and every recording."""
     arrow = nanoarrow()
     return arrow.c_schema(
         arrow.struct(
@@ -227,9 +227,9 @@ def schema() -> Any:
 
 
 def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
-    """Return an array of the schema from each column's buffers in Arrow's layout, without copying.
+    """Return an array of `schema()` from each column's buffers in Arrow's layout, without copying.
 
-    Raises ValueError or RuntimeError when the buffers are not those of so many rows.
+    Raises ValueError or RuntimeError if the buffers do not have this number of rows.
     """
     c_array_from_buffers = nanoarrow().c_array_from_buffers
     children = [
@@ -240,7 +240,7 @@ def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
 
 
 class GatheredRows(Columns):
-    """Columns that grow by a copy of each batch: the core has its memory back at once."""
+    """Columns that grow by a copy of each batch, so that the core can immediately reuse its memory."""
 
     def __init__(self, drives: Names, registers: Names) -> None:
         self._drives, self._registers = drives, registers
@@ -251,7 +251,10 @@ class GatheredRows(Columns):
         return self._rows
 
     def add(self, batch: Batch) -> bool:
-        """Copy the rows; return False for rows of another poller, whose codes mean other names."""
+        """Copy a batch's rows. Return False, without copying, if they are from another poller.
+
+        The codes of another poller mean other names.
+        """
         columns, drives, registers = batch.parts()
         if drives is not self._drives or registers is not self._registers:
             return False
@@ -269,7 +272,7 @@ class GatheredRows(Columns):
         return bitmap_of(self.array("status"))
 
     def batch(self) -> Batch:
-        """Return all rows so far; none may be added afterwards."""
+        """Return all rows so far. No rows may be added afterwards."""
         return Batch(self, self._drives, self._registers)
 
 

@@ -1,4 +1,4 @@
-"""Jobs: a drive's polls as blocks, each with the exchange that reads it and the layout of its rows."""
+"""Jobs: the blocks in which a drive is polled, each with its exchange and the layout of its rows."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ MOST_NAMES = 1 << 16  # limit of the uint16 name codes
 
 
 class RowNames:
-    """Names of drives and registers; rows hold their numbers."""
+    """Names of drives and registers. Rows store the numbers of names."""
 
     def __init__(self) -> None:
         self.drives = Names()
         self.registers = Names()
 
     def check_room(self, drives: Iterable[PolledDrive]) -> None:
-        """Raise ValueError if the names of these drives or registers exceed the number codes."""
+        """Raise ValueError if, with these drives, there are more names than numbers for them."""
         wanted = list(drives)
         of_drives = {*self.drives.listed, *(polled.drive.name for polled in wanted)}
         of_registers = {*self.registers.listed, *(poll.register.name for d in wanted for poll in d.polls)}
@@ -38,7 +38,7 @@ class RowNames:
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:
-        """Return the rows that a reply with this block becomes."""
+        """Return the layout of the rows into which a reply with this block is decoded."""
         return RowLayout(
             self.drives.number(drive.name),
             [
@@ -56,35 +56,38 @@ class PolledJob(Job):
     block: Block
     exchange: Exchange
     rows: RowLayout
-    own_ns: int  # of silence and characters, to which the response delay comes
-    may_be_too_long: bool  # for the drive
+    own_ns: int  # duration of silence and characters, without the response delay
+    may_be_too_long: bool  # whether the drive may not answer so long a request
 
     @property
     def name(self) -> str:
-        """Drive and first register."""
+        """Name of the drive and of the first register."""
         return f"{self.owner.name}.{self.block.registers[0].name}"
 
 
 @dataclass
 class PlannedJobs:
-    """Jobs that read a drive in the least time, and the plan that they carry out."""
+    """Jobs that read a drive in the least bus time, and their plan."""
 
     jobs: list[PolledJob]
     plan: Plan
 
 
 class JobMaker:
-    """Makes the jobs of one line; the same block at the same rate is always the same job."""
+    """Makes the jobs of one line, and returns the same job for the same block at the same rate."""
 
     def __init__(self, bus: Bus, names: RowNames) -> None:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by rates: a refusal stays known
-        self._skipped = 0  # of jobs that were forgotten
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by all rates, so refusals stay known
+        self._skipped = 0  # skipped slots of forgotten jobs
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
-        """Plan a drive's polls for this response delay in s. Raises ValueError for another's register."""
+        """Plan a drive's polls for this response delay in s; return the jobs.
+
+        Raises ValueError for a register of another drive.
+        """
         drive = polled.drive
         for poll in polled.polls:
             check_own(drive, poll.register)
@@ -104,9 +107,9 @@ class JobMaker:
         return self._made[key]
 
     def forget(self, jobs: Iterable[PolledJob]) -> None:
-        """Keep jobs with a period no longer: rates come and go without number.
+        """Forget those of these jobs that have a period, because rates may change without limit.
 
-        Jobs without a period are kept: the core may repeat them until the port is closed.
+        Jobs without a period are kept, because the core may repeat them until the port is closed.
         """
         for job in jobs:
             key = job.owner, job.block, job.period_ns
@@ -115,7 +118,7 @@ class JobMaker:
                 self._skipped += job.skipped
 
     def forget_drive(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that left for good."""
+        """Forget the jobs of a drive that was removed for good."""
         for key in [key for key in self._made if key[0] is drive]:
             self._skipped += self._made.pop(key).skipped
         self._rows = {key: rows for key, rows in self._rows.items() if key[0] is not drive}
@@ -123,7 +126,7 @@ class JobMaker:
     def make(
         self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None
     ) -> PolledJob:
-        """Make a job of its own."""
+        """Return a new job, which `job` does not return again."""
         rows = rows or self._names.layout(drive, block)
         own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
         return PolledJob(
@@ -143,5 +146,5 @@ class JobMaker:
 
     @property
     def skipped(self) -> int:
-        """Slots that were left out because the line was busy."""
+        """Number of slots that were skipped because the line was busy."""
         return self._skipped + sum(job.skipped for job in self._made.values())

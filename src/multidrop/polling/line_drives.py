@@ -1,6 +1,6 @@
 """LineDrives: the drives of one line, their jobs, and their measured delays.
 
-Blocks are planned again when a drive's measured response delay differs from its document's.
+A drive's blocks are planned again if its measured response delay differs too much from the planned one.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from multidrop.polling.port_queue import Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.transport import clock
 
-MARGIN = 0.05  # of a response delay, by which it may be outside those that a plan suits
+MARGIN = 0.05  # fraction by which a response delay may lie outside the range of its plan
 
 
 class LineDrives:
-    """Drives that come and go on one line; the caller holds the line's lock."""
+    """The drives of one line, which may be added and removed; the caller holds the line's lock."""
 
     def __init__(self, bus: Bus, schedule: Schedule[PolledJob], maker: JobMaker, refusals: Refusals) -> None:
         self.schedule = schedule
         self._bus = bus
         self._maker = maker
         self._refusals = refusals
-        self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that were removed
-        self._present: dict[Drive, PolledDrive] = {}  # of drives that are here
-        self._since_ns: dict[Drive, int] = {}  # when the present way of polling each started
-        self._gone: dict[int, Peer] = {}  # of drives that left, by address: it may be asked yet
+        self._planned: dict[PolledDrive, PlannedJobs] = {}  # includes removed drives
+        self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
+        self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
+        self._gone: dict[int, Peer] = {}  # peers of removed drives, by address; may still be in an exchange
         self._polled: list[tuple[Drive, Peer]] = []
-        self._observed: list[tuple[int, int, bool]] = []  # of each: failures, late until, has answered
+        self._observed: list[tuple[int, int, bool]] = []  # for each: failures, late until, has answered
 
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
@@ -42,18 +42,18 @@ class LineDrives:
 
     @property
     def since_ns(self) -> dict[str, int]:
-        """By name, the time in ns since which each present drive is polled as it is now."""
+        """By drive name, when the drive's polls were last changed (ns, CLOCK_MONOTONIC)."""
         return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def polled_of(self, drive: Drive) -> PolledDrive:
         return self._present[drive]
 
     def take_gone(self, address: int) -> Peer | None:
-        """Return the peer of a drive that left this address, once; any thread may ask, without the lock."""
+        """Return, only once, the peer of a drive that was removed from this address; needs no lock."""
         return self._gone.pop(address, None)
 
     def add(self, polled: PolledDrive, *, is_started: bool) -> None:
-        """Attach one more drive, and schedule its jobs where polling has started."""
+        """Attach a drive, and schedule its jobs if polling has started."""
         drive = self._bus.attach(polled.drive)
         try:
             if polled not in self._planned:
@@ -69,7 +69,7 @@ class LineDrives:
             self.begin(drive, clock.now_ns())
 
     def begin(self, drive: Drive, due_ns: int) -> None:
-        """Schedule the jobs of a drive, due from this time on."""
+        """Schedule the jobs of a drive, first due at `due_ns`."""
         jobs = self._planned[self._present[drive]].jobs
         for job in jobs:
             self.schedule.add(job, due_ns)
@@ -77,7 +77,7 @@ class LineDrives:
             self.schedule.back_off.meet(drive.address)
 
     def begin_anew(self, now_ns: int) -> None:
-        """Reschedule the jobs of all drives after a failure during planning."""
+        """Schedule the jobs of all drives again; a failure may have left the schedule incomplete."""
         self.schedule.clear()
         self._observed = []
         for drive in self._present:
@@ -133,7 +133,7 @@ class LineDrives:
         Refused registers are polled normally again.
         """
         present = self._jobs(drive)
-        dues = {job.period_ns: job.due_ns for job in sorted(present, key=_due, reverse=True)}  # the first
+        dues = {job.period_ns: job.due_ns for job in sorted(present, key=_due, reverse=True)}  # earliest each
         self._refusals.forget(drive)
         old = [job for job in present if job not in wanted]
         for period_ns in dict.fromkeys(job.period_ns for job in [*wanted, *old]):
@@ -152,7 +152,7 @@ class LineDrives:
     # ---- what their answers show ----
 
     def observe(self, now_ns: int) -> None:
-        """Report silent drives and late replies to the schedule."""
+        """Report the drives' failures and late replies to the schedule's back-off, if they changed."""
         seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
         if seen == self._observed:
             return
@@ -168,21 +168,21 @@ class LineDrives:
             )
 
     def measure(self) -> dict[Drive, float]:
-        """Take the drives' measured response delays into durations of exchanges; return them, in s."""
+        """Update exchange durations with the drives' measured response delays; return the delays in s."""
         delays = {drive: peer.response_delay for drive, peer in self._polled}
         for job in self.schedule.jobs:
             job.duration_ns = job.own_ns + round((delays[job.owner] or job.owner.response_delay) * 1e9)
         return delays
 
     def plan_anew(self, delays: Mapping[Drive, float], now_ns: int) -> None:
-        """Plan drives again whose measured delays no longer suit their plans."""
+        """Plan those drives again whose measured delays no longer suit their plans."""
         for polled in self._present.values():
             planned, delay = self._planned[polled], delays.get(polled.drive)
             if delay and not planned.plan.suits(delay, MARGIN):
                 self._plan_anew(polled, planned, delay, now_ns)
 
     def _plan_anew(self, polled: PolledDrive, before: PlannedJobs, delay: float, now_ns: int) -> None:
-        """Replace a drive's jobs by better ones, unless blocks are split because of refusals."""
+        """Replace a drive's jobs by those of a new plan, unless refusals have split its blocks."""
         if not set(before.jobs) <= set(self.schedule.jobs):
             return
         anew = self._maker.plan(polled, delay)

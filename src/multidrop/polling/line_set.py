@@ -1,4 +1,4 @@
-"""LineSet: the lines of a poller, which come and go while it polls."""
+"""LineSet: the lines of a poller, which may be added and removed while it polls."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from multidrop.polling.polled_line import PolledLine
 from multidrop.transport import clock
 from multidrop.transport.open_port import check_port
 
-OPENING = 32  # ports at a time: one that takes its time holds up no other
+OPENING = 32  # number of ports opened concurrently, so that a slow one delays no other
 ENDING_NS = 1_000_000_000  # how long to wait for in-flight exchanges
-NOBODY = 0  # reserved: no line's number
+NOBODY = 0  # reserved: never a line's number
 MOST_LINES = (1 << 16) - 1  # limit of a row queue's line numbers
 
 
 class LineSet:
-    """Lines, each with a number by which the core calls for it; one thread at a time changes them."""
+    """Lines, each with the number by which the core identifies it; only one thread at a time changes them."""
 
     def __init__(
         self,
@@ -43,10 +43,10 @@ class LineSet:
         self._ledger = ledger
         self._audit = audit
         self._mastership = mastership
-        self.stops_on_exit = False  # of lines that come, too
+        self.stops_on_exit = False  # whether `stop_on_exit` applies, also to lines added later
         self._lines: tuple[PolledLine, ...] = ()  # replaced, never mutated: readers iterate without a lock
         self._numbered: dict[int, PolledLine] = {}
-        self._free: list[int] = []  # numbers numbers of removed lines
+        self._free: list[int] = []  # numbers of removed lines
 
     def __iter__(self) -> Iterator[PolledLine]:
         return iter(self._lines)
@@ -67,7 +67,10 @@ class LineSet:
         raise ValueError(f"there is no line {name!r}; there are {names or 'none'}")
 
     def find_drive(self, drive: Drive | str) -> tuple[PolledLine, Drive]:
-        """Return a drive, given itself or its name, and its line. Raises ValueError if it is not polled."""
+        """Return the line and the drive object of a drive that is given as an object or by name.
+
+        Raises ValueError if the drive is not polled.
+        """
         drives = {each.drive.name: (line, each.drive) for line in self._lines for each in line.polled}
         name = drive if isinstance(drive, str) else drive.name
         line, known = drives.get(name, (None, None))
@@ -82,7 +85,11 @@ class LineSet:
     # ---- coming ----
 
     def fill(self, declared: Sequence[PlantLine]) -> None:
-        """Add all these lines; none is open after LineError for a port, ValueError, or an interruption."""
+        """Open and add all these lines, or none.
+
+        Raises LineError if a port cannot be opened, ValueError for a drive that cannot be on its line. After
+        any exception, no port is left open.
+        """
         buses: dict[int, Bus] = {}
         failures: dict[int, OSError] = {}
         with ExitStack() as stack:
@@ -136,14 +143,14 @@ class LineSet:
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:
-            if self._mastership and not self._mastership.holds:  # it is opened once this process is master
+            if self._mastership and not self._mastership.holds:  # open it once this process is the master
                 return self.await_port(line)
             return self._bus(Bus, line)
-        except OSError as failure:  # of the port, which is a LineError, or of the audit log
+        except OSError as failure:  # a LineError of the port, or another OSError of the audit log
             return failure
 
     def await_port(self, line: PlantLine) -> Bus:
-        """Return a bus for a port that is not there yet."""
+        """Return a bus whose port is opened later."""
         return self._bus(Bus.awaiting, line)
 
     def _bus(self, make: Callable[..., Bus], line: PlantLine) -> Bus:
@@ -159,24 +166,24 @@ class LineSet:
         )
 
     def add(self, declared: PlantLine, bus: Bus) -> PolledLine:
-        """Add a line, not polled yet. Raises ValueError for a drive that cannot be on it."""
+        """Add a line without polling it yet. Raises ValueError for a drive that cannot be on the line."""
         number = self._free[-1] if self._free else len(self._lines) + 1
         line = PolledLine(declared, number, bus, self._row_queue, self.names)
         if self._free:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
-        if self.stops_on_exit:  # checked last: a thread that sets it later sees this line
+        if self.stops_on_exit:  # checked last: a thread that sets it after this check sees this line
             bus.stop_on_exit()
         return line
 
     def put_in_order(self, names: Sequence[str]) -> None:
-        """Put the lines in the order of their names here."""
+        """Sort the lines in the order of these names."""
         places = {name: place for place, name in enumerate(names)}
         self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
 
     def check_port(self, port: str) -> None:
-        """Raise NoSuchPort for an impossible port name."""
+        """Raise NoSuchPort for an invalid port name."""
         check_port(port, self._mastership)
 
     def check_audit(self) -> None:
@@ -214,22 +221,22 @@ class LineSet:
         going = list(lines)
         with ExitStack() as stack:
             for line in reversed(going):
-                stack.callback(line.close, why)  # whatever becomes of the others
+                stack.callback(line.close, why)  # even if closing another line fails
             self.wind_down(going)
 
     def wind_down(self, lines: Sequence[PolledLine]) -> None:
-        """Stop polling these lines and wait for exchanges under way, a second at most.
+        """Stop polling these lines, and wait for stops and exchanges in flight.
 
-        Drives whose bus had `stop_on_exit` are stopped first, and stops under way are waited for; exchanges
-        under way for ENDING_NS, and not beyond the end of the mastership: half of its guard later the kernel
-        ends a process whose ports are still open.
+        Drives whose bus has `stop_on_exit` are stopped first. All stops are waited for. Exchanges in flight
+        are waited for up to ENDING_NS, but not beyond the end of the mastership: half of its guard time later
+        the kernel kills a process whose ports are still open.
         """
         for line in lines:
-            line.bus.leave()  # concurrently
+            line.bus.leave()  # starts the stops of all lines before waiting for any
         for line in lines:
             line.leave()
         for line in lines:
-            line.bus.part()  # before the port is closed, on which it stops motors
+            line.bus.part()  # waits for the stops, which need the open port
         given_up_ns = clock.now_ns() + self._patience_ns()
         while sum(line.end() for line in lines) and clock.now_ns() < given_up_ns:
             clock.sleep(0.001)
@@ -240,7 +247,7 @@ class LineSet:
 
 
 def _settled(work: Callable[[], Bus | OSError]) -> Future[Bus | OSError]:
-    """Do this, and return its end, whatever it is."""
+    """Call `work`; return a future with its result or its exception."""
     future: Future[Bus | OSError] = Future()
     try:
         future.set_result(work())

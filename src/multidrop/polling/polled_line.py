@@ -1,4 +1,4 @@
-"""PolledLine: one line that is polled: its drives, its schedule, and a port that may be lost."""
+"""PolledLine: the polling of one line, with its drives, its schedule, and a port that may be lost."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class Reopening:
-    """Attempts to open a lost port again, one at a time, in a thread: a slow one delays no other line."""
+    """Attempts to reopen a lost port, one at a time, in a thread, so that a slow one delays no other line."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -41,7 +41,7 @@ class Reopening:
         return self._thread is not None and self._thread.is_alive()
 
     def begin(self) -> None:
-        """Start an attempt. Without a free thread, stops open the port themselves."""
+        """Start an attempt. If the system has no thread left, stops reopen the port themselves."""
         thread = threading.Thread(target=self._attempt, name="multidrop reopening", daemon=True)
         self._thread = None
         with suppress(RuntimeError, MemoryError):
@@ -50,7 +50,7 @@ class Reopening:
         self._bus.tended(self._thread is not None)
 
     def join(self) -> None:
-        """Wait for the end of an attempt that is under way."""
+        """Wait until the current attempt, if any, is over."""
         if self._thread is not None:
             self._thread.join()
 
@@ -66,7 +66,7 @@ class Reopening:
 
 
 def line_summary(seconds: float, peers: Mapping[str, Peer]) -> dict[str, Any]:
-    """Return the summary of a line's exchanges in `seconds` s, in total and by drive."""
+    """Return the summary of a line's exchanges, in total and by drive, over `seconds` s."""
     line = line_statistics(seconds, {name: peer.counters() for name, peer in peers.items()}, None)
     return {
         "seconds": round(seconds, 3),
@@ -95,32 +95,33 @@ def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
     }
 
 
-LEARN_NS = 1_000_000_000  # interval of measuring exchange durations
-RELEARN_NS = 2_000_000_000  # the same, while the core repeats the bus cycle
-REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
-STANDBY_NS = 500_000_000  # between rows of a line that is not polled at present
-RETRY_NS = 500_000_000  # after a failure; doubled by each further one
+LEARN_NS = 1_000_000_000  # interval between measurements of exchange durations
+RELEARN_NS = 2_000_000_000  # the same interval while the core repeats the bus cycle
+REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
+STANDBY_NS = 500_000_000  # interval between miss rows of a line that is not polled at present
+RETRY_NS = 500_000_000  # pause after polling failed; doubled by each further failure
 LONGEST_RETRY_NS = 30_000_000_000
-SOUND_NS = 10_000_000_000  # after which a line is polled well again
+SOUND_NS = 10_000_000_000  # time without a failure after which earlier failures are forgotten
 
 _log = logging.getLogger("multidrop.polling")
 
 
 class PolledLine:
-    """A line's bus, drives and schedule; the core calls for attention by `number`.
+    """A line's bus, drives and schedule.
 
-    Any thread may add and remove drives; the poller's thread calls `tend`.
+    `number` identifies the line when the core requests attention for it. Any thread may add and remove
+    drives; the poller's thread calls `tend`.
     """
 
     def __init__(
         self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
     ) -> None:
-        self.declared = declared  # but for its drives, which come and go
+        self.declared = declared  # valid except for its drives, which change
         self.bus = bus
-        self.switching = declared.switching  # s that a change of settings takes; in the end as measured
+        self.switching = declared.switching  # s that a change of settings takes; after `end`, as measured
         self.started_ns = clock.now_ns()
         self.number = number
-        self._is_left = False  # no longer tended
+        self._is_left = False  # whether `leave` was called
         self._ended_ns: int | None = None  # when polling ended
         self._over_ns: int | None = None  # when the last exchange ended
         self._row_queue = row_queue
@@ -134,11 +135,11 @@ class PolledLine:
         self._reopening = Reopening(bus)
         self._lost_ns = self._reopen_ns = 0
         self._standby_ns = 0
-        self.failure = ""  # of its polling since it was last sound; "": none
-        self._failures = 0  # in a row
-        self._retry_ns = 0  # after the last one
-        self._is_broken = False  # the plan may be incomplete
-        self._lock = threading.Lock()  # of all above: drives come and go on any thread
+        self.failure = ""  # the last failure of polling; "" after SOUND_NS without another
+        self._failures = 0  # number of failures in a row
+        self._retry_ns = 0  # when to poll again after the last failure
+        self._is_broken = False  # whether a failure may have left the schedule incomplete
+        self._lock = threading.Lock()  # for everything above, because any thread may add and remove drives
         register_at_fork(self)
         try:
             for polled in declared.drives:
@@ -167,26 +168,27 @@ class PolledLine:
         return self._drives.since_ns
 
     def add(self, polled: PolledDrive) -> None:
-        """Poll one more drive; one that comes back has the jobs that it had.
+        """Start polling a drive; one that was polled before has the same jobs again.
 
-        Wait first for the last exchange of another drive at its address: its late replies are known then.
+        Wait first for the last exchange of an earlier drive at its address: only then are that drive's late
+        replies known.
         """
         self.await_gone(polled.drive.address)
-        settings = polled.drive.settings  # here, as the polling must not wait for a port that is being opened
+        settings = polled.drive.settings  # before locking: polling must not wait while a port is being opened
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
             self._drives.add(polled, is_started=self._is_started)
         self._row_queue.call(self.number)
 
     def put_in_order(self) -> None:
-        """Ask the drives in the order in which their settings are changed in the least time."""
+        """Poll the drives in the order in which changes of the line's settings take the least time."""
         with self._lock:
             ordered = in_order(self.bus.drives, self.switching)
             self._schedule.put_in_order([drive.address for drive in ordered])
         self._row_queue.call(self.number)
 
     def await_gone(self, address: int) -> None:
-        """Wait for the last exchange of the drive that left this address."""
+        """Wait for the last exchange of a drive that was removed from this address."""
         peer = self._drives.take_gone(address)
         while peer and not self._is_left and self.bus.is_asking(peer):
             clock.sleep(GONE_S)
@@ -206,17 +208,17 @@ class PolledLine:
             self._drives.forget(drive)
 
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
-        """Set the period in s of a polled register, or of all of them with None.
+        """Set the period `every` in s of a polled register, or of all of them if `register` is None.
 
-        Unchanged registers keep their slots. A new rate starts with a slot now. Raises ValueError for a
-        register that is not polled.
+        `every` None means as fast as possible. Unchanged registers keep their slots. A new rate starts with a
+        slot now. Raises ValueError for a register that is not polled.
         """
         with self._lock:
             after = self._drives.polled_of(drive).at_rate(register, every)
         self.set_polls(after)
 
     def set_polls(self, after: PolledDrive) -> None:
-        """Poll other registers of a drive that is here, or at other rates; what stays keeps its slots."""
+        """Change the polled registers or the rates of a present drive; unchanged polls keep their slots."""
         with self._lock:
             if not self._drives.set_polls(after, is_started=self._is_started):
                 return
@@ -229,7 +231,7 @@ class PolledLine:
             self.started_ns = clock.now_ns()
             self.bus.tended(True)
             self.bus.reset_statistics()
-            polled = [polled.drive for polled in self.polled]  # others may be attached to the bus by hand
+            polled = [polled.drive for polled in self.polled]  # the bus may have other drives too
             for drive in in_order(polled, self.switching):
                 self._drives.begin(drive, self.started_ns)
             self._is_started = True
@@ -240,23 +242,23 @@ class PolledLine:
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
     def is_well(self, now_ns: int) -> bool:
-        """Return True while its port is there and all of its drives answer: it only has to be kept busy."""
+        """Return True while the port is open, this process is the master, and all drives answer."""
         if self._queue.port is None or self._queue.port is not self.bus.line.queue:
             return False
         is_asked = not self._schedule.unasked and not self._schedule.back_off.may_sleep(now_ns)
         return is_asked and self.bus.line.may_send
 
     def tend(self, now_ns: int) -> None:
-        """Note the results of queued exchanges, and queue the next ones.
+        """Process the results of queued exchanges, and queue the next ones.
 
-        Never raises: a failure, such as one of a user's own class, is logged, the line's values are rows
-        with the status POLLING_FAILED, and polling is tried again later.
+        Never raises. A failure, such as one in a user's own class, is logged; polling is tried again later,
+        and until then the line's rows are misses with the status POLLING_FAILED.
         """
-        if self._is_left:  # its lock may be held until the port is closed
+        if self._is_left:  # the lock may be held until the port is closed
             return
         try:
             self._tend(now_ns)
-        except BaseException as failure:  # also SystemExit, of a user's class: other lines go on
+        except BaseException as failure:  # even SystemExit from a user's class must not end other lines
             self._fail(failure, now_ns)
 
     def _fail(self, failure: BaseException, now_ns: int) -> None:
@@ -269,7 +271,10 @@ class PolledLine:
         log_aside(_log, logging.ERROR, said, self.name, delay_ns / 1e9, self.failure, traceback_of(failure))
 
     def _is_sound(self, now_ns: int) -> bool:
-        """Return True unless polling failed and is not to be tried again yet; then its values are missed."""
+        """Return True if polling may continue after a failure.
+
+        Until the next attempt is due, return False, and make misses of the values that are due.
+        """
         if self._is_broken:
             self._queue.abandon()
             self._drives.begin_anew(now_ns)
@@ -295,7 +300,7 @@ class PolledLine:
                 else:
                     self._stand_by(now_ns, Status.NOT_MASTER)
                 return
-            if port is not self._queue.port:  # a stop may have opened it again before the loss was seen here
+            if port is not self._queue.port:  # the port was opened, or a stop has already reopened it
                 self._queue.give_back()
                 self._queue.move_to(port)
                 port.report_to(self._row_queue, self.number)
@@ -316,7 +321,7 @@ class PolledLine:
             self._miss_unasked(now_ns)
 
     def _learn(self, now_ns: int) -> None:
-        """Take the drives' measured response delays into durations of exchanges and into the plan."""
+        """Update exchange durations and the plan with the drives' measured response delays."""
         self._learnt_ns = now_ns
         delays = self._drives.measure()
         self._queue.measure()
@@ -331,7 +336,7 @@ class PolledLine:
                 self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
-        """Make rows of slots that passed unasked once they are due: they are planned ahead."""
+        """Make misses of the skipped slots that are due; slots may be skipped before they are due."""
         unasked = self._schedule.unasked
         if unasked:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)
@@ -340,7 +345,7 @@ class PolledLine:
     # ---- not the master, a port that is lost, and the end ----
 
     def _stand_by(self, now_ns: int, why: Status) -> None:
-        """Queue no exchange, and make a miss of every value that is due."""
+        """Every STANDBY_NS, make a miss of each value that is due, instead of polling."""
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
             self._miss(self._schedule.pass_all(now_ns), why)
@@ -352,9 +357,9 @@ class PolledLine:
         self._lost_ns = self._reopen_ns = now_ns
 
     def _regain(self, now_ns: int) -> None:
-        """Open the port again in a thread; until it is back every value that is due is missed.
+        """Reopen the port in a thread; until that succeeds, make a miss of each value that is due.
 
-        The first attempt makes no misses: a port that is back at once continues in the same slot.
+        The first attempt makes no misses, so that a port that is back immediately continues in the same slot.
         """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
@@ -370,7 +375,7 @@ class PolledLine:
         self.bus.tended(False)
 
     def end(self) -> bool:
-        """Stop polling and reopening; return True while an exchange is still under way."""
+        """Stop polling and reopening; return True while an exchange is still in flight."""
         self._reopening.join()
         self._ended_ns = self._ended_ns or clock.now_ns()
         if port := self.bus.line.queue:
@@ -378,7 +383,7 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Close the bus after making rows of all slots that are over; later calls fail with `why`."""
+        """Make misses of all slots that are over, and close the bus; later calls fail with `why`."""
         self.bus.line.why_closing = why
         with self._lock:
             try:
@@ -418,5 +423,5 @@ class PolledLine:
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
-    """Return the slots that end by `ended_ns`: a longer one has missed no value yet."""
+    """Return the slots that end by `ended_ns`; in a slot that ends later, no value is missed yet."""
     return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]

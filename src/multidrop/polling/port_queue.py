@@ -1,7 +1,7 @@
-"""PortQueue: exchanges that the core has to carry out on a port, queued some way ahead or repeated.
+"""PortQueue: exchanges that the core carries out on a port, queued in advance or repeated.
 
-Where all drives of a line answer and are polled as fast as it allows, the core repeats the bus cycle by
-itself; else the queue is topped up, many exchanges at a time.
+If all drives of a line answer and are polled as fast as possible, the core repeats the bus cycle by itself.
+Otherwise the queue is refilled with many exchanges at a time.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from multidrop.core import Port
 from multidrop.planning.schedule import Schedule, Turn
 from multidrop.polling.jobs import PolledJob
 
-AHEAD_NS = 300_000_000  # so far ahead exchanges are queued
+AHEAD_NS = 300_000_000  # how far in advance exchanges are queued
 
-Slot = tuple[PolledJob, int]  # and when it was due, ns
+Slot = tuple[PolledJob, int]  # a job, and when it was due in ns
 
 
 class PortQueue:
-    """Jobs of a schedule on the port that is open now."""
+    """The exchanges of a schedule's jobs on the currently open port."""
 
     def __init__(self, schedule: Schedule[PolledJob]) -> None:
         self._schedule = schedule
         self.port: Port | None = None
-        self._done = 0  # exchanges on it, when they were counted last
-        self._queued: deque[Turn[PolledJob]] = deque()  # that the core has not carried out yet
-        self._ahead_ns = 0  # that these will take
-        self._newest: Turn[PolledJob] | None = None  # the last one carried out
-        self._cycle: list[PolledJob] = []  # that the core repeats
+        self._done = 0  # the port's number of completed exchanges at the last count
+        self._queued: deque[Turn[PolledJob]] = deque()  # turns that the core has not carried out yet
+        self._ahead_ns = 0  # total duration of the queued turns
+        self._newest: Turn[PolledJob] | None = None  # the last turn carried out
+        self._cycle: list[PolledJob] = []  # jobs that the core repeats
 
     @property
     def is_repeating(self) -> bool:
@@ -38,8 +38,8 @@ class PortQueue:
         self.port, self._done = port, port.done
 
     def conclude(self, port: Port) -> None:
-        """Tell the schedule which exchanges were carried out."""
-        if port is not self.port:  # reopened since: its queue is empty
+        """Report to the schedule which exchanges were carried out."""
+        if port is not self.port:  # the port was reopened, and its queue is empty
             return
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):
@@ -50,7 +50,7 @@ class PortQueue:
         self._done = done
 
     def keep_busy(self, port: Port, now_ns: int) -> None:
-        """Let the core repeat the bus cycle, or else queue the next exchanges."""
+        """Let the core repeat the bus cycle if possible; otherwise queue the next exchanges."""
         cycle = self._schedule.cycle(now_ns)
         if cycle != self._cycle or port.repeating != bool(cycle):
             self.pause(port)
@@ -86,18 +86,18 @@ class PortQueue:
             self._ahead_ns += sum(turn.job.duration_ns for turn in turns)
 
     def measure(self) -> None:
-        """Sum up again how long the queue takes: durations of jobs have changed."""
+        """Recompute the total duration of the queued turns, because durations of jobs have changed."""
         self._ahead_ns = sum(turn.job.duration_ns for turn in self._queued)
 
     def slots(self) -> list[Slot]:
-        """Return the slots that are queued and not carried out."""
+        """Return the slots of the queued turns."""
         return [(turn.job, turn.due_ns) for turn in self._queued if turn.due_ns is not None]
 
     def give_back(self) -> None:
         """Return unsent exchanges to the schedule, because the port failed.
 
-        An exchange that the failure cut off is retried first, unless it was the first one on its port: a
-        device may end the connection at each request that it rejects.
+        An exchange that the failure interrupted is retried first, unless it was the first one on its port: a
+        device may close the connection after each request that it rejects.
         """
         if self.port is not None:
             self.conclude(self.port)

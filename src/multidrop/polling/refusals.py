@@ -1,9 +1,10 @@
 """Refusals: split blocks that a drive does not answer as a whole, and poll refused registers rarely.
 
-So no register is lost because of its neighbours. A register that is answered after all is polled as before,
-and so is a whole that was split: now and then it is tried again, without rows. A block may also be too long
-for its drive, which then keeps silent. It is split too, if the class states no limit, the block was
-never answered, and the drive answers other requests; a silent drive gets a request for one register.
+So no register is lost because of its neighbours. Refused registers and split blocks are retried every
+SET_ASIDE_NS, and polled as before once the drive answers them. Rows are not made from the retries of a split
+block. A drive may also give no reply to a block that is too long. Such a block is split if the class states
+no limit, the block was never answered, and the drive answers other requests. A drive that answers nothing is
+sent requests for one register.
 """
 
 from __future__ import annotations
@@ -17,28 +18,28 @@ from multidrop.planning.schedule import Schedule
 from multidrop.polling.jobs import JobMaker, PolledJob
 from multidrop.transport.aside_log import log_aside
 
-REFUSALS = 3  # exceptions in a row before a block is split or a register set aside
-FAILURES = 3  # requests in a row for a block without a reply, while the drive answers others
-SET_ASIDE_NS = 60_000_000_000  # interval of retrying refused blocks
+REFUSALS = 3  # exceptions in a row before a block is split or a register is set aside
+FAILURES = 3  # unanswered requests in a row before a block is split, if the drive answers others
+SET_ASIDE_NS = 60_000_000_000  # interval between retries of refused blocks
 
 _log = logging.getLogger("multidrop.polling")
 
 
 class Refusals:
-    """Registers of one line that are set aside, and blocks that are split."""
+    """Registers of one line that are set aside (polled rarely), and blocks that are split."""
 
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
-        self._set_aside: dict[PolledJob, PolledJob] = {}  # the rare job, and the one it replaces
-        self._rare: dict[PolledJob, PolledJob] = {}  # by the job that each replaces
-        self._wholes: dict[PolledJob, PolledJob] = {}  # the planned job, by each of its parts
-        self._trials: dict[PolledJob, PolledJob] = {}  # the rare attempt, and the planned job that it makes
-        self._probes: dict[int, PolledJob] = {}  # by drives that have only blocks that may be too long
+        self._set_aside: dict[PolledJob, PolledJob] = {}  # from a rare job in use to the job it replaces
+        self._rare: dict[PolledJob, PolledJob] = {}  # from a job to the rare job that can replace it
+        self._wholes: dict[PolledJob, PolledJob] = {}  # from a part to the planned job that was split
+        self._trials: dict[PolledJob, PolledJob] = {}  # from a retry of a split block to its planned job
+        self._probes: dict[int, PolledJob] = {}  # by address of a drive all of whose blocks may be too long
 
     @property
     def names(self) -> list[str]:
-        """Drives and registers that are set aside now."""
+        """Names, as DRIVE.REGISTER, of the registers that are set aside now."""
         return [
             f"{job.owner.name}.{register.name}" for job in self._set_aside for register in job.block.registers
         ]
@@ -49,7 +50,7 @@ class Refusals:
             self._make_whole(trial, now_ns)
         for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
             job = self._set_aside.pop(rare)
-            job.rows.refusals = 0  # not before: as it was set aside the core may have had it under way
+            job.rows.refusals = 0  # only now: the job may have been in flight when it was set aside
             self._schedule.replace([rare], [job], now_ns)
         for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
             if parts := halves(job.owner, job.block):
@@ -63,7 +64,7 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True if a job needs splitting or setting aside; for a part of a refused block at once."""
+        """Return True if a job must be split or set aside: after REFUSALS, or for a part after the first."""
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
             return False
@@ -93,7 +94,7 @@ class Refusals:
         log_aside(_log, logging.INFO, said, job.name, len(job.block.registers) - 1, why)
 
     def _try_rarely(self, whole: PolledJob, now_ns: int) -> None:
-        """Try now and then whether a block is answered as a whole after all."""
+        """Every SET_ASIDE_NS, check whether the drive answers a split block as a whole after all."""
         if whole in self._trials.values():
             return
         trial = self._maker.make(whole.owner, whole.block, SET_ASIDE_NS, rows=RowLayout(0, []))
@@ -135,7 +136,7 @@ class Refusals:
             self._schedule.remove(self._probes.pop(address))
 
     def forget(self, drive: Drive) -> None:
-        """Forget the refusals of a drive that leaves."""
+        """Forget the refusals of a drive that is being removed."""
         self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare.owner is not drive}
         self._rare = {job: rare for job, rare in self._rare.items() if job.owner is not drive}
         self._trials = {trial: job for trial, job in self._trials.items() if trial.owner is not drive}

@@ -1,6 +1,6 @@
 """RowSource: the rows of a poller, as batches.
 
-Rows gather in the core, in chunks of bounded number, and are taken from there, the oldest first.
+Rows are collected in the core, in a limited number of chunks, and taken from there, the oldest first.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _DEFERRED = (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.i
 
 
 def check_function(function: object) -> None:
-    """Raise TypeError unless this is a plain function: a call does not run an async or generator function."""
+    """Raise TypeError unless this is a plain function: a call of an async or generator one runs nothing."""
     if not callable(function):
         raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
     while isinstance(function, partial):
@@ -52,9 +52,9 @@ def _check_returned(function: object, returned: object) -> None:
 
 
 class BatchCaller:
-    """Calls a function with each batch on its own thread, until the poller is closed.
+    """Calls a function with each batch, on a thread of its own, until the poller is closed.
 
-    The first failure of the function ends that, is logged at once, and is raised by `raise_failure`.
+    The first failure of the function ends the calls, is logged immediately, and is raised by `raise_failure`.
     """
 
     def __init__(self, batches: Iterable[Batch], function: Callable[[Batch], object]) -> None:
@@ -70,12 +70,12 @@ class BatchCaller:
                 _check_returned(self._function, self._function(batch))
         except PollingFailed:
             pass  # the poller has logged it, and raises it itself
-        except BaseException as failure:  # whatever it is, the caller of close() must see it
+        except BaseException as failure:  # of any kind: the caller of close() must see it
             self._failure = failure
             _log.error("on_batch: the function failed, and is called no more", exc_info=failure)
 
     def join(self) -> None:
-        """Wait until the last batch is handed out; not in the function itself."""
+        """Wait until the function has had the last batch. Does nothing if called by the function itself."""
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -86,25 +86,25 @@ class BatchCaller:
             raise failure
 
 
-FILLING_NS = 10_000_000  # for which new rows gather before they are taken from a chunk that is not full
-ASYNC_LOOK_S = 0.05  # between looks for rows in an event loop
+FILLING_NS = 10_000_000  # minimum interval between batches taken from a chunk that is not full
+ASYNC_LOOK_S = 0.05  # interval between checks for rows in an event loop
 
 
 class RowSource:
-    """Rows that wait in the core's queue until they are taken."""
+    """Rows in the core's queue, and the ways to take them."""
 
     def __init__(self, row_queue: RowQueue, names: RowNames) -> None:
         self._row_queue = row_queue
         self._names = names
         self._wakeup = WakeUp()
-        self._is_watched = False  # `fileno` was called
-        self._taken_ns = 0  # the newest rows
+        self._is_watched = False  # whether `fileno` was called
+        self._taken_ns = 0  # when rows of the newest chunk were last taken
         self._closing = False
-        self._over = threading.Event()  # all lines are closed, and no further row comes
+        self._over = threading.Event()  # set once all lines are closed, so that no further rows come
         self._caller: BatchCaller | None = None
-        self._changing = threading.Lock()  # one drive or line comes or goes at a time
+        self._changing = threading.Lock()  # held while a drive or line is added or removed
         self.failure: PollingFailed | None = None
-        """Why polling has ended by itself, on all lines; None: it has not."""
+        """Why polling has ended by itself on all lines; None if it has not."""
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
@@ -113,9 +113,9 @@ class RowSource:
         return self._wakeup.fileno()
 
     def take(self) -> Batch | None:
-        """Return the oldest rows that wait, at once; None when there are none, or only a few new ones.
+        """Return the oldest queued rows without waiting; None if there are none, or only a few new ones.
 
-        Raises PollingFailed if polling has failed, and no rows are left.
+        Raises PollingFailed if polling has failed and no rows are left.
         """
         now, chunks = clock.now_ns(), self._row_queue.chunks
         if chunks < 2:
@@ -130,10 +130,10 @@ class RowSource:
         return Batch(columns, self._names.drives, self._names.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
-        """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops.
+        """Yield batches as they come, about one every `every` s, for `seconds` s or until the poller closes.
 
-        Once the poller is closed, the remaining batches come at once, and the iterator ends. Raises
-        PollingFailed like `take`.
+        Once the poller is closed, the remaining batches are yielded immediately. Raises PollingFailed like
+        `take`.
         """
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         is_over = False
@@ -144,16 +144,16 @@ class RowSource:
                 yield batch
 
     def __iter__(self) -> Iterator[Batch]:
-        """Yield batches until the poller is closed; what `batches()` yields."""
+        """Yield batches until the poller is closed, like `batches()`."""
         return self.batches()
 
     async def __aiter__(self) -> AsyncIterator[Batch]:
         """Yield batches until the poller is closed, without blocking the event loop.
 
-        A batch is taken only when it is yielded: if the task is cancelled, rows that wait stay for the next
-        taker, also after the poller is closed.
+        A batch is taken only when it is yielded. So if the task is cancelled, queued rows stay for the next
+        consumer, even after the poller is closed.
         """
-        import asyncio  # takes 4 MB, which other programs save
+        import asyncio  # imported here, because it uses 4 MB that other programs save
 
         is_over = False
         while not is_over:
@@ -167,11 +167,12 @@ class RowSource:
     def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
         """Call `function` with each of `batches()` on a thread of its own, until the poller is closed.
 
-        A slow function delays no line: rows wait in the core's queue, and further ones
-        are dropped and counted in `summary()`. Closing waits until it has had the last batch. When it
-        raises, that is logged at once, the calls end, and closing raises the same. A batch goes to
-        one taker: do not take others beside it. Raises ValueError for a second function, and TypeError for
-        an async or generator function, which a call would not carry out.
+        A slow function delays no line: rows wait in the core's queue, and if it is full, further rows are
+        dropped and counted in `summary()`. Closing the poller waits until the function has had the last
+        batch. If the function raises, the failure is logged immediately, the calls end, and closing raises
+        the same failure. Each batch goes to one consumer only, so do not call `take` or `batches` too. Raises
+        ValueError for a second function, and TypeError for an async or generator function, because a call
+        would not run it.
         """
         check_function(function)
         with self._changing:

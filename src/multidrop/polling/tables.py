@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 
 class ArrowTable(ABC):
-    """A table that any library takes which speaks the Arrow PyCapsule interface."""
+    """A table with the Arrow PyCapsule interface, through which other libraries can read it."""
 
     @abstractmethod
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any: ...
@@ -60,14 +60,14 @@ TIMES = ("time", "monotonic_ns")
 
 
 class _WideColumn:
-    """Samples of one register, each with the number of its row."""
+    """Values of one register, each with the number of its row."""
 
     def __init__(self) -> None:
         self.rows = array("q")
         self.values = array("d")
 
     def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
-        """Return a bit for each row, 1 if it has a value, and the values, reordered by `places`."""
+        """Return a bit for each row (1 if it has a value) and the values, in the order of `places`."""
         valid = bytearray((len(places) + 7) // 8)
         values = array("d", bytes(8 * len(places)))
         for row, value in zip(self.rows, self.values, strict=True):
@@ -80,20 +80,20 @@ class _WideColumn:
 class WideRows(ArrowTable):
     """Rows by time: columns `time`, `monotonic_ns`, and `drive.register` for each register of each drive.
 
-    Rows of the long form that have the same time to the nanosecond are one row: those of one request are,
-    as its registers share the time at which it was sent. Other values are not joined, filled or interpolated:
-    a row has values for the registers of one request, and null for all others. A miss is null too; why is
-    in the long form alone. Rows are in the order of `monotonic_ns`.
+    Rows of the long form that have the same time to the nanosecond become one row. These are the rows of one
+    request, because its registers share the time at which it was sent. Other values are not joined, filled
+    or interpolated: a row has values for the registers of one request, and null for all others. A miss is
+    also null; only the long form has its reason. Rows are sorted by `monotonic_ns`.
     """
 
     def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:
-        """Take the rows of the `chosen` columns, or all rows.
+        """Use the rows of the `chosen` columns, or all rows if none are chosen.
 
-        `known` are columns that may have no row. Raises ValueError for a column that is not known, and where
-        two registers would have the same column.
+        `known` are valid columns that may have no row. Raises ValueError for an unknown column, and if two
+        registers would have the same column name.
         """
         self._columns = {name: _WideColumn() for name in chosen}
-        self._times: dict[tuple[int, int], int] = {}  # and monotonic_ns: the number of the row
+        self._times: dict[tuple[int, int], int] = {}  # row numbers by (time, monotonic_ns)
         found: dict[tuple[str, str], _WideColumn | None] = {}
         owners: dict[str, tuple[str, str]] = {}
         for time, monotonic_ns, _, drive, register, value, _ in rows:
@@ -112,7 +112,7 @@ class WideRows(ArrowTable):
     def _column(
         self, owner: tuple[str, str], owners: dict[str, tuple[str, str]], are_chosen: bool
     ) -> _WideColumn | None:
-        """Return the column of a drive's register; None if it is not chosen."""
+        """Return the column of a drive's register, new or existing; None if it is not chosen."""
         name = ".".join(owner)
         if owners.setdefault(name, owner) != owner:
             drives = " and ".join(repr(drive) for drive, _ in (owners[name], owner))

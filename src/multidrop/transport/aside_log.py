@@ -1,4 +1,4 @@
-"""A thread for work that may hang, such as a log handler's disk: stops and ports never wait for it."""
+"""AsideThread: does work that may hang, such as writing a log to a disk, so that stops never wait for it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from queue import Empty, SimpleQueue
 
 from multidrop.core.fork import register_at_fork
 
-MOST_FRAMES = 30  # of a traceback, the innermost
+MOST_FRAMES = 30  # number of innermost frames in a logged traceback
 MOST_WAITING = 10_000  # queued pieces of work; further ones are dropped
 
 
 class AsideThread:
-    """A thread that does one piece of work after another. A signal handler may call each method."""
+    """A thread that does one piece of work after another. All methods are safe in a signal handler."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -27,24 +27,24 @@ class AsideThread:
 
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._begun = threading.Lock()  # held once the thread has started
-        # The queue of a flush that timed out, and its time limit in s.
+        self._begun = threading.Lock()  # locked once the thread has started
+        # the queue of the last flush that timed out, and its timeout in s
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object]) -> None:
-        """Do this soon, in the order of the calls; return at once."""
+        """Queue this work, and return immediately. Work is done in the order of the calls."""
         if self._work.qsize() < MOST_WAITING:
             self._work.put(work)
         if self._begun.acquire(blocking=False):
             try:
-                _thread.start_new_thread(self._run, ())  # threading would wait until it runs
-            except BaseException as failure:  # there is none now, or at the interpreter's end
+                _thread.start_new_thread(self._run, ())  # threading would wait until the thread runs
+            except BaseException as failure:  # no thread is left, or the interpreter is ending
                 self._begun.release()
                 if not isinstance(failure, (RuntimeError, MemoryError)):
                     raise
 
     def flush(self, seconds: float) -> bool:
-        """Wait until all that was put is done, for `seconds` s at most; return whether it is."""
+        """Wait up to `seconds` s until all queued work is done; return True if it is."""
         if not self._begun.locked():
             return self._work.empty()
         done: SimpleQueue[None] = SimpleQueue()
@@ -66,7 +66,7 @@ class AsideThread:
         with suppress(Exception):
             threading.current_thread().name = self._name
         while True:
-            with suppress(BaseException):  # a handler's own failure, SystemExit too
+            with suppress(BaseException):  # a log handler may raise anything, even SystemExit
                 self._work.get()()
 
 
@@ -74,21 +74,21 @@ _log_thread = AsideThread("multidrop log")
 
 
 def log_aside(logger: logging.Logger, level: int, text: str, *details: object) -> None:
-    """Log this soon, in the order of the calls; return at once."""
+    """Log this on the log thread, in the order of the calls; return immediately."""
     if logger.isEnabledFor(level):
         _log_thread.put(partial(logger.log, level, text, *details))
 
 
 def words_of(failure: BaseException) -> str:
-    """Return an exception's type and message on one line; its type alone if the message cannot be made."""
+    """Return an exception's type and message on one line; only its type if `str` of it fails."""
     try:
         return " ".join(f"{type(failure).__name__}: {failure}".split()).removesuffix(":")
-    except BaseException:  # of a class that a user wrote
+    except BaseException:  # a user's exception class may raise anything
         return type(failure).__name__
 
 
 def traceback_of(failure: BaseException) -> str:
-    """Return an exception's traceback as text; "" if it cannot be made."""
+    """Return an exception's traceback as text; "" if formatting it fails."""
     try:
         return "".join(traceback.format_exception(failure, limit=-MOST_FRAMES)).rstrip()
     except BaseException:
@@ -96,5 +96,5 @@ def traceback_of(failure: BaseException) -> str:
 
 
 def flush(seconds: float) -> None:
-    """Wait until all is logged, for `seconds` s at most."""
+    """Wait up to `seconds` s until the log thread has logged everything."""
     _log_thread.flush(seconds)

@@ -1,4 +1,4 @@
-"""Bridge: a descriptor for a port that has none, such as a network's serial port (RFC 2217)."""
+"""Bridge: a descriptor for a port that has none of its own, such as an RFC 2217 port."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from multidrop.transport.aside_log import log_aside, traceback_of
 
 try:
     import termios
-except ImportError:  # Windows has none of its errors either
+except ImportError:  # Windows has no termios
     _terminal_error: type[Exception] = OSError
 else:
     _terminal_error = termios.error
 
 _log = logging.getLogger("multidrop.line")
 
-# All exceptions with which a port can fail.
+# All exceptions that a port may raise.
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
-# Both are shorter than WRITE_TIMEOUT: an outcome that a write's caller was given stays true.
-MOST_STALL_MS = 750  # a network that stalls for longer is disconnected
-MOST_AGE = 0.25  # s, of a request that leaves
-MOST_CHUNK = 1024  # bytes that the core reads at once
+# Both are shorter than WRITE_TIMEOUT, so that no write is sent after its caller got an outcome.
+MOST_STALL_MS = 750  # a connection that stalls for longer is cut
+MOST_AGE = 0.25  # s; an older request is not forwarded
+MOST_CHUNK = 1024  # bytes that the core reads in one call
 LOOK_EVERY = 0.1  # s between checks whether the bridge is closed
-CLOSING_TIME = 2.0  # s that closing waits for a thread which the port holds up
+CLOSING_TIME = 2.0  # s that closing waits for a thread blocked by the port
 
-# On Linux such a socket keeps requests apart, and stamps each with the time at which the core wrote it.
+# On Linux such a socket keeps requests separate, and gives each the time at which the core wrote it.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; the control message is a struct timespec
@@ -45,7 +45,7 @@ _TCP_MAXRTMS = 14  # mstcpip.h
 
 
 def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
-    """Give the port its baud rate and format; pyserial may take a while for it."""
+    """Set the port's baud rate and format; this may take a while."""
     baudrate, format = settings
     port.baudrate = baudrate
     port.bytesize = int(format[0])
@@ -56,8 +56,8 @@ def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
 def hand_on_nothing_late(connection: socket.socket) -> None:
     """Make the kernel cut a connection that stalls, and discard unsent bytes when it is closed.
 
-    Those bytes may start a motor, also after this process has died. Windows before 11 may not know the
-    time-out, and then gives a connection up when its retransmissions end.
+    Such bytes could start a motor, even after this process has died. Windows before 11 may not support the
+    timeout; it then cuts a connection when its retransmissions end.
     """
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack(_LINGER, 1, 0))
@@ -71,7 +71,7 @@ def hand_on_nothing_late(connection: socket.socket) -> None:
 def _pair() -> tuple[socket.socket, socket.socket]:
     if hasattr(socket, "AF_UNIX"):
         return socket.socketpair(socket.AF_UNIX, _KIND)
-    pair = socket.socketpair()  # by TCP, which would gather small pieces
+    pair = socket.socketpair()  # on Windows a TCP connection, so disable its delay of small packets
     for end in pair:
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return pair
@@ -80,8 +80,8 @@ def _pair() -> tuple[socket.socket, socket.socket]:
 class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
-    No request waits in it: the core has given up one that is older than MOST_AGE when its thread takes it,
-    because the process was suspended or the port blocked. Such a request is discarded.
+    A request older than MOST_AGE is discarded, not forwarded: the core has already given it up. A request
+    gets that old if the process was suspended or the port blocked.
     """
 
     def __init__(self, port: serial.SerialBase) -> None:
@@ -106,7 +106,7 @@ class Bridge:
             raise OSError(errno.ENOMEM, str(failure)) from failure
 
     def _run(self, copy: Callable[[], None]) -> None:
-        """Copy until the port fails, in whatever way; then the core sees that it hung up."""
+        """Copy until the port fails in any way; then hang up, which the core notices."""
         try:
             copy()
         except PORT_FAILURES:
@@ -128,7 +128,7 @@ class Bridge:
                 self._port.write(request)
 
     def _take(self) -> tuple[bytes, bool]:
-        """Return a request of the core, and whether it was written just now; Windows has no `recvmsg`."""
+        """Return a request of the core, and whether it is fresh (without time stamps, always True)."""
         if not _STAMPED:
             return self._ours.recv(MOST_CHUNK), True
         request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))
@@ -143,7 +143,7 @@ class Bridge:
                 self._hand_over(received[at : at + MOST_CHUNK])
 
     def _hand_over(self, chunk: bytes) -> None:
-        """Give the core these bytes. While it takes none, more wait in the port."""
+        """Pass these bytes to the core. While the core takes none, further bytes stay in the port."""
         while chunk and not self._closing.is_set():
             with suppress(TimeoutError):
                 chunk = chunk[self._ours.send(chunk) :]
@@ -153,7 +153,7 @@ class Bridge:
             self._ours.shutdown(socket.SHUT_RDWR)
 
     def forget(self) -> None:
-        """Close without hanging up: the parent of a fork still uses it."""
+        """Close without hanging up, because the parent of the fork still uses the connection."""
         self._ours.close()
         self.theirs.close()
 
@@ -166,6 +166,6 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Return True for a request that was written just now, False in doubt, as when the clock was set."""
+    """Return True if the request was written within MOST_AGE; False in doubt (the clock was set)."""
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]
     return any(abs(time.time() - seconds - ns / 1e9) <= MOST_AGE for seconds, ns in written)

@@ -1,7 +1,7 @@
-"""The clock of all that is polled and written: CLOCK_MONOTONIC, as the core reads it.
+"""The clock of polling and writing: CLOCK_MONOTONIC, as the core reads it.
 
-Deadlines of requests are of CLOCK_BOOTTIME, which runs on while the machine sleeps. Call these functions
-through the module, `clock.now_ns()`: a test then replaces them in one place.
+Deadlines of requests use CLOCK_BOOTTIME, which continues while the computer sleeps. Call these functions
+through the module, as `clock.now_ns()`, so that tests can replace them in one place.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from multidrop.core import utc_minus_monotonic_ns
 
 sleep = time.sleep
 
-if hasattr(time, "clock_gettime_ns"):  # a call of Python's own costs less than one of the core
+if hasattr(time, "clock_gettime_ns"):  # faster than a call of the core's function
 
     def now_ns() -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""

@@ -1,4 +1,4 @@
-"""Exchanges with the drives on a line, one at a time and ahead of any polling."""
+"""Exchanges with the drives on a line, one at a time, and before queued exchanges of polling."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from multidrop.transport.prepared import (
 
 
 def good_reply(drive: Drive, completion: Completion) -> Message:
-    """Return the good reply; raises NoReply, BadReply or DriveException."""
+    """Return the good reply of a completion. Raises NoReply, BadReply or DriveException."""
     result, reply = completion.result, completion.reply
     if result > 0 and not reply.exception:
         return reply
@@ -50,7 +50,7 @@ def good_reply(drive: Drive, completion: Completion) -> Message:
 
 
 def no_reply(drive: Drive, completion: Completion) -> NoReply:
-    """Return the error of a drive that is silent, or whose gateway says that it is."""
+    """Return the error for a silent drive, or for one that its gateway reports as silent."""
     if drive.framing is Framing.TCP and completion.raw:
         code = completion.raw[-1]
         return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
@@ -65,12 +65,12 @@ def check_master(drive: Drive, completion: Completion) -> None:
 
 
 def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveException:
-    """Return the error for an exception code; `register` is set if it alone was requested."""
+    """Return the error for an exception code; `register` is the name if only one register was requested."""
     return DriveException(drive.name, code, drive.exception(code), register)
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
-    """Return the error of the first register for which the drive gave no value, with the others' values."""
+    """Return the error for the first register without a value; it contains the other registers' values."""
     known = {name: value for name, value in found.items() if value is not None}
     return NoValue(drive.name, next(name for name in found if name not in known), known)
 
@@ -82,8 +82,8 @@ def _port_of(drive: Drive) -> str:
 T = TypeVar("T")
 
 READ_ATTEMPTS = 3
-WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
-ILLEGAL_FUNCTION = 1  # a shorter request has the same one
+WRITE_TIMEOUT = 1.0  # s, long, because a write wrongly reported as unconfirmed costs more than the wait
+ILLEGAL_FUNCTION = 1  # exception code to which a shorter request of the same function is no answer
 
 
 class Exchanges:
@@ -98,7 +98,7 @@ class Exchanges:
     # ---- the drives ----
 
     def add(self, drive: Drive) -> None:
-        """Add a drive; one that comes back keeps its learnt timing and late replies."""
+        """Add a drive; one that was on the line before keeps its learnt timing and late replies."""
         self._peers.add(drive)
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class Exchanges:
         self._peers.close()
 
     def remember(self, before: Exchanges) -> None:
-        """Take over the peers of an earlier bus on the same line."""
+        """Copy the peers of an earlier bus on the same line."""
         self._peers.remember(before._peers)
 
     def remove(self, drive: Drive) -> None:
@@ -125,7 +125,7 @@ class Exchanges:
         return self._peers.of(drive)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued, under way or about to be."""
+        """Return True while an exchange with this peer is about to start, queued or in flight."""
         return self._peers.is_asking(peer)
 
     def has_answered(self, drive: Drive) -> bool:
@@ -135,10 +135,11 @@ class Exchanges:
     # ---- reading ----
 
     def read(self, drive: Drive, registers: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
-        """Return registers' values by name, as `values`, also from a peer that closes after each reply.
+        """Return the registers' values by name, as `values` does, but reopen a lost port.
 
-        A port that is lost after the drive has answered on it is opened again, and the blocks are read one
-        by one. A block that loses the port twice in a row raises PortLost.
+        This is for a gateway that closes the connection after each reply. If the port is lost after the drive
+        has answered on it, reopen it and read block by block. Raises PortLost if a block loses the port twice
+        in a row, or if the drive had not answered.
         """
         try:
             return self.values(drive, registers, READ_ATTEMPTS)
@@ -159,7 +160,7 @@ class Exchanges:
         return found
 
     def read_text(self, drive: Drive, text: Text) -> str:
-        """Return a text, as `text`; a port that is lost after the drive has answered is opened again."""
+        """Return a text, as `text` does, but reopen a port that is lost after the drive has answered."""
         try:
             return self.text(drive, text)
         except PortLost:
@@ -173,9 +174,10 @@ class Exchanges:
         )
 
     def _again(self, read: Callable[[], T]) -> T:
-        """Open a lost port again and read; once more if the peer closes again. For reads of the user alone.
+        """Reopen a lost port and call `read`; if the port is lost again, do both a second time.
 
-        A script's reads do not come here: its writes need the identity check that follows a reopening.
+        Only for a user's own reads, not for those of a script: after a reopening, a script's writes need
+        another identity check.
         """
         self._regain()
         try:
@@ -197,12 +199,12 @@ class Exchanges:
         insists: bool = False,
         timeout: float = 0.0,
     ) -> dict[str, Any]:
-        """Return the values of registers, or of registers' names, by name; try each block `attempts` times.
+        """Return the values of registers (given as such or by name) by name.
 
-        With `insists`, send at once even if a late reply could be mistaken for this one; on slow paths wait
-        up to `timeout` seconds. A block that the drive refuses or does not answer as a whole is read in
-        parts until the port is opened again. Raises NoValue if a register holds no value,
-        and TextWanted if one of them is a text.
+        Each block is tried up to `attempts` times. With `insists`, send immediately even if a late reply
+        could be mistaken for this one; on slow paths wait up to `timeout` seconds. If the drive does not
+        answer a block as a whole, the block is read in parts until the port is reopened. Raises NoValue if a
+        register holds no value, and TextWanted if one of `registers` is a text.
         """
         prepared = self._prepare(drive)
         plan = prepared.newest
@@ -219,11 +221,11 @@ class Exchanges:
                     into = read.spare.pop()
                 except IndexError:
                     into = None
-                try:  # a read that goes well takes few calls: see Completion
+                try:  # a successful read takes few calls, for speed: see Completion
                     reply = self._peers.carry_out(drive, exchange, into=into)
                     if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
-                    if reply.count == read.whole:  # with cold caches `strict`, and a call, take microseconds
+                    if reply.count == read.whole:  # the fast path, without `strict` and a further call
                         values = dict(zip(read.names, reply.numbers.tolist()))  # noqa: B905
                     else:
                         values = read.decode(reply)
@@ -248,7 +250,7 @@ class Exchanges:
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
     ) -> tuple[Block, ...]:
-        """Return smaller blocks to read instead of a failed one, or raise its failure if that cannot help."""
+        """Return smaller blocks to read instead of a failed block; raise the failure if they cannot help."""
         block = read.block
         if isinstance(failure, DriveException):
             helps = failure.code != ILLEGAL_FUNCTION and not drive.is_passing(failure.code)
@@ -286,7 +288,7 @@ class Exchanges:
         return self.values(drive, [register], attempts, insists=insists)[register.name]
 
     def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
-        """Return a text, read in as many requests as its family's limit demands."""
+        """Return a text, read in as many requests as the family's limit on their length requires."""
         peer = self.peer(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
         return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
@@ -295,7 +297,7 @@ class Exchanges:
         return self._ask(drive, make_read(drive, block, self.peer(drive)), READ_ATTEMPTS)
 
     def _prepare(self, drive: Drive) -> PreparedReads:
-        """Return the drive's prepared reads; rebuild them after a change of port, settings or peer."""
+        """Return the drive's cached reads; replace them if the port, the settings or the peer has changed."""
         peer = self._peers.present.get(drive) or self.peer(drive)
         asked_as = (drive.address, drive.framing, drive.settings, drive.agreed_silence, drive.response_delay)
         made_for = (peer, self.line.queue, *asked_as)
@@ -305,7 +307,10 @@ class Exchanges:
         return prepared
 
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
-        """Return the value in this drive's reply to another family's request, sent once without waiting."""
+        """Read a register of `other`, a drive of another family, from this drive; return the value.
+
+        Each request is sent only once, with `insists`.
+        """
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
             asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
@@ -320,9 +325,10 @@ class Exchanges:
     def ask(
         self, drive: Drive, function: int, start: int, count: int, expiry: float, attempts: int = 1
     ) -> bytes:
-        """Return the data of the reply to any read, sent up to `attempts` times.
+        """Read `count` items from address `start` by any read function; return the reply's data.
 
-        Raises Expired if the first one cannot be sent within `expiry` seconds.
+        The request is sent up to `attempts` times. Raises Expired if the first request cannot be sent within
+        `expiry` seconds.
         """
         request = any_read(drive, function, start, count)
         expires_ns = clock.boottime_ns() + round(expiry * 1e9)
@@ -339,19 +345,19 @@ class Exchanges:
         return good_reply(drive, completion).data
 
     def _note_answer(self, drive: Drive, completion: Completion) -> None:
-        if completion.result > 0:  # an exception also says that the drive is there
+        if completion.result > 0:  # an exception also shows that the drive is there
             self._answered_on[drive] = self.line.queue
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Completion:
-        """Return the good reply to a read, which is retried up to `attempts` times."""
+        """Send a read up to `attempts` times; return its good reply."""
         reply = self._good(drive, exchange, attempts, self._carry_out(drive, exchange))
         self._note_answer(drive, reply)
         return reply
 
     def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
-        """Return the good reply to a read that was sent once; retry it if the reply is lost.
+        """Return the good reply to a read that was sent once, with `completion`; retry it if that failed.
 
-        Raises BadReply if any bytes came for one of the attempts, even if the others met silence.
+        If all attempts fail, raises BadReply if any of them received bytes, else NoReply.
         """
         came: BadReply | None = None
         while completion.count < 0:
@@ -382,12 +388,12 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Write once, ahead of any polling, after late replies have come in or expired.
+        """Send a write once, before queued polling, after late replies have come in or expired.
 
-        After `expires_ns` (of CLOCK_BOOTTIME; 0: never), and without a good permit, it is not sent. It waits
-        for its answer at least `timeout` seconds. With `insists` it
-        does not wait for late replies, and on slow paths waits up to `timeout` for its own. Raises NoReply
-        without sending if late replies are due and the drive is silent.
+        The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or if `permit` was withdrawn.
+        It waits for its reply at least `timeout` seconds. With `insists` it does not wait for late replies,
+        and on slow paths waits up to `timeout` seconds for its own reply. Raises NoReply without sending if
+        late replies are due and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
@@ -398,7 +404,10 @@ class Exchanges:
         return completion
 
     def _carry_out(self, drive: Drive, made: Exchange, expires_ns: int = 0) -> Completion:
-        """Carry the exchange out once late replies allow it; see `_settled`. Raises NotMaster."""
+        """Carry out the exchange, after late replies if necessary (see `_settled`); return its completion.
+
+        Raises NotMaster if another process may be the line's master.
+        """
         try:
             completion = self._peers.carry_out(drive, made, expires_ns=expires_ns)
         except PortLost as failure:
@@ -407,16 +416,17 @@ class Exchanges:
         return completion if completion.count >= 0 else self._settled(drive, made, completion, expires_ns)
 
     def _check_held_back(self, drive: Drive, failure: PortLost) -> None:
-        """Raise NotMaster if the port is not reopened because this process is not the line's master."""
+        """Raise NotMaster if the request was not sent and this process is not the line's master."""
         if not failure.is_sent and not self.line.may_send:
             raise NotMaster(drive.name, self.line.port) from None
 
     def _settled(
         self, drive: Drive, made: Exchange, completion: Completion, expires_ns: int = 0
     ) -> Completion:
-        """Wait once for late replies, until the exchange expires; then the core sends a proof first.
+        """If late replies prevented the exchange, wait for them and carry it out again.
 
-        Raises NotMaster.
+        The wait ends when the exchange expires. The core then first sends a proof, a read whose reply shows
+        that no earlier reply is still due. Raises NotMaster if another process may be the line's master.
         """
         if completion.result == Failure.LATE_ANSWER_DUE:
             wait_ns = completion.late_until_ns - clock.now_ns()

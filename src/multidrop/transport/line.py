@@ -1,4 +1,4 @@
-"""Line: a port on which exchanges are carried out, lost and opened again."""
+"""Line: a port that carries out exchanges, and that can be reopened after it was lost."""
 
 from __future__ import annotations
 
@@ -39,35 +39,35 @@ FOREIGN = (
 
 
 class LineLog:
-    """The log of one line: reports each loss once, and counts another master's bytes."""
+    """The log of one line: reports each loss once, and counts bytes from another master."""
 
     def __init__(self, port: str) -> None:
-        self.foreign = 0  # bytes that came while the line was listened to before a request
-        self.shows = _log.isEnabledFor  # a level
+        self.foreign = 0  # number of bytes received while listening before a request
+        self.shows = _log.isEnabledFor  # takes a level
         self._port = port
-        self._foreign_here = 0  # of the port that is open now
+        self._foreign_here = 0  # the same since the port was last opened
         self._is_lost = False
         self._why_unopened = ""
         self.forked()
 
     def forked(self) -> None:
-        """Hold no lock of the parent's."""
+        """Replace the lock in a forked child, because a thread of the parent may hold it."""
         self._noting = threading.Lock()
 
     def opened(self, identity: str) -> None:
-        """Log that the port was opened; no foreign byte has come on it yet."""
+        """Log that the port was opened, and reset the state of its last opening."""
         again = " again" if self._is_lost else ""
         log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
         self._is_lost, self._foreign_here, self._why_unopened = False, 0, ""
 
     def lost(self, why: str) -> None:
-        """Log that the port was lost, unless that is in the log already."""
+        """Log that the port was lost, unless this loss is already logged."""
         if not self._is_lost:
             self._is_lost = True
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
 
     def unopened(self, why: str) -> None:
-        """Log why a port is not opened, or not again, unless that is the last thing in the log."""
+        """Log why the port could not be opened or reopened, unless the same reason was logged last."""
         if why != self._why_unopened:
             self._why_unopened = why
             again = " again" if self._is_lost else ""
@@ -77,7 +77,7 @@ class LineLog:
         log_aside(_log, logging.INFO, "%s: closed", self._port)
 
     def note_foreign(self, core: Port) -> None:
-        """Log the foreign bytes that came since this was called last; any thread may call it."""
+        """Log the number of foreign bytes since the last call; any thread may call it."""
         if core.foreign == self._foreign_here:
             return
         with self._noting:
@@ -88,7 +88,7 @@ class LineLog:
             log_aside(_log, logging.WARNING, FOREIGN, self._port, came)
 
     def frames(self, exchange: Exchange, found: Completion) -> None:
-        """Log both frames: direction, CLOCK_MONOTONIC in s, bytes, meaning."""
+        """Log request and reply, each with direction, CLOCK_MONOTONIC in s, bytes and meaning."""
         if found.sent_ns:
             frame = build_request(exchange.framing, exchange.request).hex(" ").upper()
             at = found.sent_ns / 1e9
@@ -99,18 +99,19 @@ class LineLog:
         log_aside(_log, logging.DEBUG, "%s < %.6f %s %s", self._port, at, came, meaning)
 
 
-LOGGING_S = 1.0  # that closing waits for loggers
+LOGGING_S = 1.0  # how long closing waits for the log thread
 
 UNOPENED = "it is not opened: this process is not its master, and could end the master's connection"
 
 
 class Line:
-    """A port on which exchanges are carried out; urgent ones go ahead of queued ones.
+    """A port that carries out exchanges, urgent ones before queued ones.
 
-    `port` is a device, a URL of socket:// or rfc2217://, or tcp://host:port for Modbus TCP, whose replies
-    have their requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the
-    transceiver. For `settle` seconds after each opening the line stays silent and discards its input. With a
-    `mastership`, requests leave only while that holds. Every failure of the port is a LineError.
+    `port` is a device, a URL of socket:// or rfc2217://, or tcp://host:port for Modbus TCP. `ids` says
+    whether a Modbus TCP reply must have the transaction id of its request. `rs485` says who switches the
+    transceiver. For `settle` seconds after each opening, the line sends nothing and discards its input. With
+    a `mastership`, requests are sent only while this process holds it. Every failure of the port is raised
+    as a LineError.
     """
 
     def __init__(
@@ -132,14 +133,14 @@ class Line:
         self.ids = ids
         self._echo = echo
         self._opened = OpenPort(port, ids, rs485, mastership, settle)
-        # The core's port, on which exchanges are queued; None once that is about to be closed.
+        # The core's port, on which exchanges are queued; None before it is opened, and once it is dropped.
         self.queue: Port | None = None
         self._tap: Tap | None = None
         self._log = LineLog(port)
         self._is_over = False
         self._why_closed = "it is closed"
         self._why_lost: str | None = None
-        self.why_closing: str | None = None  # why calls on it fail now, though `close` is yet to come
+        self.why_closing: str | None = None  # why calls already fail, before `close` is called
         self._make_locks()
         register_at_fork(self)
 
@@ -147,7 +148,7 @@ class Line:
         self._lock = threading.RLock()  # one thread opens or closes at a time
 
     def forked(self) -> None:
-        """Close it in the child at once: a descriptor left open there would keep the port busy."""
+        """Close the line in a forked child: a descriptor left open there would keep the port busy."""
         self._make_locks()
         self._log.forked()
         self._is_over = True
@@ -157,20 +158,20 @@ class Line:
 
     @property
     def identity(self) -> str:
-        """The same however the port's name is spelt, once it is open; see port_identity."""
+        """The port's identity once it is open, the same for all names of the port; see port_identity."""
         return self._opened.identity
 
     # ---- opening and closing ----
 
     def open(self) -> Self:
-        """Open it and return it; LineError when it is not there, or was closed."""
+        """Open the line and return it. Raises LineError if the port is absent or the line was closed."""
         self._open_first()
         return self
 
     @undisturbed
     def _open_first(self) -> None:
         with self._lock:
-            if self._is_over:  # its opening was interrupted, and has closed it
+            if self._is_over:  # an earlier, interrupted opening has closed the line
                 raise self._closed()
             self._reopen()
 
@@ -195,7 +196,7 @@ class Line:
             raise LineError(self.port, reason_of(failure)) from None
 
     def drop(self) -> None:
-        """End all exchanges; queued ones are never sent. `close` closes the port."""
+        """End all exchanges and discard queued ones, without closing the port."""
         with self._lock:
             core, self.queue = self.queue, None
             if core is None:
@@ -215,8 +216,8 @@ class Line:
         flush(LOGGING_S)
 
     def end(self) -> bool:
-        """Stop taking queued exchanges; return True while one is under way."""
-        with self._lock:  # another thread could free the port
+        """Start no more queued exchanges; return True while one is in flight."""
+        with self._lock:  # without it, another thread could free the port meanwhile
             return self.queue is not None and self.queue.end()
 
     def _let_go(self) -> None:
@@ -236,18 +237,18 @@ class Line:
 
     @property
     def is_lost(self) -> bool:
-        """True when the port failed, and was neither opened again nor closed since."""
+        """True if the port failed, and was neither reopened nor closed since."""
         core = self.queue
         return not self._is_over and (core is None or core.lost)
 
     @property
     def why_lost(self) -> str | None:
-        """Why a lost port is not back, with its name; None if it is open, or was not tried yet."""
+        """Why a lost port could not be reopened, with its name; None if it is open or was not tried yet."""
         return f"{self.port}: {self._why_lost}" if self.is_lost and self._why_lost else None
 
     @undisturbed
     def regain(self) -> None:
-        """Open a lost port again. Raises PortLost if it is absent, LineError once it was closed."""
+        """Reopen a lost port. Raises PortLost if that fails, LineError if the line was closed."""
         with self._lock:
             if self._is_over:
                 raise self._closed()
@@ -255,7 +256,7 @@ class Line:
                 return
             try:
                 self._reopen()
-            except Exception as failure:  # of pyserial, a library of its kind, or for want of memory
+            except Exception as failure:  # pyserial and its backends may raise any kind
                 reason = failure.reason if isinstance(failure, LineError) else words_of(failure)
                 self._why_closed = self._why_lost = reason
                 self._log.unopened(reason)
@@ -264,7 +265,7 @@ class Line:
     # ---- taps, settings and peers ----
 
     def tap(self, tap: Tap) -> None:
-        """Give this tap all bytes of the line; it replaces an earlier one."""
+        """Pass all bytes of the line to this tap, which replaces an earlier tap."""
         with self._lock:
             self._tap = tap
             if self.queue:
@@ -277,11 +278,11 @@ class Line:
 
     @property
     def only_settings(self) -> tuple[int, str] | None:
-        """Settings that a bridged port has, and keeps while it is open; None for other ports."""
+        """The fixed settings of a bridged port; None for other ports."""
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let a drive inherit the late replies of another one at its address."""
+        """Let `peer` inherit the late replies of `before`, an earlier peer at its address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)
@@ -298,9 +299,11 @@ class Line:
         expires_ns: int = 0,
         into: Completion | None = None,
     ) -> Completion:
-        """Carry an exchange out ahead of the queue, and wait for it. Raises LineError if the port fails.
+        """Carry out an exchange before all queued ones; wait for its completion and return it.
 
-        `into` is a completion to reuse.
+        `not_before_ns` is the earliest time to send it (CLOCK_MONOTONIC), `expires_ns` the latest
+        (CLOCK_BOOTTIME); 0 means no limit. `into` is a completion to reuse. Raises LineError if the port
+        fails.
         """
         if self._opened.bridge and self.queue and self._opened.settings != exchange.settings:
             self.require(exchange.settings)
@@ -319,7 +322,7 @@ class Line:
         return found
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued or under way on the port."""
+        """Return True while an exchange with this peer is queued or in flight on the port."""
         with self._lock:
             return self.queue is not None and self.queue.is_asking(peer)
 
@@ -338,7 +341,7 @@ class Line:
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def counted_ns(self, now_ns: int) -> int:
-        """Return the end of the counted time: now, or the start of the exchange under way."""
+        """Return the time until which exchanges are counted: now, or the start of the one in flight."""
         return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:
@@ -358,7 +361,7 @@ class Line:
 
     @property
     def foreign(self) -> int:
-        """Bytes that came while it was listened to before a request."""
+        """Number of bytes that came while the line listened before a request."""
         return self._log.foreign
 
     @property

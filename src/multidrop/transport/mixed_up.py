@@ -1,6 +1,6 @@
-"""Tell Modbus TCP (tcp://) from RTU over TCP (socket://), which are easily taken for each other.
+"""Detect when Modbus TCP (tcp://) and RTU over TCP (socket://) were confused in a port's name.
 
-A gateway is set to one of the two. Asked in the other, it is silent or replies with nonsense.
+A gateway is set to one of the two. To requests of the other, it is silent or replies with nonsense.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _SPOKEN = {"socket": "RTU over TCP", "tcp": "Modbus TCP"}
 
 
 def other_port(port: str) -> str:
-    """Return the port for the other of the two at the same place; "" for a port that has neither."""
+    """Return the port name for the other protocol at the same host and port; "" for other kinds of ports."""
     url = urlsplit(port)
     if url.scheme not in _OTHER:
         return ""
@@ -26,7 +26,7 @@ def other_port(port: str) -> str:
 
 
 def spoken_on(port: str) -> str:
-    """Return the name of what such a port speaks."""
+    """Return the name of the protocol of a tcp:// or socket:// port."""
     return _SPOKEN[urlsplit(port).scheme]
 
 
@@ -40,7 +40,7 @@ def mixed_up(port: str, received: bytes) -> str:
 
 
 def silence_hint(port: str) -> str:
-    """Return advice for a drive that is silent behind such a port; "" for any other."""
+    """Return advice for a silent drive behind a tcp:// or socket:// port; "" for other ports."""
     other = other_port(port)
     if not other:
         return ""

@@ -1,7 +1,8 @@
-"""RFC2217Port: pyserial's client of a network's serial port (RFC 2217), bounded in memory and in time.
+"""RFC2217Port: pyserial's client for serial ports on a network (RFC 2217), with limits on memory and time.
 
-pyserial keeps received bytes without a bound, and waits for seconds until a stalled network takes a
-request. Here bytes that come too fast are lost, as on a serial line, and a request leaves at once or never.
+pyserial buffers received bytes without a limit, and waits for seconds until a stalled network takes a
+request. Here bytes that come too fast are lost, as on a serial line, and a request is sent immediately or
+never.
 """
 
 from __future__ import annotations
@@ -21,36 +22,36 @@ from serial.urlhandler.protocol_socket import Serial
 
 
 class SocketPort(Serial):
-    """pyserial's port behind socket://, whose own `close` sleeps for 300 ms."""
+    """pyserial's port for socket://, with a faster `close`: pyserial's sleeps for 300 ms."""
 
     _socket: socket.socket | None = None
 
     def close(self) -> None:
-        """End the connection, so that the far end is free for another one at once."""
+        """End the connection, so that the far end can immediately accept another one."""
         connection, self._socket, self.is_open = self._socket, None, False
         if connection:
-            with suppress(OSError):  # it may have ended already
+            with suppress(OSError):  # the far end may have closed it already
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
 
     def reset_input_buffer(self) -> None:
-        """Discard received bytes; pyserial would use `select`, which fails for descriptors above 1023."""
+        """Discard received bytes. pyserial's own uses `select`, which fails for descriptors above 1023."""
         with suppress(BlockingIOError):
             while self._socket and self._socket.recv(4096):
                 pass
 
 
-MOST_RECEIVED = 4096  # bytes taken from the network at once
-MOST_CHUNKS = 64  # that wait to be read
-MOST_SUBOPTION = 256  # bytes: those of RFC 2217 are short, only its signature is a text
-LOCK_TIME = 0.1  # s, for another thread to answer an option
+MOST_RECEIVED = 4096  # bytes read from the network in one call
+MOST_CHUNKS = 64  # limit of received chunks that are buffered
+MOST_SUBOPTION = 256  # bytes; RFC 2217's suboptions are short, except for its signature
+LOCK_TIME = 0.1  # s that a write waits while another thread answers an option
 
 _IAC, _SB, _SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
 _NEGOTIATIONS = (rfc2217.DO, rfc2217.DONT, rfc2217.WILL, rfc2217.WONT)
 
 
 class Telnet:
-    """Parser of a telnet stream (RFC 854) into data and commands; the stream may come in any pieces."""
+    """Parser that splits a telnet stream (RFC 854), received in any pieces, into data and commands."""
 
     def __init__(self) -> None:
         self._command = b""  # incomplete command
@@ -100,7 +101,7 @@ class Telnet:
 
 
 def _send_at_once(connection: socket.socket, data: bytes) -> int:
-    """Return how much the network took. socket.send() alone would wait for as long as the time-out."""
+    """Send without waiting; return the number of bytes sent. socket.send() would wait for its timeout."""
     if sys.platform != "win32":
         return os.write(connection.fileno(), data)
     return connection.send(data) if select.select([], [connection], [], 0)[1] else 0
@@ -109,7 +110,7 @@ def _send_at_once(connection: socket.socket, data: bytes) -> int:
 class RFC2217Port(rfc2217.Serial):
     """A serial port on a network; `port` is rfc2217://host:port."""
 
-    # pyserial's own attributes, which its type stubs leave out
+    # pyserial's own attributes, which its type stubs omit
     _socket: Any
     _write_lock: Any
     _read_buffer: Any
@@ -117,7 +118,7 @@ class RFC2217Port(rfc2217.Serial):
     _telnet_negotiate_option: Any
 
     def _telnet_read_loop(self) -> None:
-        """Read the socket until it ends: pyserial's own thread runs this."""
+        """Read the socket until the connection ends; pyserial's own thread runs this."""
         self._read_buffer = queue.Queue(MOST_CHUNKS)
         telnet = Telnet()
         with suppress(OSError):
@@ -143,7 +144,7 @@ class RFC2217Port(rfc2217.Serial):
             self._telnet_negotiate_option(kind, content)
 
     def write(self, data: Any) -> int:
-        """Send all data at once. Raises SerialException if the network does not take it."""
+        """Send all data without waiting. Raises SerialException if the network does not take all of it."""
         self._internal_raw_write(bytes(data).replace(_IAC, _IAC + _IAC))
         return len(data)
 

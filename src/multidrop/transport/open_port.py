@@ -1,4 +1,4 @@
-"""OpenPort: find and open a port by its name, and give the core its descriptor."""
+"""OpenPort: open a port by its name, and give the core its descriptor."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 
 def overruns(fd: int) -> int:
-    """Return the overruns since the driver was loaded. Raises OSError if it does not count them."""
+    """Return the number of overruns since the driver was loaded. Raises OSError if they are not counted."""
     if sys.platform != "linux":
         raise OSError("Linux alone counts them")
     import fcntl  # which Windows lacks
@@ -60,7 +60,7 @@ _REASONS = {
     errno.ECONNREFUSED: "nothing listens there",
 }
 
-# pyserial keeps an error of Windows in its text alone: could not open port 'COM5': PermissionError(13, ...)
+# pyserial keeps a Windows error only in its message: could not open port 'COM5': PermissionError(13, ...)
 _WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
 _WINDOWS_REASONS = {
     errno.EACCES: _REASONS[errno.EBUSY],  # only one program can have a COM port
@@ -69,7 +69,7 @@ _WINDOWS_REASONS = {
 
 
 def reason_of(failure: BaseException) -> str:
-    """Return the cause in words: pyserial hides the system's error in or behind its own."""
+    """Return the cause of a failure in words; pyserial hides the system's error in its own or its context."""
     for error in (failure, failure.__context__):
         if isinstance(error, socket.gaierror):
             return error.strerror or str(error)
@@ -83,20 +83,20 @@ def reason_of(failure: BaseException) -> str:
 
 
 def is_lost_by(result: int, port: Port) -> bool:
-    """Return True where an exchange with this result ended because its port was lost."""
+    """Return True if this result means that the exchange ended because its port was lost."""
     is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
     return is_lost or (result == Failure.LATE_ANSWER_DUE and port.lost)
 
 
 def why_lost(port: str, error: int, received: bytes) -> str:
-    """Return why a port was lost, from the errno of its descriptor; 0 means that it hung up."""
+    """Return why a port was lost, from the errno of its descriptor; 0 means that the far end hung up."""
     if error != errno.EPROTO:
         return os.strerror(error) if error else "hung up"
     shown = received[:16].hex(" ").upper() or "a damaged header"
     return f"what came is no Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
-_FOR_PROGRAMS = ("loop", "spy")  # of pyserial, without options: spy://DEVICE?file=PATH empties that file
+_FOR_PROGRAMS = ("loop", "spy")  # pyserial's; without options, as spy://DEVICE?file=PATH empties that file
 
 
 def _socket_url(url: SplitResult) -> str:
@@ -105,7 +105,10 @@ def _socket_url(url: SplitResult) -> str:
 
 
 def unopened(port: str) -> serial.Serial:
-    """Return the port, not opened yet. Raises TypeError, and NoSuchPort for a URL that no port can have."""
+    """Return a pyserial port of this name, not opened yet.
+
+    Raises TypeError if the name is not text, and NoSuchPort for an invalid URL.
+    """
     if not isinstance(port, str):
         raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
     url = url_of(port)
@@ -116,7 +119,7 @@ def unopened(port: str) -> serial.Serial:
     if url.scheme == "rfc2217":
         found = RFC2217Port()
         found.port = port
-        return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
+        return cast(serial.Serial, found)  # the type that pyserial declares for all its ports
     if url.scheme in ("socket", "tcp"):
         connection = SocketPort()
         connection.port = _socket_url(url) if url.scheme == "tcp" else port
@@ -125,15 +128,15 @@ def unopened(port: str) -> serial.Serial:
 
 
 def is_bridged(port: serial.SerialBase) -> bool:
-    """Return True for a port that the core cannot write to itself: a thread passes its requests on."""
+    """Return True if the core cannot write to this port directly, so that a thread forwards its requests."""
     return type(port).read is not serial.Serial.read and not isinstance(port, SocketPort)
 
 
 def check_port(port: str, mastership: Mastership | None) -> None:
-    """Raise NoSuchPort for an impossible port name, and TypeError unless this is a mastership.
+    """Raise NoSuchPort for an invalid port name, and TypeError unless this is a mastership or None.
 
-    With a mastership requests must be held back, and those that a thread has taken leave all the same: then
-    NoSuchPort is raised for such a port too.
+    With a mastership, raise NoSuchPort for a bridged port too: a request that its thread has already taken
+    would be sent even after the mastership was lost.
     """
     if mastership is not None and not isinstance(mastership, Mastership):
         raise TypeError(f"mastership takes a multidrop.core.Mastership, not {mastership!r}")
@@ -164,16 +167,16 @@ def device_of(port: serial.SerialBase) -> str:
 
 
 def identity_of(port: serial.SerialBase, name: str) -> str:
-    """Return the identity of an open port, however its name is spelt (see port_identity)."""
+    """Return the identity of an open port, the same for all of its names (see port_identity)."""
     if connection := connection_of(port):
         return port_identity.of_connection(connection)
     try:
         return port_identity.of_device(device_of(port))
-    except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
+    except (OSError, ValueError, AttributeError):  # the port has no device, such as loop://
         return port_identity.of_name(name)
 
 
-BY_PLACE = "/dev/serial/by-path/"  # names that mean whatever is plugged in there
+BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, for whatever adapter is plugged in
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
     TransactionIds.MATCH: Transactions.MATCHED,
@@ -182,7 +185,7 @@ _TRANSACTIONS = {
 
 
 def _refusal(rs485: RS485, failure: OSError) -> str:
-    """Return why a port cannot be polled: its driver refuses to switch the transceiver."""
+    """Return a sentence that the driver cannot switch the transceiver as `rs485` needs."""
     what = "has no RS-485 mode" if rs485 is RS485.KERNEL else "does not switch RTS"
     return f'the driver {what} ({os.strerror(failure.errno or 0)}), which rs485 = "{rs485}" needs'
 
@@ -190,7 +193,7 @@ def _refusal(rs485: RS485, failure: OSError) -> str:
 class OpenPort:
     """A pyserial port, with a bridge if the core cannot use it directly.
 
-    It may be opened and closed again and again, by one thread at a time.
+    It may be opened and closed repeatedly, by one thread at a time.
     """
 
     def __init__(
@@ -202,26 +205,26 @@ class OpenPort:
         settle: float = 0.0,
     ) -> None:
         self.name = name
-        self.identity = name  # see port_identity; known once it was open
+        self.identity = name  # see port_identity; known once the port was opened
         self.bridge: Bridge | None = None
-        self.settings: tuple[int, str] | None = None  # required of a bridged port
+        self.settings: tuple[int, str] | None = None  # baud rate and format of a bridged port
         self._ids = ids
         self._rs485 = rs485
         self._mastership = mastership
         self._settle = settle
         self._serial: serial.SerialBase | None = None
-        self._adapter: USBAdapter | None = None  # of the first opening
+        self._adapter: USBAdapter | None = None  # the adapter at the first opening
 
     def open(self) -> Port:
-        """Open the port and return the core's port after `settle` s; discard earlier input.
+        """Open the port, wait for `settle` s, discard the input, and return the core's port.
 
-        Raises LineError, or one of PORT_FAILURES; then close it.
+        Raises LineError or one of PORT_FAILURES; the caller must then call `close`.
         """
         port = self._serial = unopened(self.name)
         port.timeout = 0
         if isinstance(port, serial.Serial):
             port.exclusive = True
-            port.rts = self._rs485 is not RS485.RTS_UP  # else the transceiver sends once it is open
+            port.rts = self._rs485 is not RS485.RTS_UP  # else opening would switch the transceiver to sending
         port.open()
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
             self._require_same_adapter(device_of(port))
@@ -231,11 +234,11 @@ class OpenPort:
             port.reset_input_buffer()
         core = self._drive(port)
         with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
-            port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
+            port.set_low_latency_mode(True)  # without it, a USB adapter delays bytes by up to 16 ms
         return core
 
     def _require_same_adapter(self, device: str) -> None:
-        """Raise LineError if another adapter has this name now: its line has other motors."""
+        """Raise LineError if another adapter has this name now, because its line has other motors."""
         found = adapter_of(device)
         if self._adapter is None:
             self._adapter = found
@@ -247,7 +250,7 @@ class OpenPort:
             )
 
     def _drive(self, port: serial.SerialBase) -> Port:
-        """Give the core a descriptor of this port."""
+        """Return a core port that uses this port's descriptor, or that of a new bridge."""
         if type(port).read is serial.Serial.read:
             device = device_of(port)
             opened = Port(descriptor_of(port), must_take(device), mastership=self._mastership)
@@ -264,7 +267,10 @@ class OpenPort:
         return Port(self.bridge.theirs.fileno(), _NO_SETTINGS)
 
     def _switched(self, core: Port, device: str) -> Port:
-        """Have its transceiver switched; a pseudo-terminal has none, and goes without."""
+        """Set who switches the transceiver, and return `core`; skip this for a pseudo-terminal.
+
+        Raises LineError if the driver refuses.
+        """
         try:
             core.switch(self._rs485)
         except OSError as failure:
@@ -282,7 +288,7 @@ class OpenPort:
             connection = connection_of(self._serial)
             with suppress(*PORT_FAILURES):
                 self._serial.close()
-            if connection:  # pyserial leaves one open that has ended already
+            if connection:  # pyserial does not close a connection that the far end has closed
                 connection.close()
 
     def forget(self) -> None:
@@ -290,18 +296,18 @@ class OpenPort:
         if self.bridge:
             self.bridge.forget()
             self.bridge = None
-        # Of a network port the socket alone: pyserial would end the connection, which the parent has too.
+        # Close only a network port's socket: pyserial would also end the connection, which the parent uses.
         port = connection_of(self._serial) or self._serial
         if port:
             with suppress(*PORT_FAILURES):
                 port.close()
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Give a bridged port these settings: it can have only one baud rate and format.
+        """Set the one baud rate and format of a bridged port.
 
-        Raises LineError when it has others already, or does not take these.
+        Raises LineError if the port already has other settings, or rejects these.
         """
-        if self._serial is None or self.bridge is None:  # it may be one, when it is there
+        if self._serial is None or self.bridge is None:  # keep them: the port may be bridged once it is open
             self.settings = self.settings or settings
             return
         if self.settings == settings:
@@ -315,9 +321,9 @@ class OpenPort:
         self.settings = settings
 
     def overruns(self) -> int | None:
-        """Return how many characters came too fast for the port, since its driver was loaded.
+        """Return how many characters the port has lost to overruns since its driver was loaded.
 
-        None while it is closed, or if the driver does not count them.
+        Return None while the port is closed, or if the driver does not count overruns.
         """
         try:
             return None if self.bridge or not self._serial else overruns(self._serial.fileno())

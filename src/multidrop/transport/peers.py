@@ -1,4 +1,4 @@
-"""Peers: each drive's learnt timing and late replies, kept when a drive leaves and comes back."""
+"""Peers: each drive's learnt timing and late replies, kept while a drive is off the line."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
-KEPT_NS = 120_000_000_000  # as late.c remembers requests
+KEPT_NS = 120_000_000_000  # late.c remembers requests for the same time
 
 
 class FormerPeers(NamedTuple):
-    """Peers with late replies due when their port was closed, with their addresses."""
+    """Peers whose late replies were still due when their port was closed, each with its address."""
 
     closed_ns: int
     peers: tuple[tuple[int, Peer], ...]
 
 
-_former: dict[str, FormerPeers] = {}  # by port; each change is one step, so that no thread needs a lock
+_former: dict[str, FormerPeers] = {}  # by port; changed only atomically, without a lock
 
 
 def identities_of(*names: str) -> set[str]:
-    """Return the identities of an open port for its names.
+    """Return the identities that belong to these names of an open port.
 
-    Pseudo-terminal numbers are reused soon, so the identity of one includes its creation time.
+    The number of a pseudo-terminal is soon reused, so its identity here includes its creation time.
     """
     found = {port_identity.of_name(name) for name in names}
     return {f"{name} of {_made_ns(name)}" if is_pseudo_terminal(name) else name for name in found}
@@ -40,12 +40,12 @@ def identities_of(*names: str) -> set[str]:
 def _made_ns(device: str) -> int:
     try:
         return Path(device).stat().st_ctime_ns
-    except OSError:  # it is gone, and never comes back
+    except OSError:  # the device is gone for good: return a time that no other has
         return clock.now_ns()
 
 
 def remember_owing(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """Remember the peers with late replies due, by address, because their port was closed."""
+    """Remember the peers (with addresses) whose late replies are still due when their port is closed."""
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
         if now_ns - former.closed_ns > KEPT_NS:
@@ -56,30 +56,31 @@ def remember_owing(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> N
 
 
 def former_at(names: Iterable[str], address: int) -> Iterator[Peer]:
-    """Yield the peers at this address with late replies due when the port was closed."""
+    """Yield the peers at this address whose late replies were still due when the port was closed."""
     for name in names:
         former = _former.get(name)
         yield from (peer for at, peer in former.peers if at == address) if former else ()
 
 
 GONE_S = 0.001  # polling interval while a drive that left is still in an exchange
-LEAST_TIMEOUT = 0.02  # s; a host and its adapter may add so much to a drive's own delay
+LEAST_TIMEOUT = 0.02  # s; delay that a host and its adapter may add to the drive's own
 
 
 class Peers:
-    """The peers of the drives on one line; any thread may look while another one adds and removes drives."""
+    """The peers of the drives on one line. Threads may read it while one adds and removes drives."""
 
     def __init__(self, line: Line) -> None:
         self._line = line
-        self.present: dict[Drive, Peer] = {}  # of the drives that are on the line now
-        self._asked: dict[object, Peer] = {}  # by threads, each with a key of its own
+        self.present: dict[Drive, Peer] = {}  # peers of the drives that are on the line now
+        self._asked: dict[object, Peer] = {}  # peers in exchanges of threads, by a key for each exchange
         # By address and description; includes drives that left.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
-        """Add a drive; one that comes back keeps its learnt timing and late replies.
+        """Add a drive; one that was on the line before keeps its learnt timing and late replies.
 
-        A thread that still asks another, which left its address, is waited for: what that owes then is known.
+        Wait until no exchange with an earlier drive at this address is in flight: only then are its late
+        replies known.
         """
         for other, known in self._known.items():
             while other[0] == drive.address and self._is_asked(known):
@@ -119,7 +120,7 @@ class Peers:
         return identities_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
-        """Take over the peers of an earlier bus on the same line."""
+        """Copy the peers of an earlier bus on the same line."""
         self._known.update(before._known)
 
     def remove(self, drive: Drive) -> None:
@@ -137,12 +138,15 @@ class Peers:
     def carry_out(
         self, drive: Drive, made: Exchange, *, expires_ns: int = 0, into: Completion | None = None
     ) -> Completion:
-        """Carry an exchange out on the line. Raises NotAttached if the drive has left since it was made."""
+        """Carry out an exchange on the line.
+
+        Raises NotAttached if the drive was removed after the exchange was made.
+        """
         asking = object()
-        try:  # a signal between any two steps must leave no entry: `add` would wait for it forever
+        try:  # a signal must never leave an entry in `_asked`: `add` would wait for it forever
             self._asked[asking] = (
                 made.peer
-            )  # before the check: a drive that takes this one's place waits for it
+            )  # before the check, so that `add` of another drive at this address waits for this exchange
             if self.present.get(drive) is not made.peer:
                 raise _not_attached(drive)
             return self._line.carry_out(made, expires_ns=expires_ns, into=into)
@@ -150,7 +154,7 @@ class Peers:
             self._asked.pop(asking, None)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued, under way or about to be."""
+        """Return True while an exchange with this peer is about to start, queued or in flight."""
         return self._is_asked(peer) or self._line.is_asking(peer)
 
     def _is_asked(self, peer: Peer) -> bool:

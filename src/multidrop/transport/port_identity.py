@@ -1,4 +1,4 @@
-"""Identities of ports: one text for each port, however its name is spelt."""
+"""Identities of ports: the same text for all names of one port."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of t
 
 @dataclass(frozen=True)
 class USBAdapter:
-    """One port of an adapter: its place on the bus, and its serial number, or ""."""
+    """One port of a USB adapter: its place on the USB bus, and its serial number (or "")."""
 
     place: str
     serial: str
@@ -33,11 +33,11 @@ class USBAdapter:
 
 
 def adapter_of(device: str) -> USBAdapter | None:
-    """Return the adapter behind this device name; None if there is none, or the system does not say."""
+    """Return the USB adapter behind this device name; None if there is none or it is unknown."""
     found = (TTYS / Path(device).name / "device").resolve()
     for part in (found, *found.parents):
         if interface := _INTERFACE.fullmatch(part.name):
-            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # of the adapter's ports
+            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # which of the adapter's ports
             serial = _text(part.parent / "serial")
             return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
     return None
@@ -60,7 +60,7 @@ def com_name(name: str) -> str:
 
 
 def of_device(path: str) -> str:
-    """Return the link named after the adapter's serial number, else the path with links resolved."""
+    """Return the link in BY_ID to this device; without one, the path with its links resolved."""
     if sys.platform == "win32":
         return com_name(path)
     device = os.path.realpath(path)
@@ -72,7 +72,7 @@ def of_device(path: str) -> str:
 
 
 def lasting_name(port: str) -> str:
-    """Return a device's name by the serial number of its adapter, if it has one; else the name as it is."""
+    """Return a device name that contains its adapter's serial number; without one, the given name."""
     if "://" in port or Path(port).is_symlink():
         return port
     adapter = adapter_of(port)
@@ -91,7 +91,7 @@ def of_address(address: tuple[str | int, ...]) -> str:
 
 
 def of_name(name: str) -> str:
-    """Return the identity of a port that was written down as a path, a URL, or an identity."""
+    """Return the identity of a port that is given as a path, a URL, or an identity."""
     if "://" in name:
         try:
             url = urlsplit(name)

@@ -1,4 +1,4 @@
-"""Exchanges that carry a drive's requests, and its reads, made once and kept."""
+"""Create the exchanges for a drive's requests, and cache those of its reads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.drive.text import Text
 from multidrop.planning.blocks import Block, blocks, may_be_too_long
 from multidrop.planning.bus_time import silence
 
-MOST_EXACT = 1 << 53  # a float holds every whole number up to it
+MOST_EXACT = 1 << 53  # a float holds every whole number up to this one
 
 
 def _is_exact(register: Register[Any]) -> bool:
@@ -31,7 +31,7 @@ def _is_exact(register: Register[Any]) -> bool:
 
 
 class BlockDecoder:
-    """The places of registers in the reply of a block that starts at this address."""
+    """Decoder for the reply to a read of a block: these registers, from address `start`."""
 
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
@@ -62,18 +62,21 @@ def _shared(registers: tuple[Register[Any], ...], start: int) -> BlockDecoder:
 
 
 def decoder_of(block: Block) -> BlockDecoder:
-    """Return the block's decoder, which all drives of a kind share."""
+    """Return the block's decoder, which all drives with the same registers share."""
     return _shared(block.registers, block.start)
 
 
-MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
-NO_ROWS = core.RowLayout(0, [])  # for commands: a poll's summary counts only values that have rows
+MOST_PREPARED = 256  # cache size per drive, for plans and for blocks
+NO_ROWS = core.RowLayout(0, [])  # for commands: the poll's summary counts only values that have rows
 
 
 def make_exchange(
     drive: Drive, request: Message, peer: Peer, rows: core.RowLayout | None = None, **details: Any
 ) -> Exchange:
-    """Return the exchange that carries this request to this drive; `details` are Exchange's own."""
+    """Return an exchange that sends this request to this drive.
+
+    `details` are further arguments of Exchange.
+    """
     settings = drive.settings
     return Exchange(
         drive.framing,
@@ -92,7 +95,7 @@ def make_exchange(
 def make_read(
     drive: Drive, block: Block, peer: Peer, rows: core.RowLayout = NO_ROWS, **details: Any
 ) -> Exchange:
-    """Return the exchange that reads a block, with an echo probe if it needs one."""
+    """Return an exchange that reads a block, with the drive's echo probe unless the block contains it."""
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:
         probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
@@ -100,7 +103,7 @@ def make_read(
 
 
 class PreparedRead:
-    """A block of one drive's registers, the exchange that reads it, and what its reply's data means."""
+    """A block of one drive's registers, with the exchange that reads it and the decoder of its reply."""
 
     def __init__(self, drive: Drive, block: Block, peer: Peer) -> None:
         decoder = decoder_of(block)
@@ -109,19 +112,19 @@ class PreparedRead:
         self.may_be_too_long = may_be_too_long(drive, block)
         self.decode = decoder.decode
         self.names = decoder.names
-        self.whole = decoder.count if decoder.is_plain else None  # values of a reply that lacks none
-        self.spare: list[Completion] = []  # whose values were taken
+        self.whole = decoder.count if decoder.is_plain else None  # number of values in a complete reply
+        self.spare: list[Completion] = []  # completions to reuse
 
     def insisting(self, drive: Drive, timeout: float) -> Exchange:
-        """Return an exchange that insists, and reads the same."""
+        """Return an exchange that reads the same block with `insists` and this timeout in s."""
         peer, values = self.exchange.peer, self.exchange.values
         return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
 
 
 class ReadPlan:
-    """The reads of `wanted`, which are registers or their names: the last read first.
+    """The reads that return `wanted` (registers or their names), in reverse order.
 
-    `only` is the single read that returns all of them in the order of `wanted`, or None.
+    If a single read returns them all in the order of `wanted`, it is also `only`; else that is None.
     """
 
     __slots__ = ("names", "only", "reads", "wanted")
@@ -142,7 +145,7 @@ NOTHING = ReadPlan((), (), ())
 
 
 class PreparedReads:
-    """The prepared reads of one drive, for one port and one set of line settings."""
+    """The cached reads of one drive, for one port and one set of line settings."""
 
     def __init__(self, drive: Drive, peer: Peer, made_for: tuple[object, ...]) -> None:
         self.made_for = made_for
@@ -161,13 +164,16 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the last plan used: found again without hashing the registers
+        self.newest = NOTHING  # the last plan used, so that using it again hashes no registers
         self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks that the drive does not answer as a whole
-        self.answered: set[Block] = set()  # blocks that may have been too long, and are not
+        self.parts: dict[Block, tuple[Block, ...]] = {}  # parts of blocks not answered as a whole
+        self.answered: set[Block] = set()  # blocks of doubtful length that the drive has answered
 
     def ask_first(self, block: Block) -> None:
-        """Read a refused block before the other parts of its whole: the read fails without it anyway."""
+        """From now on read a refused block before the other parts of its larger block.
+
+        Without this block's values the whole read fails, so reading the other parts first wastes bus time.
+        """
         for whole, parts in [*self.parts.items()]:
             if block in parts:
                 self.parts[whole] = (block, *(part for part in parts if part != block))

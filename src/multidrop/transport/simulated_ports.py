@@ -1,8 +1,8 @@
-"""Marks by which a client recognises ports of simulated drives, whose writes wear no EEPROM.
+"""Marks that show a client which ports have simulated drives, whose writes wear no EEPROM.
 
-A simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)). The
-name is gone when the process ends, even by SIGKILL. Other systems have no such names: there a simulated
-drive's writes are counted as a real one's.
+On Linux, a simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)).
+The kernel removes the name when the process ends, even by SIGKILL. Other systems have no such names, so a
+simulated drive's writes are counted there like those of a real drive.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ def _name(identity: str) -> bytes:
 
 
 def ledger_of(identity: str, directory: Path) -> Path:
-    """Return the file that counts a simulated port's writes while its simulator runs."""
+    """Return the path of the ledger for a simulated port, which lasts while its simulator runs."""
     return directory / "simulated" / f"{quote(identity, safe='')}.sqlite"
 
 
 class SimulatedPort:
-    """A mark that a port is simulated, until it is closed; it clears the port's ledger."""
+    """The mark of a simulated port, until it is closed. Opening and closing it delete the port's ledger."""
 
     def __init__(self, identity: str, directory: Path) -> None:
         self._ledger = ledger_of(identity, directory)
@@ -35,7 +35,7 @@ class SimulatedPort:
         self._forget_writes()
         if _HAS_NAMES:
             self._holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            with suppress(OSError):  # another simulator's, on a port of the same name
+            with suppress(OSError):  # another simulator has a port of the same name
                 self._holder.bind(_name(identity))
 
     def _forget_writes(self) -> None:

@@ -1,7 +1,7 @@
 """Statistics of a line and its drives: results of exchanges, response delays, utilisation.
 
-All figures derive from counters that only grow: those of a time span are the difference of two readings.
-A reading costs the line no time.
+All figures derive from counters that only grow. The counters of a time span are the difference of two
+readings. A reading does not delay the line.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from multidrop.transport.exchange import Exchanges
 
 
-LOOKS = 3  # at counters that must be of one moment
+LOOKS = 3  # attempts to read counters without an exchange ending meanwhile
 _EPOCHS = count(1)
 
 
-# Bytes came instead of the reply, and no good frame among them.
+# Results if bytes came but no good frame.
 _DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
 
 _NOTHING = Counters()
@@ -40,23 +40,23 @@ class Diagnostics:
     """
 
     bus_messages: int
-    """Good frames received: replies, also exceptions and late ones, and confirmations of another write.
-    Frames of other addresses are not known to be whole, and are not counted."""
+    """Good frames received: replies (also exceptions and late ones), and confirmations of another write.
+    Frames from other addresses are not counted, because they may be incomplete."""
 
     bus_communication_errors: int
-    """Exchanges that ended in damage: a bad checksum or character, a reply cut short, no frame at all.
-    Parity and framing errors show as such damage. Noise that begins like a frame of another address
-    cannot be distinguished from one, and is not counted."""
+    """Exchanges that ended with damage: a bad checksum or character, a truncated reply, or bytes without a
+    frame. Parity and framing errors appear as such damage. Noise that starts like a frame from another
+    address cannot be distinguished from such a frame, and is not counted."""
 
     bus_exception_errors: int
-    """Exception replies. A drive never says what it finds wrong with a broadcast."""
+    """Exception replies. A drive never answers a broadcast, not even with an exception."""
 
     server_messages: int
-    """Requests that left, broadcasts too (which count for the drive whose register was written).
-    Nothing says that the drive received them."""
+    """Requests sent, including broadcasts (counted for the drive whose register was written).
+    It is unknown whether the drive received them."""
 
     server_no_responses: int
-    """Broadcasts, and requests to which nothing came within the time-out."""
+    """Broadcasts, and requests without any reply within the timeout."""
 
     server_naks: int
     """Exception replies with code 07, negative acknowledge."""
@@ -65,16 +65,16 @@ class Diagnostics:
     """Exception replies with code 06, busy."""
 
     bus_character_overruns: int | None
-    """Characters, not messages, that the port lost because they came too fast. Of a line only, and
-    None where the driver does not count them, as on pseudo-terminals and the network. Only the drive
-    itself knows what it loses."""
+    """Characters (not messages) that the port lost because they came too fast. Only for a line; None if the
+    driver does not count them, as on pseudo-terminals and networks. Characters that a drive loses are
+    unknown."""
 
 
 @dataclass(frozen=True)
 class Delays:
-    """Response delays in s, from a request's last bit to its reply's first.
+    """Response delays in s, from the last bit of a request to the first bit of its reply.
 
-    Quantiles are within a part in 16 of the truth, above 0.07 ms and below 4 s.
+    From 0.07 ms to 4 s, quantiles are accurate to 1/16 of their value.
     """
 
     replies: int
@@ -82,26 +82,27 @@ class Delays:
     p90: float
     p99: float
     longest: float
-    """Exact since the beginning; of a later span within a part in 8, unless it is the longest ever."""
+    """Exact since counting started. For a later time span it is accurate to 1/8, unless it is the longest
+    delay of all."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Results of the exchanges with one drive, or with all drives of a line, in `seconds` s."""
+    """Results of the exchanges with one drive, or with all drives of a line, within `seconds` s."""
 
     seconds: float
     counters: Counters
     overruns: int | None = None
     counted_s: float | None = None
-    """Time in s of the exchanges that are counted. It ends, as it begins, where an exchange under way began:
-    that one counts in the time after it. None: `seconds`."""
+    """Length in s of the time span of the counted exchanges; None means `seconds`. If an exchange is in
+    flight at a reading, the span ends at the start of that exchange, which counts in the next span."""
     epoch: int = field(default=0, kw_only=True)
-    """Number of the beginning from which all this is counted. Another line or drive of the same name has
-    another one, and so has a line whose statistics were reset."""
+    """Number that identifies the start of counting. It differs for another line or drive of the same name,
+    and changes when a line's statistics are reset."""
 
     @property
     def exchanges(self) -> int:
-        """Requests that left, whatever their result."""
+        """Number of requests sent, whatever their result."""
         return self.counters.sent
 
     @property
@@ -114,42 +115,42 @@ class Statistics:
 
     @property
     def misses(self) -> Counter[str]:
-        """Values that are missing, by the reason in their rows."""
+        """Number of missing values, by the reason in their rows."""
         found = Counter({STATUSES[status]: n for status, n in self.counters.missed.items()})
         found.update({STATUSES[EXCEPTION_STATUS + code]: n for code, n in self.counters.refused.items()})
         return found
 
     @property
     def late_replies(self) -> int:
-        """Replies that came after their time-out, and were recognised."""
+        """Number of replies that were recognised after their timeout."""
         return self.counters.late
 
     @property
     def timeout(self) -> float:
-        """Present time-out in s; of a line, the longest of its drives.
+        """Current timeout in s; for a line, the longest of its drives.
 
-        It follows a drive's own response delay, and grows where replies come late again and again.
+        It follows the drive's response delay, and grows if replies are late repeatedly.
         """
         return self.counters.timeout_ns / 1e9
 
     @property
     def skipped_bytes(self) -> int:
-        """Bytes outside replies: noise, late replies, an adapter's echo."""
+        """Number of bytes outside replies: noise, late replies, an adapter's echo."""
         return self.counters.stray_bytes
 
     @property
     def utilisation(self) -> float:
-        """Part of all time that the answered exchanges had to take of the line.
+        """Fraction of the time that the answered exchanges needed on the line.
 
-        Silence, request, response delay and reply, at the line's settings. A port that is faster than its
-        settings, such as a network's or a pseudo-terminal, needs at most the time it took. An exchange counts
-        when it ends, and so does its time: see `counted_s`.
+        An exchange needs silence, request, response delay and reply, at the line's settings. If the port is
+        faster than its settings (a network, a pseudo-terminal), its need is at most the time it took. An
+        exchange and its time count when it ends: see `counted_s`.
         """
         return self.used_s / (self.seconds if self.counted_s is None else self.counted_s)
 
     @property
     def used_s(self) -> float:
-        """Time in s that the answered exchanges had to take of the line."""
+        """Time in s that the answered exchanges needed on the line; see `utilisation`."""
         return self.counters.ideal_ns / 1e9
 
     @property
@@ -160,9 +161,9 @@ class Statistics:
 
     @property
     def delay_counts(self) -> list[tuple[float, int]]:
-        """Replies by their delay: the least delay of each bucket, in s, and how many there were.
+        """A histogram of the response delays: pairs of a bucket's least delay in s and its number of replies.
 
-        Buckets without replies are left out. Their width is an eighth of their delay.
+        Empty buckets are omitted. The width of a bucket is an eighth of its delay.
         """
         return [(delay_edge(bucket) / 1e9, n) for bucket, n in sorted(self.counters.delays.items()) if n > 0]
 
@@ -188,9 +189,9 @@ class LineStatistics(Statistics):
     drives: Mapping[str, Statistics] = field(default_factory=dict)
 
     def since(self, earlier: LineStatistics) -> LineStatistics:
-        """Return the statistics of the time since an earlier reading of the line of this name.
+        """Return the statistics of the time since `earlier`, a reading of the line of this name.
 
-        A line or drive with another epoch counts from zero.
+        A line or drive whose epoch differs from that in `earlier` counts from zero.
         """
         if self.epoch != earlier.epoch:
             return self
@@ -219,9 +220,9 @@ def line_statistics(
     counted_s: float | None = None,
     epochs: Mapping[str, int] = _UNNUMBERED,
 ) -> LineStatistics:
-    """Return the statistics that drives' counters, by their names, amount to after so many seconds.
+    """Return the statistics of a line and its drives from the counters of `seconds` s, by drive name.
 
-    `epochs` has those of the drives, by their names.
+    `epochs` has the drives' epochs, by name.
     """
     drives = {
         name: Statistics(seconds, counters, counted_s=counted_s, epoch=epochs.get(name, 0))
@@ -252,7 +253,7 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
         return now
     found = Counters._make(map(_minus, now, earlier))
     longest = now.longest_ns
-    if longest == earlier.longest_ns:  # that one may have been before the span
+    if longest == earlier.longest_ns:  # the longest delay may lie before the span
         longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
     return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
 
@@ -277,16 +278,16 @@ def _middle(counters: Counters, bucket: int) -> float:
 
 
 class Count(NamedTuple):
-    """Statistics since a line was opened, and the peers by the names that their drives had."""
+    """Statistics since a line was opened, and its peers by the names of their drives at that time."""
 
     statistics: LineStatistics
     peers: Mapping[str, Peer]
 
 
 class LineMeter:
-    """Statistics of a line since it was opened, or last reset; frozen when it is closed.
+    """Statistics of a line since it was opened or last reset; frozen when the line is closed.
 
-    Counts at the reset are kept by peer, because a name may be another drive's by now.
+    The counts at the reset are kept by peer, because another drive may have the same name later.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
