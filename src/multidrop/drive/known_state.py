@@ -1,4 +1,4 @@
-"""Known state: a drive's state, computed from values that were read before."""
+"""StateReader: compute a drive's state from values that were read before."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from multidrop.errors import BusError
 
 MOST_STEPS = 20
 FAULT = "fault"  # the register of a fault's code, in every family that has one
-FAULT_RECORDS = ("last_fault", "fault_record_1")  # of the newest fault, which may be past
+FAULT_RECORDS = ("last_fault", "fault_record_1")  # registers of the newest fault, which may be over
 
 
 class StateReader:
     """Computes a drive's state by its family's rules, from values such as those of polled rows.
 
-    It sends no request. Attributes that the family sets from one call to the next are kept in this reader.
+    It sends no request. Attributes that the family's script sets on the drive are kept in this reader's copy.
     """
 
     def __init__(self, drive: Drive) -> None:
@@ -34,11 +34,11 @@ class StateReader:
         """The register whose value was missing in the last call; "" if none was."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
-        """Return the state that these values, by register name, show; None if a value is missing.
+        """Return the state according to these values, by register name; None if a value is missing.
 
-        A value is as in a row: in the register's unit, or the raw count of a named value. If the status
-        shows a fault and the fault's code is missing, the fault has no name. The state is computed again only
-        if a value that it depends on has changed, or if the family set an attribute.
+        Values are as in rows: in the register's unit, or the raw count of a named value. If the status shows
+        a fault and the fault's code is missing, the state has no fault name. The state is computed again only
+        if a value that it depends on has changed, or if the family's script set an attribute.
         """
         if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
             return self._shown[1]
@@ -50,7 +50,7 @@ class StateReader:
         return found
 
     def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
-        """Return the state, or None if a value is missing; put the values that were used into `read`."""
+        """Return the state, or None if a value is missing; store the values used in `read`."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -73,16 +73,16 @@ class StateReader:
 
 
 def _known(state: object, read: Mapping[str, float | None]) -> State | None:
-    """Return a state; without the fault's name if the fault's code was missing."""
+    """Return the state. If the fault's code was missing, return a fault without a name, or None."""
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None
 
 
 def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
-    """Return True if these registers, by name, can show a fault of the drive.
+    """Return True if a fault of the drive can be detected from the registers with these names.
 
-    A record of the newest fault shows one by changing.
+    A record of the newest fault counts, because a new fault changes it.
     """
     if {FAULT, *FAULT_RECORDS} & {*polled}:
         return True
@@ -100,6 +100,6 @@ def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
 
 
 def _choices(register: Register[Any]) -> list[float]:
-    """Return the register values that a state may depend on."""
+    """Return the values of a register on which a state may depend."""
     members: list[Any] = [] if register.values is None else list(cast(Any, register.values))
     return [0.0, 1.0, *(float(member.value) for member in members)]

@@ -59,15 +59,15 @@ class Settings:
         return f"{self.baudrate} {self.format}"
 
 
-MODBUS_PORT = 502  # if a URL names none
+MODBUS_PORT = 502  # the default port number of tcp:// URLs
 SCHEMES = ("tcp", "socket", "rfc2217")  # not all of pyserial's: its spy:// writes to any file
 URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
 
 
 def check_port(port: str) -> str:
-    """Return a port's name from a file or a command line.
+    """Return `port` unchanged if it is a valid port name in a file or on a command line.
 
-    Raises NoSuchPort for a URL with another scheme, with a user or a password, or without its host or port
+    Raises NoSuchPort for a URL with an unknown scheme, with a user or a password, or without its host or port
     number.
     """
     scheme, is_url, _ = port.partition("://")
@@ -85,7 +85,10 @@ def speaks_tcp(port: str) -> bool:
 
 
 def url_of(port: str) -> SplitResult:
-    """Return the parts of a port's name. Raises NoSuchPort for a URL without its host or port number."""
+    """Return the parts of a port's name.
+
+    Raises NoSuchPort for a URL without a host, or without a port number if it needs one.
+    """
     try:
         url = urlsplit(port)
         host, number = url.hostname, url.port
@@ -98,7 +101,7 @@ def url_of(port: str) -> SplitResult:
     return url
 
 
-MOST_SETTLE = 10.0  # s; a process that ends may have to wait this long
+MOST_SETTLE = 10.0  # s; limited, because a process that ends may have to wait this long
 
 
 def check_settle(settle: float) -> None:
@@ -117,7 +120,7 @@ SERIAL_ADDRESSES = range(1, 248)  # 0 is the broadcast address
 def framing_on(
     port: str, declared: Framing | None, default: Framing, address: int, *, family: str, speaks_modbus: bool
 ) -> Framing:
-    """Return the framing of a drive on this port: TCP on tcp://, else the declared one or the default.
+    """Return the framing of a drive on this port: TCP on tcp://, otherwise `declared` or else `default`.
 
     Raises ValueError if the drive cannot be used on the port.
     """
@@ -147,8 +150,8 @@ def framing_on(
 def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:
     """Raise ValueError unless `agreed` is a valid silence in s.
 
-    `own` is the silence in s of an RTU drive's document. If both are shorter than 1.5 characters, such a
-    silence may also occur within a frame.
+    `own` is the silence in s that an RTU drive's document requires. Raises also if both are shorter than 1.5
+    characters, because such a silence may occur within a frame.
     """
     is_number = isinstance(agreed, (int, float)) and not isinstance(agreed, bool)
     if not (is_number and 0 <= agreed <= LONGEST_SILENCE):

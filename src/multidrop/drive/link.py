@@ -1,4 +1,4 @@
-"""Reads and writes of a drive, and Link: how a drive reaches its bus."""
+"""RegisterAccess: the read and write methods of a drive; and Link: the bus's part of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T", bound=float)
 
 
 class TextWanted(Exception):
-    """A text is among the registers to read: it needs requests of its own."""
+    """One of the registers to read is a text, which needs requests of its own."""
 
 
 class Link(Protocol):
@@ -21,9 +21,9 @@ class Link(Protocol):
 
     @property
     def values(self) -> Any:
-        """Return registers' values by name, of a drive and a sequence of registers or their names.
+        """A function of a drive and a sequence of registers or names that returns their values by name.
 
-        Raises TextWanted if one of them is a text.
+        It raises TextWanted if one of them is a text.
         """
 
     def text(self, drive: Any, text: Text) -> str: ...
@@ -56,7 +56,7 @@ class NoLink:
 
 
 def not_attached(drive: Any) -> NotAttached:
-    """Return the error of a call that needs a bus."""
+    """Return the error for a call that needs a bus."""
     return NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
 
 
@@ -64,7 +64,7 @@ NO_LINK = NoLink()
 
 
 class RegisterAccess:
-    """The reads and writes of a drive's registers, by themselves or by their names."""
+    """The reads and writes of a drive's registers, given as objects or by name."""
 
     name: str
     link: Link
@@ -87,11 +87,11 @@ class RegisterAccess:
         *more: Register[Any] | Text | str,
     ) -> dict[str, Any]: ...
     def read(self, *wanted: Register[Any] | Text | str) -> Any:
-        """Return the value of a register or text in engineering units; of several, a dict by name.
+        """Return the value of a register or text in engineering units; for several, a dict by name.
 
-        Registers may be given by their names. Several are read in as few requests as the family allows.
-        Raises NoReply, BadReply, NoValue, DriveException or LineError if the read fails; ValueError for a
-        name that the family does not have, and NotAttached.
+        Registers may be given by name. Several are read in as few requests as the family allows. Raises
+        NoReply, BadReply, NoValue, DriveException or LineError if the read fails, ValueError for an unknown
+        name, and NotAttached if the drive is on no bus.
         """
         if not wanted:
             raise TypeError(f"read of {self.name} takes registers or their names; read_all() reads all")
@@ -99,7 +99,7 @@ class RegisterAccess:
         return found if len(wanted) > 1 else next(iter(found.values()))
 
     def read_many(self, wanted: Iterable[Register[Any] | Text | str]) -> dict[str, Any]:
-        """Return the values of any number of registers and texts by name, as `read` does of several."""
+        """Return the values of any number of registers and texts, as a dict by name."""
         asked = tuple(wanted)
         try:
             return cast(dict[str, Any], self.link.values(self, asked))
@@ -123,41 +123,41 @@ class RegisterAccess:
     @overload
     def write(self, register: str, value: Any) -> Any: ...
     def write(self, register: Register[Any] | str, value: Any) -> Any:
-        """Write a value and return the value that the drive then holds; `value` if that cannot be read.
+        """Write a value; return the value that the drive then holds, or `value` if that cannot be read.
 
         The write is sent once. It is skipped if the register may be in EEPROM and already holds the value.
         The identity of the drive is checked before the first write to it. Raises WriteForbidden (also a
-        ValueError) for a write that the library does not send, TypeError for an invalid value, Expired if it
-        cannot be sent within the bus's `expiry`, DriveException if the drive refuses, and Unconfirmed if no
-        answer comes and the write may have happened.
+        ValueError) for a write that the library does not send, TypeError for an invalid value, Expired if the
+        write cannot be sent within the bus's `expiry`, DriveException if the drive refuses it, and
+        Unconfirmed if there is no reply, so that the write may have happened.
         """
         return self.try_write(register, value).value
 
     def try_write(self, register: Register[Any] | str, value: Any) -> Any:
-        """Write like `write`, and return the Outcome of a write that was sent, also if it failed."""
+        """Write like `write`, but return the Outcome of a write that was sent, even if it failed."""
         known = self.register(register) if isinstance(register, str) else register
         return self.link.write(self, known, value)
 
     def read_raw(self, function: int, start: int, count: int, *, expiry: float = 1.0) -> bytes:
-        """Return the data of any read request: addresses that need not be declared as registers.
+        """Read any addresses, whether or not they are declared as registers; return the reply's data.
 
         `function` is 1 (coils), 2 (discrete inputs), 3 (holding registers) or 4 (input registers). `start` is
         the address on the wire, from 0. `count` is the number of words or bits: at most 125 words or 2000
-        bits, or the family's limit for one request. Words come as two bytes, the more significant first;
+        bits, or the family's limit for one request. Words are returned as two bytes, most significant first;
         bits fill whole bytes from the least significant bit of the first byte.
 
-        The request is sent once, ahead of polling. A late reply to another request is never returned. A
-        silent drive costs its timeout, and counts as a failure of the drive. Raises Expired if the request
-        cannot be sent within `expiry` seconds, NoReply, BadReply, DriveException or LineError; ValueError or
-        TypeError for an invalid request.
+        The request is sent once, before queued polling. A late reply to another request is never returned. If
+        there is no reply, the call waits for the timeout, and this counts as a failure of the drive. Raises
+        Expired if the request cannot be sent within `expiry` seconds, NoReply, BadReply, DriveException or
+        LineError if it fails, and ValueError or TypeError if it is invalid.
         """
         return self.link.read_raw(self, function, start, count, expiry)
 
     def send_raw(self, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
-        """Send any request but a Modbus read once, past all checks, and return the data of the reply.
+        """Send any request except a Modbus read once, without checks; return the reply's data.
 
-        This is the one deliberate way around the rules: no identity check, no limits, no EEPROM budget. It
-        may start a motor. Raises Unconfirmed if no answer comes, DriveException, CancelledByStop or Expired;
-        ValueError for functions 1 to 4, which `read_raw` sends.
+        This deliberately bypasses the rules: no identity check, no limits, no EEPROM budget. It may start a
+        motor. Raises Unconfirmed if there is no reply, DriveException if the drive refuses, CancelledByStop
+        or Expired if the request was not sent, and ValueError for functions 1 to 4, which `read_raw` sends.
         """
         return self.link.send_raw(self, function, start, data, count)

@@ -1,4 +1,4 @@
-"""Named verbs: a drive's verbs by name, with options as in JSON."""
+"""The verbs of a drive by name, with options as in JSON."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def verbs_of(drive: Drive) -> list[str]:
 
 
 def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
-    """Return the arguments of a verb: `{"direction": "reverse"}` is Direction.REVERSE, `hz` is in Hz.
+    """Return a verb's arguments for these options.
 
-    An option that is None is left out. Raises ValueError for an unknown, missing or invalid option, KeyError
-    for an unknown verb.
+    `{"direction": "reverse"}` becomes Direction.REVERSE; `hz` is in Hz. An option that is None is omitted.
+    Raises ValueError for an unknown, missing or invalid option, KeyError for an unknown verb.
     """
     takes = _OPTIONS[verb]
     for name in options:

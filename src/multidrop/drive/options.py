@@ -1,4 +1,4 @@
-"""Options: facts about one drive that only its owner knows, among them its make (`confirmed`)."""
+"""Options: facts about one drive that only its owner knows, such as that its make is `confirmed`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class Option:
     """A fact about one drive that only its owner knows, such as its maximum frequency.
 
-    Without a unit it is a whole number: a choice, or a number of something.
+    Without a unit the value is a whole number: a choice or a count.
     """
 
     unit: str
@@ -25,7 +25,7 @@ _CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop
 def checked_options(
     family: str, options: Mapping[str, Option], given: Mapping[str, float]
 ) -> Mapping[str, float]:
-    """Return the given options. Raises ValueError for an unknown option or a value outside its span."""
+    """Return `given`. Raises ValueError for an unknown option, or for a value outside its span."""
     for name, value in given.items():
         if name not in options:
             known = ", ".join(options) or "none"
@@ -41,7 +41,7 @@ def checked_options(
 
 
 def confirmation(declared_in: str, *, identifies: bool) -> Mapping[str, Option]:
-    """Return the option `confirmed`, if the class is untested or cannot identify its drives."""
+    """Return the option `confirmed` by its name if the class is untested or cannot identify its drives."""
     if declared_in:
         return {"confirmed": _CHECKED}
     return {} if identifies else {"confirmed": _CONFIRMED}

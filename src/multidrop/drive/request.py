@@ -1,6 +1,6 @@
 """Requests that read and write registers, and the limits of one read.
 
-A `family` is a drive's class, or a drive, which may have limits of its own.
+A `family` argument is a drive's class, or a drive object that may have limits of its own.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ def stated_limit(family: Any, table: Table) -> int | None:
 
 
 def read_limit(family: Any, table: Table) -> int:
-    """Return how many registers one read of this table may take: the stated limit, or the standard's."""
+    """Return how many registers one read of this table may have: the stated limit, or the standard's."""
     stated = stated_limit(family, table)
     return STANDARD_LIMITS[table.carrier] if stated is None else stated
 
 
 def function_limit(family: Any, function: int) -> int:
-    """Return how many addresses one read by this function may take, declared or not.
+    """Return how many addresses, declared or not, one read by this function may have.
 
-    This is the smallest limit that the family states, but enough for its longest register.
+    This is the smallest limit that the family states, but at least its longest register.
     """
     standard = STANDARD_LIMITS[FUNCTIONS[function]]
     stated: list[int] = [most for table, most in family.most_registers.items() if table.read == function]
@@ -45,7 +45,7 @@ def function_limit(family: Any, function: int) -> int:
 
 
 def stated_gaps(family: Any, table: Table) -> list[range]:
-    """Return the addresses without registers that may be read across."""
+    """Return the ranges of addresses without registers that a read may include."""
     return [gap for other, gap in family.readable_gaps.items() if other.read_space == table.read_space]
 
 
@@ -86,10 +86,10 @@ def read_request(drive: Any, table: Table, start: int, count: int) -> Message:
 
 
 def write_request(drive: Any, register: Register[Any], raw: float, address: int | None = None) -> Message:
-    """Return the request that writes a raw count to a register, or to its RAM alias if it has one.
+    """Return the request that writes a raw count to a register.
 
-    `address` replaces the drive's own address in a broadcast. Raises ValueError if the register cannot be
-    written.
+    If the register has a RAM address, the request uses that address. `address` replaces the drive's own
+    address, as for a broadcast. Raises ValueError if the register cannot be written.
     """
     table = register.table
     if not register.writable or table.write is None:
@@ -113,7 +113,7 @@ def write_request(drive: Any, register: Register[Any], raw: float, address: int 
 
 
 def check_no_read(drive: Any, request: Message) -> None:
-    """Raise ValueError for a Modbus read: as a raw request it could return another read's late reply."""
+    """Raise ValueError for a Modbus read, because a raw read could return another read's late reply."""
     if drive.framing is not Framing.DELIXI and request.function in FUNCTIONS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(

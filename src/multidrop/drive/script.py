@@ -13,7 +13,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.errors import BadReply, BusError, DriveException, NoReply, Unconfirmed
 
-MOST_UNANSWERED = 3  # consecutive checks
+MOST_UNANSWERED = 3  # consecutive checks without a valid reply until the error is raised
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -32,12 +32,12 @@ class Write:
 
 @dataclass(frozen=True)
 class Insist(Write):
-    """A write that is harmless at any time and when repeated, such as a stop."""
+    """A write that is harmless at any time, even if repeated, such as a stop."""
 
 
 @dataclass(frozen=True)
 class Pulse(Insist):
-    """A harmless write that is sent once a call, such as a stop that trips the drive."""
+    """A harmless write that is sent only once in a call, such as a stop that trips the drive."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,10 @@ def wait(seconds: float) -> Script[None]:
 
 
 def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
-    """Run a script and return its result. A step's BusError or ValueError is raised in the script."""
+    """Run a script, calling `do` for each step, and return the script's result.
+
+    If `do` raises BusError or ValueError, that is raised in the script.
+    """
     try:
         step = next(script)
         while True:
@@ -95,10 +98,10 @@ def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
 
 
 def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
-    """Repeat a check until it is true; return False after `limit` seconds.
+    """Repeat a check every `every` seconds until it is true; return False after `limit` seconds.
 
-    A starting motor causes noise, so a check without a valid reply counts as false. The third consecutive
-    one raises NoReply or BadReply.
+    A starting motor causes noise, so a check without a valid reply counts as false. The third such check in
+    a row raises its NoReply or BadReply.
     """
     waited = 0.0
     unanswered = 0

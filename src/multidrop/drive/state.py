@@ -1,4 +1,4 @@
-"""State: condition, direction and fault, as a drive reports them; and the setpoint written last."""
+"""State: condition, direction and fault as a drive reports them; KnownSetpoint: the setpoint written last."""
 
 from __future__ import annotations
 
@@ -63,9 +63,10 @@ class KnownSetpoint:
         self._held = value
 
     def begin_write(self) -> Callable[[], None]:
-        """Forget the setpoint until the write ends; return a callback for a write that was not sent.
+        """Forget the setpoint until the write ends; return a function that restores it.
 
-        A value that another thread wrote in between stays.
+        Call the function if the write was not sent or was refused. It does nothing if another thread has
+        written a setpoint since.
         """
         write = self._held = _PendingWrite(self._held)
 

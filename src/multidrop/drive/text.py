@@ -44,9 +44,9 @@ class Text:
         return self.name
 
     def decode(self, data: bytes) -> str:
-        """Return the text of a reply's data: up to the first NUL, without spaces at its end.
+        """Return the text in a reply's data, up to the first NUL and without trailing spaces.
 
-        Bytes above 7FH are Latin-1. A character that does not print becomes a question mark.
+        Bytes above 7FH are Latin-1. An unprintable character becomes a question mark.
         """
         if self.order == "BA":
             data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
@@ -56,7 +56,7 @@ class Text:
         return "".join(character if character.isprintable() else "?" for character in found)
 
     def encode(self, value: str) -> bytes:
-        """Return the bytes of the registers that hold a text. Raises ValueError for one that does not fit."""
+        """Return a text as the bytes of its registers. Raises ValueError if the text is too long."""
         data = value.encode("latin-1")
         most = self.length * (1 if self.order == "B" else 2)
         if len(data) > most:
@@ -70,9 +70,10 @@ class Text:
 
 
 def text(address: int, length: int, *, table: Table = HOLDING, order: str = "AB", place: str = "") -> Text:
-    """Declare a text of so many registers, two characters in each; order "BA": the second one comes first.
+    """Declare a text of `length` registers with two characters in each.
 
-    Order "B" is one character in each, in its low byte.
+    With order "BA" the second character is in the high byte. With order "B" each register has only one
+    character, in its low byte.
     """
     return Text(address, length, table, order, place)
 

@@ -17,10 +17,10 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
-# Sent only to an identified drive, and not after a stop was called.
+# Verbs that are sent only to an identified drive, and not after a stop was called.
 MOVING = ("start", "jog", "reset_fault", "set_frequency", "release_control")
 
-# Sent repeatedly, also to a silent drive.
+# Verbs that are sent repeatedly, even to a silent drive.
 STOPPING = ("stop", "coast", "emergency_stop")
 
 VERBS = (
@@ -28,7 +28,7 @@ VERBS = (
     *("release_control", "state"),
 )
 
-# Each verb's argument, its types, and these in words: "reverse", a string, would go forward.
+# Each verb's argument, its types, and a description. Unchecked, the string "reverse" would mean forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
@@ -36,11 +36,11 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 }
 
 
-TRIES = 150  # of a stop, while the system has no memory or file descriptors left
+TRIES = 150  # attempts of a stop while the system has no memory or file descriptors left
 
 
 class CalledStop(Protocol):
-    """A stop that was called; if interrupted, `carry_out` resumes it."""
+    """A stop that was called. `carry_out` may be called again after it failed, and then resumes the stop."""
 
     def carry_out(self) -> None: ...
     def interrupted(self, interruption: BaseException) -> None: ...
@@ -55,10 +55,10 @@ class UnattachedStop:
         self._make = make
 
     def carry_out(self) -> None:
-        """Return at once."""
+        """Do nothing."""
 
     def interrupted(self, interruption: BaseException) -> None:
-        """Return at once."""
+        """Do nothing."""
 
     def result(self) -> Any:
         """Raise NotAttached."""
@@ -66,11 +66,11 @@ class UnattachedStop:
 
 
 class _BoundVerb(Generic[P, R]):
-    """A verb of one drive; a call carries it out.
+    """A verb of one drive; calling it carries out the verb.
 
     A stop takes `seconds`: it is repeated for that long, or until the motor is seen to be at rest. Without a
     valid `seconds` it is repeated for the duration of the motor's ramp, and at least 30 s. A stop that is
-    called with wrong arguments is carried out before it raises TypeError.
+    called with wrong arguments is carried out before TypeError is raised.
     """
 
     def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:
@@ -92,7 +92,7 @@ class _BoundVerb(Generic[P, R]):
         return cast(R, self.drive.perform(self.script(*args, **kwargs)))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
-        """Return the steps, for another verb or a test. Raises TypeError for a wrong argument."""
+        """Return the verb's script, for another verb or a test. Raises TypeError for a wrong argument."""
         if self.name in _TAKES:
             keyword, types, right = _TAKES[self.name]
             for given in (*args[:1], *(value for key, value in kwargs.items() if key == keyword)):
@@ -102,11 +102,11 @@ class _BoundVerb(Generic[P, R]):
 
 
 class _BoundMove(_BoundVerb[P, R]):
-    """A verb that may move the motor: a stop that is called after its first step ends it."""
+    """A verb that may move the motor. A stop that is called after the start of the call cancels it."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> R:
-        # Read the count first, without calling a Python function: a signal handler that stops the drive then
-        # runs either before this verb's call, or ends it.
+        # Read the count first, without calling a Python function. Then a signal handler that stops the drive
+        # either runs before this call, or cancels it.
         seen = self.drive.stops_called[0]
         script = self.script(*args, **kwargs)
         self.drive.check_confirmed(self.name)
@@ -114,7 +114,7 @@ class _BoundMove(_BoundVerb[P, R]):
 
 
 class _BoundStop(_BoundVerb[P, R]):
-    """A verb that stops the motor, even if interrupted after its first step."""
+    """A verb that stops the motor, even if the call is interrupted."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> R:
         run: CalledStop | None = None
@@ -144,7 +144,7 @@ class _BoundStop(_BoundVerb[P, R]):
     def _mistake(
         self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any
     ) -> TypeError | None:
-        """Return the error for arguments that the stop does not take."""
+        """Return a TypeError if the stop does not take these arguments, else None."""
         if not args and not kwargs:
             return None
         try:
@@ -161,7 +161,7 @@ _BOUND: Mapping[str, type[_BoundVerb[Any, Any]]] = {
 
 
 class Verb(Generic[P, R]):
-    """Decorator of a script that becomes a verb: a call carries it out on the drive's bus."""
+    """Decorator that makes a script a verb: a call of the verb carries out the script on the drive's bus."""
 
     def __init__(self, script: Callable[Concatenate[Any, P], Script[R]]) -> None:
         self._script = script
@@ -175,7 +175,7 @@ class Verb(Generic[P, R]):
         return signature(self._script).replace(return_annotation=Signature.empty)
 
     def __call__(self, drive: Drive, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Carry it out on a drive: `YD1000.start(pump)` is `pump.start()`."""
+        """Carry out the verb on a drive: `YD1000.start(pump)` is `pump.start()`."""
         return self.__get__(drive, type(drive))(*args, **kwargs)
 
     @overload
@@ -192,8 +192,8 @@ verb = Verb
 def verb_errors(family: Any) -> list[str]:
     """Return a sentence for each method that has a verb's name and lacks the decorator.
 
-    A call of such a method would only make a generator, and send no request. A register with such a name is
-    reported as a register.
+    A call of such a method would only create a generator, and send no request. A register or text with such
+    a name is reported elsewhere.
     """
     return [
         f"{name}: without the decorator @verb a call would send nothing; write @verb above it"

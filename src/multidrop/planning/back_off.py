@@ -1,10 +1,11 @@
-"""Back off from drives that stay silent, so that they cost the others little. Time comes in, in ns.
+"""Back off from silent drives, so that they take little time from the others. Callers pass the time, in ns.
 
-A silent drive rests longer each time. After each rest it gets its shortest request, in the others' spare
-time or in the share of jobs without a period; all silent drives together cost a small part of the line. With
-its first reply it is back, and the next silent one is tried at once: both may have been without power. A new
-drive, which has never answered, gets one request, and no other before the outcome of that is known; without
-a reply it rests at once. Once all new drives have had their request and few were silent, these get another.
+A silent drive rests (gets no request) for longer each time. After each rest it gets its shortest request, in
+spare time or in the share of jobs without a period. All silent drives together take only a small share of the
+line. When a silent drive replies, its rests end, and the next silent drive is tried immediately, because both
+may have been without power. A new drive, which has never answered, gets one request and no other until the
+outcome is known; without a reply it rests immediately. Once all new drives have had this request, and if only
+few were silent, the silent ones get a second request.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-SILENT_AFTER = 2  # failures in a row
+SILENT_AFTER = 2  # failures in a row after which a drive rests
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
-SILENT_SHARE = 0.015  # of the line, for requests to silent drives
-SECOND_COST_NS = 400_000_000  # at most, of a second request to new drives: a reply may have been lost
+SILENT_SHARE = 0.015  # share of the line for requests to silent drives
+SECOND_COST_NS = 400_000_000  # limit of the total time for second requests to silent new drives
 
 
 @dataclass
 class Health:
     """One drive's failures and rest."""
 
-    is_new: bool = False  # it has never answered
-    is_pending: bool = False  # only of a new drive: its request has no outcome yet
+    is_new: bool = False  # the drive has never answered
+    is_pending: bool = False  # the drive is new, and the outcome of its request is not known yet
     failures: int = 0
     late_until_ns: int = 0
     rest_ns: int = 0
@@ -36,26 +37,26 @@ class Health:
 class BackOff:
     """The health of all drives on a line, by address; `begin_rest` is called at the start of each rest."""
 
-    begin_rest: Callable[[int, int], None]  # with drive and time
+    begin_rest: Callable[[int, int], None]  # takes drive and time
     health: dict[int, Health] = field(default_factory=dict)
-    has_silent: bool = False  # or new drives
+    has_silent: bool = False  # whether any drive has failed last or is new
     _late_until_ns: int = 0  # of all drives
 
     def meet(self, drive: int) -> None:
-        """Treat a drive as new: it may not be there."""
+        """Treat a drive as new, because it may be absent."""
         self.health[drive].is_new = self.has_silent = True
 
     def forget(self, drive: int) -> None:
-        """Forget a drive that has no job left."""
+        """Forget a drive without jobs."""
         self.health.pop(drive, None)
 
     def conclude(self, drive: int) -> None:
-        """Note that a request to this drive has ended, with any outcome."""
+        """Record that a request to this drive has ended, with any outcome."""
         if drive in self.health:
             self.health[drive].is_pending = False
 
     def may_sleep(self, at_ns: int) -> bool:
-        """Return True where any drive may be asleep."""
+        """Return True if any drive may be asleep (may get no request now)."""
         return self.has_silent or at_ns < self._late_until_ns
 
     def is_asleep(self, drive: int, at_ns: int) -> bool:
@@ -63,7 +64,7 @@ class BackOff:
         return health.rest_ns > 0 or at_ns < max(health.asleep_until_ns, health.late_until_ns)
 
     def wake(self, at_ns: int) -> int | None:
-        """Return a drive whose rest is over; it rests again until the outcome of its request is known."""
+        """Return a drive whose rest is over, or None; the drive then starts its next rest."""
         for drive, health in self.health.items():
             if health.rest_ns and at_ns >= health.asleep_until_ns and not health.is_pending:
                 health.asleep_until_ns = at_ns + health.rest_ns
@@ -80,10 +81,10 @@ class BackOff:
         cost_ns: int,
         has_answered: bool = True,
     ) -> None:
-        """Note a drive's failures in a row, and the cost of its next request without a reply.
+        """Record a drive's failures in a row, and the cost of its next request if that gets no reply.
 
-        Until `late_until_ns` its reply to an earlier request may come, so it gets none, even if it has
-        answered since. When that reply has come, late as it is, the drive can be tried at once.
+        Until `late_until_ns` a reply to an earlier request may come, so the drive gets no request, even if it
+        has answered since. Once that late reply has come, the drive can be tried immediately.
         """
         health = self.health[drive]
         has_answered_late = late_until_ns < health.late_until_ns
@@ -113,18 +114,18 @@ class BackOff:
             self.begin_rest(drive, now_ns)
 
     def _fair_rest_ns(self) -> int:
-        """Return the rest that keeps all silent drives together within their share."""
+        """Return the rest in ns with which all silent drives together stay within SILENT_SHARE."""
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
-        """End the rest of one more drive, because this one is back."""
+        """End the rest of another silent drive, because this drive is back."""
         resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
         if resting:
             first = min(resting, key=lambda health: health.asleep_until_ns)
             first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
-        """End the rest of new drives once each has had its first request and few are silent."""
+        """End the rest of silent new drives once all new drives have had a request and few are silent."""
         new = [health for health in self.health.values() if health.is_new]
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:

@@ -1,4 +1,4 @@
-"""Choose which registers go into which request, so that reading them takes the least time on the wire."""
+"""Combine registers into requests, so that reading them takes the least time on the wire."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ class Block:
 
     table: Table
     start: int
-    count: int  # of addresses, with those between the registers
+    count: int  # number of addresses, including those between the registers
     registers: tuple[Register[Any], ...]
     request: Message
 
     @classmethod
     def of(cls, drive: Drive, registers: Sequence[Register[Any]]) -> Block:
-        """Return the block that reads these registers of one read space and what lies between them."""
+        """Return the block that reads these registers of one read space, with the addresses between them."""
         spans = [register.reach for register in registers]
         table, start = registers[0].table, min(span.start for span in spans)
         count = max(span.stop for span in spans) - start
         return cls(table, start, count, tuple(registers), read_request(drive, table, start, count))
 
     def offset(self, register: Register[Any]) -> int:
-        """Return the register's place in the reply's data, in words (coils: bits)."""
+        """Return the register's offset in the reply's data, in words (coils: bits)."""
         return register.address - self.start
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A drive's block that is read every so many seconds; None: as fast as the line allows."""
+    """A drive's block that is read every `every` seconds; None means as fast as the line allows."""
 
     drive: Drive
     block: Block
@@ -51,11 +51,11 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """Blocks that read a drive's registers, and the response delays, in s, at which no others are quicker."""
+    """The quickest blocks that read a drive's registers, for response delays from `least` to `most` s."""
 
     planned: tuple[Planned, ...]
-    least: float  # response delay; with a shorter one more requests of fewer characters would be quicker
-    most: float  # with a longer one, fewer requests of more characters
+    least: float  # with a shorter response delay, more requests of fewer characters would be quicker
+    most: float  # with a longer response delay, fewer requests of more characters would be quicker
 
     def suits(self, delay: float, margin: float = 0.0) -> bool:
         """Return True if no other plan is quicker at this response delay, within a relative `margin`."""
@@ -67,17 +67,17 @@ def plan(
 ) -> Plan:
     """Return the quickest plan that reads these registers, each with its period in seconds.
 
-    `delay` is the drive's measured response delay in s, or None. Registers of one function share a request if
-    that is quicker: up to the family's limit, else the standard's, across other readable registers, and
-    across reserved addresses if the family's document allows that. Registers of different rates never share
-    a request: some would be read too often. Those of a group in
-    `read_together` that have the same rate always do, and the blocks are in the groups' order. Raises
-    ValueError for a register that cannot be read.
+    `delay` is the drive's measured response delay in s; with None the documented one is used. Registers of
+    one function share a request if that is quicker. A request may include other readable registers, and
+    reserved addresses if the family's document allows that, up to the family's limit or else the standard's.
+    Registers of different rates never share a request, because some would be read too often. Registers of a
+    group in `read_together` with the same rate always share one, and the blocks are in the groups' order.
+    Raises ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
         rates.setdefault(every, []).append(register)
-    overhead = silence(drive) + (drive.response_delay if delay is None else delay)  # of a request
+    overhead = silence(drive) + (drive.response_delay if delay is None else delay)  # s of each request
     character = drive.settings.character
     found: list[Planned] = []
     least, most = 0.0, math.inf
@@ -96,7 +96,7 @@ def plan(
 
 
 def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
-    """Return the blocks with registers of `read_together` first, in that order."""
+    """Return the blocks sorted: first those with registers of `read_together`, in its order."""
     places = {name: place for place, group in enumerate(drive.read_together) for name in group}
     return sorted(
         found, key=lambda one: min(places.get(each.name, len(places)) for each in one.block.registers)
@@ -117,7 +117,7 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
 
 
 def first_block(drive: Drive) -> Block | None:
-    """Return a request for the drive's first reading, or else for the first register that can be read."""
+    """Return a block with the drive's first reading, or else its first readable register; None if none."""
     readable = [*drive.readings(), *(each for each in drive.registers.values() if each.readable)]
     return blocks(drive, readable[:1])[0] if readable else None
 
@@ -125,9 +125,10 @@ def first_block(drive: Drive) -> Block | None:
 def all_requests(
     drive: Drive, registers: Iterable[Register[Any]]
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
-    """Yield every request that may read neighbours among these registers.
+    """Yield every request that may read some of these registers.
 
-    Each is a number of addresses, all registers by rising address, and the slice (begin, end) that it reads.
+    Each is a tuple: the number of addresses, all registers of the read space by rising address, and begin and
+    end of the slice of them that the request reads.
     """
     for neighbours in _neighbours(drive, registers):
         for end in range(1, len(neighbours.registers) + 1):
@@ -136,7 +137,7 @@ def all_requests(
 
 
 def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
-    """Return the blocks that read a text, in order; each within the family's limit."""
+    """Return the blocks that read a text, in order, each within the family's limit."""
     limit, end = read_limit(drive, text.table), text.address + text.length
     counts = ((start, min(limit, end - start)) for start in range(text.address, end, limit))
     return tuple(
@@ -146,7 +147,7 @@ def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
 
 
 def sending(drive: Drive, block: Block) -> float:
-    """Return the seconds in which characters of the request and of the reply are on the wire."""
+    """Return the seconds that the characters of the block's request and reply take on the wire."""
     return characters(drive.framing, block.table.carrier, block.count) * drive.settings.character
 
 
@@ -162,10 +163,10 @@ class _Neighbours:
 
     carrier: Carrier
     registers: tuple[Register[Any], ...]
-    spans: tuple[tuple[int, int], ...]  # (first address, the one behind the last) of each
-    joined: tuple[bool, ...]  # for each and the next one: what lies between them may be read
-    tied: tuple[bool, ...]  # for each and the next one: a request that ends between them parts a group
-    limit: int  # addresses that one request may read; a single longer register is still read whole
+    spans: tuple[tuple[int, int], ...]  # for each: its first address, and the one after its last
+    joined: tuple[bool, ...]  # for each and the next: whether the addresses between them may be read
+    tied: tuple[bool, ...]  # for each and the next: whether a cut between them would split a group
+    limit: int  # number of addresses that one request may read; a longer register is read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
         """Yield (begin, count) of each request that may read registers[begin:end]."""
@@ -184,7 +185,7 @@ class _Neighbours:
 
 
 def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neighbours]:
-    """Return these registers by read space."""
+    """Return these registers, grouped by read space."""
     spaces: dict[object, list[tuple[range, Register[Any]]]] = {}
     for register in dict.fromkeys(registers):
         check_readable(drive, register)
@@ -221,9 +222,9 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 @dataclass(frozen=True)
 class _Way:
-    """The cut of neighbours into so many requests that takes the fewest characters."""
+    """A division of neighbours into requests: for their number, the one with the fewest characters."""
 
-    characters: int  # of the requests and their replies
+    characters: int  # number of characters of the requests and their replies
     spans: tuple[tuple[int, int], ...]  # (begin, end) of each request's registers
 
     @property
@@ -233,11 +234,11 @@ class _Way:
 
 @lru_cache(maxsize=256)
 def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
-    """Return each way that is the quickest at some response delay, maybe others too; fewest requests first.
+    """Return all ways that are quickest at some response delay, and maybe others; fewest requests first.
 
     Dynamic programming over the first register of the last request.
     """
-    fronts: list[list[_Way]] = [[_Way(0, ())]]  # for the first so many registers
+    fronts: list[list[_Way]] = [[_Way(0, ())]]  # by the number of registers, counted from the first
     for end in range(1, len(neighbours.registers) + 1):
         fewest: dict[int, _Way] = {}  # characters, by number of requests
         for begin, count in neighbours.ending_at(end):
@@ -252,7 +253,7 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
 
 
 def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
-    """Leave out ways that need more requests and save no characters by it."""
+    """Return the ways without those that need more requests than another and no fewer characters."""
     kept: list[_Way] = []
     for requests in sorted(ways):
         if not kept or ways[requests].characters < kept[-1].characters:
@@ -261,16 +262,16 @@ def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
 
 
 def _even(drive: Drive, few: _Way, many: _Way) -> float:
-    """Return the response delay in s at which few requests take as long as many."""
+    """Return the response delay in s at which both ways take equally long."""
     saved = (few.characters - many.characters) * drive.settings.character
     return saved / (many.requests - few.requests) - silence(drive)
 
 
 def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
-    """Return two blocks that read these registers between them, or () if one would still read them all.
+    """Return two blocks that together read the block's registers, or () if it cannot be split.
 
     Registers at the same addresses stay together, and so do those of a group in `read_together`. Splitting
-    again and again ends: of n registers there are at most 2 n - 1 blocks, the whole included.
+    a block of n registers repeatedly gives at most 2 n - 1 blocks, including the block itself.
     """
     units = _units(drive, block)
     if len(units) < 2:

@@ -9,7 +9,7 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Carrier
 
-# Characters of a read's request and reply without its data, and of each byte of that.
+# Number of characters of a read's request and reply without data, and of each data byte.
 _FRAMES = {
     Framing.RTU: (8 + 5, 1),
     Framing.ASCII: (17 + 11, 2),
@@ -19,10 +19,10 @@ _FRAMES = {
 
 
 def silence(drive: Drive) -> float:
-    """Return the seconds of silence around a drive's exchanges: its needs plus one stop bit.
+    """Return the seconds of silence around a drive's exchanges: what the drive needs, plus one bit.
 
-    ASCII frames need none. They get 1.5 characters, time enough to see whether more comes, such as a second
-    copy of the reply, which could otherwise be taken for the next one. Modbus TCP has none.
+    ASCII frames need no silence, but get 1.5 characters: enough to notice further bytes, such as a second
+    copy of the reply, which could otherwise be mistaken for the next reply. Modbus TCP has no silence.
     """
     settings = drive.settings
     if drive.framing is Framing.TCP:
@@ -32,36 +32,36 @@ def silence(drive: Drive) -> float:
 
 
 def characters(framing: Framing, carrier: Carrier, count: int) -> int:
-    """Return the characters of the request that reads so many registers and of its reply."""
+    """Return the number of characters of a request that reads `count` registers, plus its reply."""
     around, each = _FRAMES[framing]
     return around + each * ((count + 7) // 8 if carrier is Carrier.BIT else 2 * count)
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
-    """Return the seconds from one drive's reply to the other's request, on a line that is never idle.
+    """Return the seconds from the reply of `before` to the request for `after`, on a line that is never idle.
 
-    `switching` is the time that the port takes to change baud rate or format once the silence is over.
+    `switching` is the time in s that the port takes to change baud rate or format after the silence.
     """
     switched = switching if switches(before, after) else 0.0
     return max(silence(before), silence(after)) + switched
 
 
 def switches(before: Drive, after: Drive) -> bool:
-    """Return True if the port changes baud rate or format between them; a network port has neither."""
+    """Return True if the port changes baud rate or format between the drives; network ports never do."""
     return before.settings != after.settings and Framing.TCP not in (before.framing, after.framing)
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Return the key of drives that follow each other in the least time: silence and settings."""
+    """Return silence and settings; drives that share them follow each other in the least time."""
     return silence(drive), str(drive.settings)
 
 
 def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
-    """Return the bus cycle with the least silence, and the fewest switches among equals.
+    """Return the drives in an order with the least silence in a bus cycle, and then the fewest switches.
 
-    The line keeps the longer of two neighbours' silences, so drives of equal silence and settings are
-    neighbours. Kinds are inserted by rising silence, each at its cheapest place; if switching is free,
-    no order is shorter.
+    The line keeps the longer of two neighbours' silences, so drives of equal silence and settings are put
+    side by side. Kinds are inserted by rising silence, each at its cheapest place. If switching takes no
+    time, no other order is shorter.
     """
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:
@@ -75,7 +75,7 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
 
 
 def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:
-    """Return the cost of visiting a drive between two others: ns, which compare well, and switches."""
+    """Return the additional cost of a drive between two others: time in ns, and number of switches."""
     seconds = gap(before, drive, switching) + gap(drive, after, switching) - gap(before, after, switching)
     more = sum(switches(one, other) for one, other in pairwise((before, drive, after)))
     return round(seconds * 1e9), more - switches(before, after)

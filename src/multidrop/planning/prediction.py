@@ -1,7 +1,7 @@
 """Predict a line's bus cycle, utilisation and rates before its port is opened.
 
-Every exchange is taken to succeed at once, and the host to be late by the usual time. The schedule itself
-says which exchange follows which, on a simulated clock.
+The prediction assumes that every exchange succeeds at the first attempt, and that the host adds its usual
+lateness. The order of exchanges comes from `Schedule`, run on a simulated clock.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from multidrop.planning.blocks import Planned, sending
 from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s that a common machine adds to each exchange: it wakes up and writes the request
-ENOUGH = 0.97  # of a wanted rate: it counts as kept
-LEAST_EXCHANGES = 1000  # that are scheduled
-LEAST_ROUNDS = 3
+LATENESS = 100e-6  # s that a common computer adds to each exchange to wake up and write the request
+ENOUGH = 0.97  # fraction of a wanted rate that counts as reached
+LEAST_EXCHANGES = 1000  # minimum number of simulated exchanges
+LEAST_ROUNDS = 3  # minimum number of simulated exchanges per job
 FAR_NS = 1 << 62
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Registers of a drive that are wanted every so many s; None: as fast as the line allows."""
+    """Registers of a drive that are polled every `every` s; None means as fast as the line allows."""
 
     drive: Drive
     every: float | None
@@ -42,11 +42,11 @@ class Rate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The figures that one line reaches."""
+    """The predicted figures of one line."""
 
-    cycle: float  # s, of all that is polled as fast as the line allows
-    switches: int  # of line settings in it
-    utilisation: float  # over 1: so many times as fast the line would have to be
+    cycle: float  # s for one exchange of each block
+    switches: int  # number of changes of the line's settings in a cycle
+    utilisation: float  # above 1, the line would have to be faster by this factor
     rates: tuple[Rate, ...]
 
     @property
@@ -54,7 +54,7 @@ class Prediction:
         return all(rate.fits for rate in self.rates)
 
     def requests(self, drive: Drive) -> int:
-        """Return how many requests of a bus cycle go to this drive."""
+        """Return the number of requests to this drive in a bus cycle."""
         return sum(rate.requests for rate in self.rates if rate.drive is drive)
 
     def exchanges_per_second(self, drive: Drive) -> float:
@@ -63,23 +63,23 @@ class Prediction:
 
 @dataclass(eq=False, kw_only=True)
 class _PredictedJob(Job):
-    """A job, and its exchanges on the simulated clock."""
+    """A job with the results of its exchanges on the simulated clock."""
 
     planned: Planned
     own: float  # s from the end of the silence to the end of the reply
     count: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    taken: float = 0.0  # s of the line, the silences before it included
+    taken: float = 0.0  # s of line time, including the silences before the exchanges
 
     @property
     def cost(self) -> float:
-        """Mean seconds of the line that it takes."""
+        """Mean line time of an exchange in s."""
         return self.taken / self.count if self.count else self.own + silence(self.planned.drive)
 
     @property
     def reached(self) -> float:
-        """Times per second."""
+        """Exchanges per second."""
         if self.skipped == 0 and self.planned.every:
             return 1 / self.planned.every
         return (self.count - 1) * 1e9 / (self.last_ns - self.first_ns) if self.count > 1 else 0.0
@@ -93,16 +93,16 @@ def predict(
 ) -> Prediction:
     """Return the bus cycle, utilisation and rates of a line with these exchanges.
 
-    `delays` are the response delays in s that were measured, of drives that have any; `switching` is the
-    time in s that the port takes to change baud rate or format, as a poll has measured it; `lateness` is
-    the host's share of each exchange in s, 0 to predict the line alone.
+    `delays` are measured response delays in s; other drives have their documented delay. `switching` is the
+    measured time in s that the port takes to change baud rate or format. `lateness` is the time in s that the
+    host adds to each exchange; 0 predicts the line alone.
     """
     jobs = _jobs(exchanges, delays or {}, switching, lateness)
     _run(jobs, switching)
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    has_rests = any(job.interval_ns for job in jobs)  # the line may idle then
+    has_rests = any(job.interval_ns for job in jobs)  # the line may then be idle
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
@@ -130,7 +130,7 @@ def predict(
 
 
 def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
-    """Return the seconds that each drive needs for all of its jobs once, with its rests."""
+    """Return the seconds that each drive needs to carry out all of its jobs once, with its intervals."""
     found: dict[Drive, float] = {}
     for job in jobs:
         drive = job.planned.drive
@@ -163,8 +163,8 @@ def _jobs(
 
 
 def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
-    """Run the jobs on a simulated clock, and note the results in them."""
-    ends = {job.kind: job.planned.drive for job in jobs}  # drives of one kind are alike to their neighbours
+    """Run the jobs on a simulated clock, and store the results in them."""
+    ends = {job.kind: job.planned.drive for job in jobs}  # all drives of one kind need the same gaps
     numbers = {kind: number for number, kind in enumerate(ends)}
     gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
     slots = tuple(
@@ -179,7 +179,7 @@ def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
 
 
 class _Slots(NamedTuple):
-    """The facts of a job that decide its schedule: the key of the cache."""
+    """The properties of a job that determine its schedule; used as cache key."""
 
     drive: int
     kind: int
@@ -198,11 +198,11 @@ class _Done(NamedTuple):
     taken: float
 
 
-@lru_cache(64)  # a plant's lines are often alike, and several parts of a program ask for one plant
+@lru_cache(64)  # lines of a plant are often alike, and a program may predict a plant several times
 def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...]) -> tuple[_Done, ...]:
-    """Carry out one job after another in the schedule's order, and return what becomes of each.
+    """Simulate the jobs in the schedule's order; return the results of each job.
 
-    `gaps` are in s, by the kinds of two drives that follow each other.
+    `gaps[a][b]` is the time in s between a drive of kind a and a following drive of kind b.
     """
     schedule: Schedule[Job] = Schedule()
     jobs = [
@@ -240,10 +240,10 @@ def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...])
 
 
 def prediction_metadata(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:
-    """Return the prediction for a line and its drives' blocks, as plain numbers.
+    """Return the prediction for a line and its drives' blocks as plain numbers, for a recording.
 
-    A reader of a recording compares it with the measurement. Characters are those on the wire, of a good
-    reply.
+    A reader of the recording can compare it with the measurement. Numbers of characters are those on the
+    wire, with a good reply.
     """
     prediction = predict(exchanges, switching=switching)
     drives = dict.fromkeys(planned.drive for planned in exchanges)

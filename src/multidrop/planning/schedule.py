@@ -1,12 +1,11 @@
-"""Decide which exchange of a line comes next. Time comes in, in ns.
+"""Decide which exchange of a line comes next. Callers pass the time, in ns.
 
-The line is planned ahead, up to a horizon, so that it never waits for Python. A job with a period
-has slots on its own grid, which never drifts. Of the started slots, the one that ends first
-goes first; if there is time for all, those of one kind go together. A slot that is over
-when its turn comes is counted and skipped, never made up for in a burst. From then on, until the
-line has caught up, the job that has waited longest goes first, so that each gets a part. Jobs without
-a period take turns in the remaining time, and have a minimum share of the line. `BackOff` handles silent
-drives.
+The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
+period has slots at multiples of the period, which never drift. Of the started slots, the one that ends first
+goes first. If there is time for all of them, jobs of one kind go together. If a slot is over before its turn,
+it is counted and skipped, and not made up for later. From then on, until the line has caught up, the job that
+has waited longest goes first, so that each job gets a share. Jobs without a period take turns in the
+remaining time (the round), and have a minimum share of the line. `BackOff` handles silent drives.
 """
 
 from __future__ import annotations
@@ -18,32 +17,32 @@ from typing import Generic, NamedTuple, TypeVar
 
 from multidrop.planning.back_off import BackOff, Health
 
-TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
+TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
 CREDIT_NS = 50_000_000  # of that share, which they use up in advance
 NEVER_NS = 1 << 63
 
 
 @dataclass(eq=False, kw_only=True)
 class Job:
-    """One exchange that is wanted again and again with the drive of this address.
+    """One exchange that is carried out repeatedly with the drive at this address.
 
-    Jobs of one `kind` follow each other in the least time: they share line settings and silence.
+    Jobs of one `kind` have the same line settings and silence, so they follow each other in the least time.
     """
 
     drive: int
     period_ns: int | None
     duration_ns: int
-    silence_ns: int = 0  # the part of its duration that can pass while the line idles
-    interval_ns: int = 0  # from the end of an exchange to the next request to its drive
+    silence_ns: int = 0  # part of the duration that may already pass while the line is idle
+    interval_ns: int = 0  # minimum time from the end of an exchange to the next request to the drive
     kind: Hashable = None
     due_ns: int = 0
     taken_ns: int = 0
-    skipped: int = 0  # slots left out because the line was busy
+    skipped: int = 0  # number of slots skipped because the line was busy
     number: int = 0  # in the bus cycle
 
     @property
     def end_ns(self) -> int:
-        """End of its slot."""
+        """End of the job's present slot."""
         return self.due_ns + (self.period_ns or 0)
 
 
@@ -51,11 +50,11 @@ J = TypeVar("J", bound=Job)
 
 
 class Turn(NamedTuple, Generic[J]):
-    """A job that is carried out once."""
+    """One execution of a job."""
 
     job: J
     not_before_ns: int
-    due_ns: int | None  # its slot; None: it has none
+    due_ns: int | None  # start of the job's slot; None for a job without slots
 
 
 class Schedule(Generic[J]):
@@ -65,20 +64,20 @@ class Schedule(Generic[J]):
         self.clear()
 
     def clear(self) -> None:
-        """Forget all jobs, and their drives' health."""
+        """Forget all jobs and the health of their drives."""
         self.jobs: list[J] = []
-        self.unasked: list[tuple[J, int]] = []  # slots that passed, with the time at which each was due
+        self.unasked: list[tuple[J, int]] = []  # slots skipped because of silence: job and due time
         self.back_off = BackOff(self._begin_rest)
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # a heap of (due, number, job)
-        self._begun: list[J] = []  # their slot has started
-        self._ready: dict[int, int] = {}  # of drives with an interval: when each may be asked again
+        self._begun: list[J] = []  # jobs whose slot has started
+        self._ready: dict[int, int] = {}  # by drive with an interval: time of the earliest next request
         self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
         self._round: list[J] = []  # jobs without a period
         self._next = 0  # index in the round
-        self._owed_ns = -CREDIT_NS  # to them
-        self._is_late = False  # a slot had to be left out since the line last had done all that was due
-        self._kind: Hashable = None  # of the job that was taken last
+        self._owed_ns = -CREDIT_NS  # time owed to the jobs of the round
+        self._is_late = False  # whether a slot was skipped since the line last had no due job left
+        self._kind: Hashable = None  # kind of the job that was taken last
         self._number = 0
 
     def add(self, job: J, now_ns: int) -> None:
@@ -108,7 +107,7 @@ class Schedule(Generic[J]):
             self._round.pop(at)
 
     def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
-        """Put others in the jobs' place in the round; the first slot of each is due at `due_ns`."""
+        """Replace `jobs` by `others`, at the same place in the round; their first slots start at `due_ns`."""
         rest = self._round[self._next :] + self._round[: self._next]
         at = next((at for at, job in enumerate(rest) if job in jobs), len(rest))
         for job in others:
@@ -119,7 +118,7 @@ class Schedule(Generic[J]):
             self.remove(job)
 
     def put_in_order(self, drives: Sequence[int]) -> None:
-        """Sort the round by the order of its drives here, and restart it."""
+        """Sort the round in the order of these drives, and restart it."""
         places = {drive: place for place, drive in enumerate(drives)}
         self._round.sort(key=lambda job: places[job.drive])
         self._next = 0
@@ -130,20 +129,20 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the round if it is all there is to do: no slots, and all drives answer; else []."""
+        """Return the round if no job has slots or an interval and all drives answer; otherwise []."""
         if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]
 
     def go_on(self, job: J) -> None:
-        """Go on with this job: the line has carried out the round up to it."""
+        """Continue the round with this job."""
         if job in self._round:
             self._next = self._round.index(job)
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[Turn[J]]:
-        """Return at most `most` turns in their order, which keep the line busy up to the horizon.
+        """Return at most `most` turns, in order, that keep the line busy until `horizon_ns`.
 
-        `start_ns` is when the line will have done all that it was given.
+        `start_ns` is when the line will have carried out all earlier turns.
         """
         at = idle_since = max(now_ns, start_ns)
         taken: list[Turn[J]] = []
@@ -171,7 +170,7 @@ class Schedule(Generic[J]):
         return min(times, default=NEVER_NS)
 
     def _begin_slots(self, by_ns: int) -> None:
-        """Start all slots that are due; skip those of drives at rest."""
+        """Start all slots that are due, and skip those of resting drives."""
         while self._waiting and self._waiting[0][0] <= by_ns:
             job = heapq.heappop(self._waiting)[2]
             if self.back_off.is_asleep(job.drive, by_ns):
@@ -185,7 +184,10 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Return the job whose slot ends first, or one of the last kind if all others can wait."""
+        """Return the started job whose slot ends first, or one of the last kind if no slot would be missed.
+
+        If slots were skipped, return the job that has waited longest. Return None if no job can be sent.
+        """
         if self.back_off.may_sleep(at_ns):
             for job in [job for job in self._begun if self.back_off.is_asleep(job.drive, at_ns)]:
                 self._begun.remove(job)
@@ -208,7 +210,7 @@ class Schedule(Generic[J]):
         return min(begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
 
     def _in_turn(self, at_ns: int) -> J | None:
-        """Return the shortest job of a drive whose rest is over, or the next one of the round."""
+        """Return the shortest job of a drive whose rest is over, or the next job of the round, or None."""
         if self.back_off.has_silent and (drive := self.back_off.wake(at_ns)) is not None:
             own = [job for job in self.jobs if job.drive == drive]
             if own:
@@ -234,11 +236,11 @@ class Schedule(Generic[J]):
         return not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Take a job for its present slot; count and skip its slots that are over."""
+        """Return a job's turn for its present slot; count and skip its slots that are over."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
-        if job.period_ns is None or health.rest_ns:  # or tried whether it answers
+        if job.period_ns is None or health.rest_ns:  # a resting drive's request does not use a slot
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return Turn(job, max(health.late_until_ns, ready_ns), None)
         self._begun.remove(job)
@@ -256,13 +258,13 @@ class Schedule(Generic[J]):
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """Put back slots of drives whose first reply is pending: their slots may start later than now."""
+        """Let slots wait again if the drive's first reply is pending, because they may start later."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)
 
     def put_back(self, turns: Sequence[Turn[J]]) -> None:
-        """Take these turns again, in their order: they were not carried out."""
+        """Schedule these turns again, in the same order, because they were not carried out."""
         for turn in reversed(turns):
             job = turn.job
             self.back_off.conclude(job.drive)
@@ -280,11 +282,11 @@ class Schedule(Generic[J]):
     # ---- slots without a request ----
 
     def _begin_rest(self, drive: int, now_ns: int) -> None:
-        """Note one row for each job without slots, which will say why it has no value."""
+        """Add to `unasked` one entry for each job of the drive without slots, which becomes a miss row."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip every slot that starts by now; return each with its due time."""
+        """Skip every slot that starts by `now_ns`; return the jobs with the slots' due times."""
         while self._begun:
             self._await(self._begun.pop())
         passed = []

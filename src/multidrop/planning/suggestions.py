@@ -1,4 +1,4 @@
-"""Suggest what would make a line fit: lower rates, a higher baud rate, fewer registers."""
+"""Suggest changes that make a line reach its rates: lower rates, a higher baud rate, fewer registers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import silence
 from multidrop.planning.prediction import Prediction, Rate, predict
 
-WORTH_SAYING = 0.02  # of the time
+WORTH_SAYING = 0.02  # least fraction of the reading time that a suggestion must save
 _NAMES = {
     HOLDING: "HOLDING",
     HOLDING_MULTIPLE: "HOLDING",
@@ -27,15 +27,15 @@ _NAMES = {
 }
 
 
-SLOWER = 1.05  # factor between attempts
+SLOWER = 1.05  # factor between attempted periods
 
 
 @dataclass(frozen=True)
 class Suggestions:
     """Three changes that each make the line fit; None if it cannot."""
 
-    every: tuple[tuple[float, float], ...]  # periods in s that are wanted, and what fits instead
-    baudrate: tuple[int, tuple[Drive, ...]] | None  # and the drives that are to have it
+    every: tuple[tuple[float, float], ...]  # pairs: a wanted period in s, and one that fits instead
+    baudrate: tuple[int, tuple[Drive, ...]] | None  # a baud rate, and the drives that need it
     registers: int | None  # register limit per overloaded drive
 
     def __str__(self) -> str:
@@ -56,9 +56,9 @@ def duration_text(seconds: float) -> str:
 
 
 def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: float = 0.0) -> Suggestions:
-    """Return changes that would make exchanges fit that do not fit by `prediction`.
+    """Return changes that would make these exchanges fit; `prediction` says which do not fit.
 
-    `switching` is as for `predict`.
+    `switching` is the time in s of a change of settings, as for `predict`.
     """
     tight = [rate for rate in prediction.rates if not rate.fits]
     return Suggestions(
@@ -71,9 +71,10 @@ def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: flo
 def _every(
     exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...]:
-    """Lengthen the periods that do not fit by one factor, from `least` on, until all fit.
+    """Multiply the periods that do not fit by a common factor, at least `least`, that makes all fit.
 
-    That ends: the others fit beside those that are lengthened, and fit better the rarer these come.
+    Return pairs of a wanted and a longer period. The search ends, because the other exchanges fit already,
+    and fit better the longer these periods are.
     """
     hasty = {(rate.drive, rate.every) for rate in tight}
     wanted = sorted({rate.every for rate in tight if rate.every})
@@ -91,13 +92,13 @@ def _every(
 
 
 def _rounded_up(seconds: float) -> float:
-    """Round up to two digits."""
+    """Round up to two significant digits."""
     digit = 10.0 ** (math.floor(math.log10(seconds)) - 1)
     return round(math.ceil(seconds / digit - 1e-9) * digit, 9)
 
 
 def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tuple[Drive, ...]] | None:
-    """Return the lowest baud rate that fits, and the drives that are slower now."""
+    """Return the lowest baud rate that makes all fit, and the drives that are slower now."""
     wanted: dict[Drive, list[tuple[Register[Any], float | None]]] = {}
     for each in exchanges:
         wanted.setdefault(each.drive, []).extend((register, each.every) for register in each.block.registers)
@@ -113,7 +114,7 @@ def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tupl
 
 
 def _at(drive: Drive, baudrate: int) -> Drive:
-    """Return the same drive with another baud rate."""
+    """Return a copy of the drive with another baud rate."""
     return type(drive)(
         drive.address,
         name=drive.name,
@@ -125,7 +126,7 @@ def _at(drive: Drive, baudrate: int) -> Drive:
 
 
 def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: float) -> int | None:
-    """Return with how many registers each rate that does not fit would; None where not with a single one."""
+    """Return the largest number of registers with which each rate would fit; None if even one is too many."""
     crowded = {(rate.drive, rate.every) for rate in tight}
     others = [each for each in exchanges if (each.drive, each.every) not in crowded]
 
@@ -143,7 +144,7 @@ def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: f
 
 @dataclass(frozen=True)
 class ReadingGain:
-    """Gaps that a class does not state, and the requests and seconds of its reads with and without them."""
+    """Readable gaps that a class could state, and the cost of its reads with them and without them (now)."""
 
     drive: Drive
     gaps: tuple[tuple[Table, range], ...]
@@ -161,7 +162,7 @@ class ReadingGain:
         )
 
     def _declaration(self) -> str:
-        """Return the gaps as the family's file or class would have them."""
+        """Return the text that declares the gaps in the family's file or class."""
         named = [(_NAMES.get(table, table.name), gap) for table, gap in self.gaps]
         if self.drive.declared_in:
             in_file = (f"{name.lower()} = [0x{gap[0]:X}, 0x{gap[-1]:X}]" for name, gap in named)
@@ -171,7 +172,7 @@ class ReadingGain:
 
 
 def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> ReadingGain | None:
-    """Return the gain of stating readable gaps if the class states none; None if it is negligible."""
+    """Return the gain if the class stated readable gaps; None if it states some or the gain is negligible."""
     wanted = list(wanted)
     before = planned(drive, wanted)
     unstated = {
@@ -191,7 +192,7 @@ def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | Non
 
 
 def _crossed(drive: Drive, table: Table, found: Sequence[Planned]) -> range:
-    """Return the addresses, from the first to the last, that are read without being declared."""
+    """Return the range of addresses that these blocks read although they are not declared."""
     family: Any = type(drive)
     readable = readable_addresses(family, table)
     blocks = [one.block for one in found if one.block.table.read_space == table.read_space]
