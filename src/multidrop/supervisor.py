@@ -1,9 +1,9 @@
-"""Supervisor: the tasks and threads of a process that must go on, and those that work for a while.
+"""Supervisor: the permanent tasks and threads of a process, and those that end by themselves.
 
-The gateway starts all of its own here, and the fleet those that must go on. The supervisor knows which of
-them have ended: the gateway's /health reports that, and a fleet's gateway ends. It also knows which work
-takes too long, such as a read from a file system that hangs. Its threads are daemons: they never keep the
-process from ending.
+The gateway starts all its tasks and threads here, a gateway of a fleet only the permanent ones. The
+supervisor notes which permanent ones have ended: /health of the gateway reports them, and a gateway of a
+fleet shuts down. The supervisor also notes which work takes too long, such as a read from a file system that
+hangs. Its threads are daemons: they never keep the process from ending.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ _log = logging.getLogger("multidrop.supervisor")
 
 
 class Hung(OSError):
-    """Work that did not end in its time; its thread goes on."""
+    """Work that exceeded its time limit; its thread continues."""
 
 
 class Ended(OSError):
-    """Tasks or threads that must go on have ended; which, and why, in one sentence."""
+    """Permanent tasks or threads have ended. One sentence says which, and why."""
 
 
 class _Work(NamedTuple):
     name: str
-    begun: float  # by the monotonic clock
-    limit_s: float  # after which it takes too long
+    begun: float  # monotonic time in s
+    limit_s: float  # work that takes longer counts as hanging
 
 
 class Supervisor:
-    """The tasks and threads of one loop. All but the threads' own work is called in the loop."""
+    """The tasks and threads of one event loop. All methods must be called in the loop."""
 
     def __init__(self) -> None:
-        self.dead: dict[str, str] = {}  # tasks and threads that must go on, and why they ended
-        self.has_dead = asyncio.Event()  # set at the first one
+        self.dead: dict[str, str] = {}  # permanent tasks and threads that have ended, and why
+        self.has_dead = asyncio.Event()  # set once `dead` has an entry
         self._kept: dict[str, asyncio.Task[Any]] = {}
         self._watched: dict[str, Callable[[], bool]] = {}
         self._short: set[asyncio.Task[Any]] = set()
@@ -56,12 +56,12 @@ class Supervisor:
 
     @property
     def kept(self) -> dict[str, asyncio.Task[Any]]:
-        """The tasks that must go on, by name."""
+        """The permanent tasks, by name."""
         return dict(self._kept)
 
     @property
     def started(self) -> list[asyncio.Task[Any]]:
-        """The tasks that end by themselves, and have not."""
+        """The tasks that end by themselves and are still running."""
         return [*self._short]
 
     @property
@@ -70,7 +70,7 @@ class Supervisor:
         return [*self._watched]
 
     def keep(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
-        """Start a task that must go on until `release`; if it ends before, `dead` says why."""
+        """Start a permanent task, which must run until `release`; if it ends before, `dead` says why."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self.dead.pop(name, None)
         self._kept[name] = task
@@ -85,7 +85,7 @@ class Supervisor:
         self.note_dead(name, "it was cancelled" if task.cancelled() else reason_of(failure), failure)
 
     def let_go(self, name: str) -> asyncio.Task[Any] | None:
-        """Return a task that may end from now on; None if it has ended."""
+        """Return a permanent task, which may end from now on; None if it has ended already."""
         return self._kept.pop(name, None)
 
     async def release(self, *names: str) -> None:
@@ -117,23 +117,24 @@ class Supervisor:
             self.note_dead(name, "its thread has ended")
 
     def note_dead(self, name: str, why: str, failure: BaseException | None = None) -> None:
-        """Note and log that something which must go on has ended."""
+        """Note and log that a permanent task or thread has ended."""
         self.dead[name] = why
         self.has_dead.set()
         _log.error("%s has ended, and does not come back: %s", name, why, exc_info=failure)
 
     def check(self) -> None:
-        """Raise Ended if a task or a thread that must go on is known to have ended."""
+        """Raise Ended if a permanent task or thread is known to have ended."""
         if self.dead:
             raise Ended("; ".join(f"{name} has ended: {why}" for name, why in self.dead.items()))
 
     # ---- threads ----
 
     def thread(self, name: str, limit_s: float, work: Callable[[], R]) -> asyncio.Future[R]:
-        """Do work in a thread of its own, which goes on whether or not the future is cancelled.
+        """Do work in its own thread, and return a future of its result.
 
-        After `limit_s` seconds /health is degraded until it ends. Raises RuntimeError or MemoryError if the
-        system has no thread left.
+        The thread continues even if the future is cancelled. Work that takes longer than `limit_s` seconds is
+        in `hung`, and /health is degraded, until it ends. Raises RuntimeError or MemoryError if the system
+        has no thread left.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[R] = loop.create_future()
@@ -167,11 +168,11 @@ class Supervisor:
         return future
 
     async def within(self, name: str, limit_s: float, work: Callable[[], R], *, most: int = 4) -> R:
-        """Return what work returns, which has a thread of its own.
+        """Return the result of work, which is done in its own thread.
 
-        At most `most` works of a name go on at once; others wait for them. Raises Hung if it is not done
-        within `limit_s` seconds, or has not started within as many. Once one is done, those that started
-        before it are no longer reported as hanging: the disk answers.
+        At most `most` works of this name run concurrently; others wait for them. Raises Hung if the work
+        cannot start within `limit_s` seconds, or is not done `limit_s` seconds after its start. Once it is
+        done, works of this name that started earlier no longer count as hanging, because the disk answers.
         """
         begin_by = monotonic() + limit_s
         while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:
@@ -217,7 +218,8 @@ def supervisor() -> Supervisor:
 async def end_tasks(*tasks: asyncio.Task[Any]) -> list[Any]:
     """Cancel tasks until each is over; return their results and exceptions.
 
-    One cancellation is not enough: `asyncio.wait_for` of Python 3.11 swallows one that meets its own timeout.
+    One cancellation is not enough: `asyncio.wait_for` of Python 3.11 swallows one that coincides with its
+    timeout.
     """
     left = set(tasks)
     while left:
@@ -228,7 +230,7 @@ async def end_tasks(*tasks: asyncio.Task[Any]) -> list[Any]:
 
 
 def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
-    """Return the result of work; no loop is needed. Raises Hung if it is not done in `seconds`."""
+    """Return the result of work done in a thread, without a loop. Raises Hung if it exceeds `seconds`."""
     ended: Future[R] = Future()
 
     def run() -> None:
@@ -241,13 +243,13 @@ def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
     try:
         return ended.result(seconds)
     except TimeoutError as late:
-        if ended.done():  # the work itself raised it
+        if ended.done():  # the work itself raised TimeoutError
             raise
         raise Hung(f"{name}: not done within {seconds:g} s; does the disk answer?") from late
 
 
 def for_a_future(failure: BaseException) -> Exception:
-    """Return a failure as a future takes it: SystemExit would end the loop, and StopIteration is refused."""
+    """Return a failure that a future accepts: SystemExit would end the loop, StopIteration is refused."""
     if isinstance(failure, Exception) and not isinstance(failure, StopIteration):
         return failure
     return RuntimeError(reason_of(failure))

@@ -29,7 +29,7 @@ class NoRight(FleetError):
 
 
 class NotDelivered(FleetError):
-    """A request that certainly reached no one."""
+    """A request that certainly reached no receiver."""
 
 
 class MayNotSend(NoRight, NotDelivered):
@@ -41,7 +41,7 @@ class NobodyThere(NotDelivered):
 
 
 class Unsure(FleetError):
-    """A request without a timely answer: it may have been carried out, or still be."""
+    """A request without a timely answer: it may have been carried out, or may still be."""
 
 
 class Conflict(Exception):
@@ -83,7 +83,7 @@ def failure_to_connect(url: str, failure: BaseException) -> FleetError:
 
 
 def _words(text: str) -> str:
-    """Return an error's text without numbers; for asyncio's connection errors, the system's words."""
+    """Return an error's text without error numbers; for asyncio's connection errors, the system's text."""
     numbers = dict.fromkeys(re.findall(r"\[Errno (\d+)\] Connect call failed", text))
     if numbers:
         return ", ".join(os.strerror(int(number)) for number in numbers)
@@ -98,11 +98,11 @@ class Denials:
         self._raised = ""  # a subscription whose denial is raised instead of logged
 
     async def note(self, failure: Exception) -> None:
-        """Take a message that a server sent by itself."""
+        """Note a denial, if this error message of a server reports one."""
         found = _DENIAL.search(str(failure))
         if not found:
             return
-        kind, subject = found[1].lower(), found[2].lower()  # nats-py lowers them
+        kind, subject = found[1].lower(), found[2].lower()  # nats-py turns messages into lower case
         if (kind, subject) not in self._said:
             if len(self._said) >= MOST_DENIALS:
                 return
@@ -117,8 +117,8 @@ class Denials:
     def check_request(self, subject: str, inbox: str, before: int) -> None:
         """Raise MayNotSend or NoRight if missing rights explain a missing answer.
 
-        `before` is how often the request was denied before it was sent. MayNotSend means that it reached no
-        one, NoRight that this inbox cannot be read.
+        `before` is the number of denials of this subject before the request was sent. MayNotSend means that
+        the request was not forwarded, NoRight that the answer in this inbox cannot be read.
         """
         if self.of_request(subject) > before:
             raise MayNotSend(_sentence("publish", subject))

@@ -23,10 +23,10 @@ IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
 
 class LifeLock:
-    """A lock on a local file, held until the process ends: its next holder knows that this one is dead.
+    """A lock on a local file, held until the process ends: its next holder knows that this process is dead.
 
-    The file holds a random id, because containers may share a machine's id and the path. Raises FleetError if
-    another process of this machine holds the lock.
+    The file holds a random id, because containers may share the machine id and the path. Raises FleetError if
+    another process of this computer holds the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -48,7 +48,7 @@ class LifeLock:
             os.fsync(self._file.fileno())
 
     def proves_death(self, value: Mapping[str, Any]) -> bool:
-        """Return True if a record is of a process that held exactly this lock, so it is dead."""
+        """Return True if the process that wrote this record held exactly this lock, and so is dead."""
         mine = (str(self.path), self.id, machine_id())
         return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
 
@@ -57,10 +57,10 @@ class LifeLock:
 
 
 def machine_id() -> str:
-    """Return an id of this machine's present boot; "" if unknown, which is never a proof.
+    """Return an id of this computer's present boot; "" if unknown, which never proves a death.
 
-    Copies of a disk share the machine's id and the lock file with its id. A gateway that finds a record of
-    another boot waits: after a reboot the lease has expired anyway.
+    Computers with copies of one disk have the same machine id and the same lock file, but other boot ids.
+    After a reboot, a gateway waits until the lease in its earlier record has expired.
     """
     with suppress(OSError):
         ids = [path.read_text("utf-8", "replace").strip() for path in IDS]

@@ -37,9 +37,9 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int}
-FORWARD_S = 10.0  # to forward the rest at the end; the next start continues
-IN_TROUBLE_S = 3.0  # the same, if the stream has a problem
-SYNC_S = 3.0  # for the disk, before forwarding
+FORWARD_S = 10.0  # time limit for forwarding the rest at shutdown; the next start continues
+IN_TROUBLE_S = 3.0  # the same limit if the stream has a problem
+SYNC_S = 3.0  # time limit for writing the last rows to the disk, before forwarding
 ENDING_S = 0.05
 LOOK_S = 0.2  # between checks of the threads
 
@@ -148,7 +148,7 @@ class FleetGateway:
             await asyncio.sleep(LOOK_S)
 
     def end(self) -> None:
-        """Let `run` return. Call it in the loop."""
+        """Make `run` shut down and return. Call this in the event loop's thread."""
         self._end.set()
 
     async def _forward_the_rest(self, forwarding: asyncio.Task[None]) -> None:
@@ -174,7 +174,7 @@ class FleetGateway:
     # ---- requests ----
 
     async def _answer(self, message: Msg) -> None:
-        """Answer a request about this gateway; without a session it may be for another of this name."""
+        """Answer a request about this gateway; ignore it without a session, as a namesake may have one."""
         if not self.member.lease.session or not names.is_inbox(message.reply):
             return
         if message.subject == names.gateway_subject(self.name, "drain"):

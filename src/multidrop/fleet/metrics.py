@@ -1,8 +1,8 @@
-"""Metrics of a fleet's gateway: its state as OpenMetrics, and the port that serves it on this machine.
+"""Metrics of a fleet's gateway: its state as OpenMetrics, and the port that serves it on this computer.
 
 An unknown figure, such as the margin without a lease, has no sample. Every client that can connect can read,
-so the port listens only on loopback addresses. It also checks the `Host` header: a web page whose name was
-redirected here reads nothing.
+so the port listens only on loopback addresses. It also checks the `Host` header, so that a web page whose
+name resolves to this computer cannot read the metrics.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from multidrop.fleet.leases.member import MemberState
 
 
 class _Figure(NamedTuple):
-    """A figure of a gateway's state, and its place there."""
+    """A metric, and the keys of its value in a gateway's state."""
 
     name: str
     kind: str  # "gauge" or "counter"
@@ -83,7 +83,7 @@ def _family(name: str, kind: str, text: str, value: float) -> MetricFamily:
 EXAMPLE = "127.0.0.1:9464"
 MOST_HEAD = 8192  # bytes of a request
 MOST_CLIENTS = 32
-PATIENCE_S = 5.0  # for a request, and for its answer
+PATIENCE_S = 5.0  # time limit for receiving a request and sending its answer
 NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
 REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed"}
 REASONS |= {500: "Internal Server Error"}
@@ -93,7 +93,7 @@ Metrics = Callable[[], Iterable[MetricFamily]]
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port. Raises ValueError if invalid, or if other machines can reach it."""
+    """Return host and port. Raises ValueError if invalid, or if other computers can reach it."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:

@@ -1,4 +1,4 @@
-"""Overview: a fleet by its records and its gateways' answers, once or again and again."""
+"""Overview: the state of a fleet, from its records and its gateways' answers, once or repeatedly."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # in the spool part of a gatew
 
 
 class FleetView:
-    """A fleet over one path; each `look` reads the changes and asks every gateway."""
+    """The state of a fleet, read over one path. Each `look` reads the changes and asks every gateway."""
 
     def __init__(self, path: ServerPath) -> None:
         self._path = path
@@ -54,7 +54,7 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # of another version
+            with suppress(KeyError, TypeError, ValueError):  # the gateway has another version
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
@@ -67,9 +67,9 @@ class FleetView:
     def fleet(self) -> dict[str, Any]:
         """Return living and missing gateways, lines with their masters, and the last moves.
 
-        A gateway that just died is still listed, until another one has ended its session. Its `says` is None
-        if it does not answer, and `unseen_s` is how long (s) no renewal was seen. Then it is missing, with
-        the time of its last renewal (`seen_ms`, UTC), until it runs again.
+        A dead gateway is listed as living until another one has ended its session. Its `says` is None if it
+        does not answer, and `unseen_s` is how long (s) no renewal was seen. Afterwards it is listed as
+        missing, with the time of its last renewal (`seen_ms`, UTC), until it runs again.
         """
         sessions = self._records.observer.sessions()
         lines = self._lines(sessions)
@@ -97,7 +97,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # by owner, because there are thousands of lines
+        held: dict[tuple[str, int], bool] = {}  # does an owner's session last? cached, for thousands of lines
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)
@@ -120,7 +120,7 @@ def _ms(found: object) -> int | None:
 
 
 def is_shown(state: Mapping[str, Any]) -> bool:
-    """Return True if a gateway's answer has all fields that are shown: another version's may lack some."""
+    """Return True if a gateway's answer has all displayed fields; that of another version may lack some."""
     spool = state["spool"]
     return isinstance(state.get("trouble"), str) and all(
         name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()
@@ -137,10 +137,10 @@ class FleetWatch:
         self._view = view
         self._clock = clock
         self._looked: float | None = None
-        self.trouble: str | None = None  # of the newest read
+        self.trouble: str | None = None  # why the newest read failed
 
     async def look(self) -> None:
-        """Read again. If that fails, the last view stays and grows old."""
+        """Read the fleet again. If that fails, set `trouble` and keep the last view, whose age increases."""
         begun = self._clock()
         try:
             await self._view.look()
@@ -161,6 +161,6 @@ class FleetWatch:
         return None if self._looked is None else round(self._clock() - self._looked, 3)
 
     def told(self) -> dict[str, Any]:
-        """Return the content that `fleet watch --json` prints and the gateway's page shows."""
+        """Return the view that `fleet watch --json` prints and the gateway's page shows."""
         about = {"at_ms": time.time_ns() // 1_000_000, "age_s": self.age_s, "trouble": self.trouble}
         return {**about, **self._view.fleet()}

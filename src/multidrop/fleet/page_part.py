@@ -1,6 +1,6 @@
 """The part `fleet` of `multidrop serve`: shows a fleet on the page, and stops it with a commander's key.
 
-`multidrop.gateway` finds it by its name, like its own parts.
+`multidrop.gateway` imports this module by its name, like those of its other parts.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
 EXAMPLE = "nats://127.0.0.1:4222"
-OLD_S = 5.0  # an older view is unhealthy
+OLD_S = 5.0  # an older view makes the part unhealthy
 AGAIN_S = 1.0  # between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
 
@@ -53,7 +53,8 @@ Settings = FleetSettings
 class FleetPart:
     """A part that reads a fleet once a second.
 
-    `command` returns a new commander that is not connected; None if this page may not stop the fleet.
+    `command` returns a new client for commands, not yet connected; it is None if this page may not stop the
+    fleet.
     """
 
     def __init__(
@@ -133,7 +134,7 @@ class HasFolder(Protocol):
 
 
 def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
-    """Return the part. It connects when it runs.
+    """Return the part, which connects only in `run`.
 
     Raises ImportError without the NATS client, OSError or ValueError for invalid files.
     """

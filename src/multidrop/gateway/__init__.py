@@ -1,1 +1,1 @@
-"""The gateway: one process masters the lines, and browsers, brokers and masters get in through it."""
+"""The gateway: one process polls the lines, and browsers, brokers and Modbus clients use it."""

@@ -1,4 +1,4 @@
-"""Newest records of the audit log, as the page shows them."""
+"""Queries of the audit log's newest records, for the page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from multidrop.control import read_audit
 from multidrop.gateway.http.messages import Denied
 
-MOST_RECORDS = 200  # of an answer
+MOST_RECORDS = 200  # limit of an answer
 
 _UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # or a prefix, such as a day
 
@@ -27,7 +27,7 @@ def time_asked(query: Mapping[str, str]) -> str:
 def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
     """Return `count` entries before this time (ISO 8601, UTC; "" for all), the newest first.
 
-    `more` says if there are older ones. Raises OSError.
+    `more` is True if there are older entries. Raises OSError.
     """
     count = max(1, min(count, MOST_RECORDS))
     found: deque[dict[str, Any]] = deque(maxlen=count + 1)

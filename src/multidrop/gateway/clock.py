@@ -28,7 +28,7 @@ else:  # on macOS and Windows the monotonic clock includes sleep
 
 
 def now_and_slept_ns() -> tuple[int, int]:
-    """Return the present time, and how long the machine has slept so far.
+    """Return the monotonic time, and how long the computer has slept since its boot, both in ns.
 
     The order of the two reads ensures that a pause between them never counts as sleep.
     """

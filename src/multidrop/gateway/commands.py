@@ -40,11 +40,11 @@ from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTE
 from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
 from multidrop.plant import drive_meant
 
-MOST_AGE_S = 5.0  # of a write or a verb that a network delayed; a stop is never too old
-MOST_WRITES = 8  # under way on a line, without stops
-BUSY = "too many writes are under way"  # a rule
-UNAUDITED = "the audit log cannot be written"  # a rule
-OVERTAKEN = "a stop was called"  # a rule
+MOST_AGE_S = 5.0  # an older write or verb, such as one that a network delayed, is refused; stops never are
+MOST_WRITES = 8  # concurrent writes on one line; stops are not counted
+BUSY = "too many writes are under way"  # a `rule` of WriteForbidden
+UNAUDITED = "the audit log cannot be written"  # a `rule` of WriteForbidden
+OVERTAKEN = "a stop was called"  # a `rule` of WriteForbidden
 WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
 # Takes the command's text and returns until when it may be sent (CLOCK_BOOTTIME, ns); raises WriteForbidden.
@@ -102,7 +102,7 @@ class Commands:
         self._stopped_ns: dict[str, int] = {}  # by drive: when the latest stop was called
         self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
-        self._ended_ns: dict[str, int] = {}  # by drive
+        self._ended_ns: dict[str, int] = {}  # by drive: when its latest command ended
         self.plant_ns: int | None = None  # when the plant was reloaded (CLOCK_BOOTTIME)
 
     def begin_anew(self) -> None:
@@ -121,7 +121,7 @@ class Commands:
         return self._stopped_ns.get(drive)
 
     def halts(self, drive: str) -> int | None:
-        """Return how many commands that end a run of this motor were called; None while it jogs."""
+        """Return how many commands so far end a run of this motor, stops included; None while it jogs."""
         return None if self._jogging[drive] else self.stops[drive] + self._halts[drive]
 
     def _note_stop(self, drives: Iterable[str]) -> None:
@@ -200,7 +200,7 @@ class Commands:
         caller: Caller,
         admit: Admit = lambda what: inf,
     ) -> CommandResult:
-        """Carry out a verb that the plant file lists, once; refused over Modbus, which asks no person."""
+        """Carry out a verb once if the plant file lists it; refused over Modbus, where no person confirms."""
         drive = drive_meant(drive, names_of(self._lines)) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
@@ -242,8 +242,8 @@ class Commands:
     async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> CommandResult:
         """Carry out a verb that stops the motor; neither writes under way nor other stops delay it.
 
-        If a reload makes the name mean another drive too, that one is stopped on its ramp, unless its verb
-        is listed.
+        If, because of a reload, the name also means another drive, that drive is stopped by this verb if the
+        plant file lists it there, else on its ramp.
         """
         self.called += 1
         _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
@@ -279,7 +279,7 @@ class Commands:
         stops = self.stops[drive]
 
         def limit_ns() -> float:
-            """Return until when it may be sent (CLOCK_MONOTONIC); 0 once a stop was called."""
+            """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 once a stop was called."""
             return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
@@ -302,7 +302,7 @@ class Commands:
 
 @contextmanager
 def _written_by(caller: Caller) -> Iterator[None]:
-    """Name the caller in the audit log, which must have a line before anything but a stop is sent."""
+    """Name the caller in the audit log. Only stops are sent before their line is in that log."""
     name, way = _printable(caller.name), _printable(f"{caller.way} from {caller.address}")
     with written_by(name or "anyone", way), noted_first():
         yield
@@ -348,7 +348,7 @@ def _for_users(result: CommandResult) -> CommandResult:
 
 
 def in_words(text: str, error: BusError | ValueError | None) -> str:
-    """Return a sentence with a gateway user's actions in place of the calls that a program would make."""
+    """Replace the program's calls that an error advises by the actions of a gateway's user."""
     advice = error.advice if isinstance(error, WriteForbidden) else None
     if advice is not None and advice.plant:
         text = text.replace(advice.program, advice.plant)

@@ -39,13 +39,13 @@ from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
-TAKE_S = 0.1  # interval of taking rows: half of that of frames
+TAKE_S = 0.1  # interval of taking rows from the poller: half the interval of frames
 LOOK_S = 0.2  # interval of checking for alarms; a frame follows each check
 TICK_S = 1.0  # interval of reading statistics
 LOG_S = 60.0  # interval of log lines about a part that keeps failing
 RESTORE_S = 2.0  # how long to wait for the alarms of earlier runs
 MOST_ASKED = 16  # concurrent requests for registers outside the drives' tables
-ASKED_S = 30.0  # time limit of one of these
+ASKED_S = 30.0  # time limit of one such request
 END_S = 4.0  # time limit of shutdown, stops included
 GRACE_S = 1  # part of END_S for finishing requests in flight
 
@@ -55,8 +55,8 @@ _log = logging.getLogger("multidrop.gateway")
 class Gateway:
     """A polled plant and its interfaces.
 
-    Raises ValueError or OSError if an interface cannot be opened, and leaves none open. A missing port of a
-    line is no error: the line counts as lost, and its port is retried.
+    Raises ValueError or OSError if an interface cannot be opened, and then closes the others. A missing port
+    of a line raises no error: the line counts as lost, and its port is retried.
     """
 
     clock = staticmethod(time.monotonic)
@@ -130,7 +130,7 @@ class Gateway:
             built = await self.parts.build(self.settings.parts)
             await self._find_audit()
             poller = self._made = Poller(nothing, ledger=self.ledger, audit=self.audit)
-            self.poller = poller.__enter__()  # left in a thread, because that may take long
+            self.poller = poller.__enter__()  # `_close` closes it in a thread, because that may take long
             adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
             either: set[asyncio.Future[Any]] = {end, adopting}
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
@@ -195,7 +195,7 @@ class Gateway:
             _log.exception("ending %s failed", name)
 
     async def _find_audit(self) -> None:
-        """Set the audit log if its disk answers now; polling would wait for a disk that hangs."""
+        """Use the audit log only if its disk answers now: a disk that hangs would block polling."""
         self.audit, path = self.settings.audit, self.settings.audit
         if path is None:
             return
@@ -207,7 +207,7 @@ class Gateway:
             _log.error("only stops are sent: %s", self.unaudited)
 
     def end(self) -> None:
-        """Let `run` come to its end. Call it in the loop."""
+        """Make `run` shut down and return. Call this in the event loop's thread."""
         self._end.set()
 
     def _server_config(self) -> uvicorn.Config:
@@ -243,7 +243,7 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch to the hub and to all parts; during a reload only rows of the previous plant."""
+        """Give each batch to the hub and to all parts; during a reload, keep rows of the new plant back."""
         while self.newcomers.has_room and (batch := poller.take()):
             self._has_news = True
             self.feed(batch if self.plant_coming is None else self.newcomers.keep(batch, self.plant, poller))
@@ -306,7 +306,7 @@ class Gateway:
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
             work(*arguments)
-        except (Exception, SystemExit):  # also from a user's class; polling and stops continue
+        except (Exception, SystemExit):  # a user's class may raise either; polling and stops continue
             self.note_failure(name)
 
     def note_failure(self, name: str) -> None:
@@ -327,7 +327,7 @@ class Gateway:
                 self.guarded("statistics", self._read_statistics, self.poller)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
-            self._has_news = True  # pages see from its time that the gateway is alive
+            self._has_news = True  # a frame is due: its time shows pages that the gateway is alive
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)
@@ -372,7 +372,7 @@ class Gateway:
         return self.poller.bus(line)
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
-        """Return words or bits of a drive at any addresses; see `Drive.read_raw`."""
+        """Read `count` words or bits of a drive from any address on; see `Drive.read_raw`."""
         _, known = self.plant.find_drive(drive)
         work = partial(known.read_raw, function, start, count, expiry=expiry_s)
         data = await supervisor().within("passed requests", ASKED_S, work, most=MOST_ASKED)

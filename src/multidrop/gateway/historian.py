@@ -26,11 +26,11 @@ from multidrop.supervisor import supervisor
 MS_NS = 1_000_000
 LOOK_S = 1.0  # between checks of the writing thread
 CLOSING_S = 3.0  # time limit for writing the last rows
-QUERY_S = 30.0  # time limit of a query, and of its wait for others
+QUERY_S = 30.0  # time limit of a query, and of its wait for other queries
 MOST_QUERIES = 2  # concurrent queries
 PIECE = 1 << 16  # bytes of an export read at a time
 UNFINISHED = ".export-"  # prefix of temporary folders of exports
-MOST_BUCKETS = 200_000  # in an answer: the page's 24 series on a screen of 8000 px, 5 MB
+MOST_BUCKETS = 200_000  # in one answer: enough for the page's 24 series on a screen of 8000 px; 5 MB
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,13 @@ def build(settings: HistorySettings, context: PartContext) -> Historian:
     try:
         return Historian(context.plant, folder, settings)
     except OSError as failure:
-        if failure.filename is None:  # already a sentence
+        if failure.filename is None:  # the message is already a sentence
             raise
         raise OSError(f"folder {folder} cannot be written: {failure.strerror}") from failure
 
 
 class Historian:
-    """Records rows and answers queries. Raises the errors of HistoryWriter when it is made."""
+    """Records rows and answers queries. The constructor raises the errors of HistoryWriter."""
 
     def __init__(self, plant: Plant, folder: Path, settings: HistorySettings) -> None:
         self._writer = HistoryWriter(
@@ -80,7 +80,7 @@ class Historian:
             keep=parse_age(settings.keep),
             most=parse_size(settings.most),
         )
-        for left in folder.glob(f"{UNFINISHED}*"):  # left by a killed process; no other one records here
+        for left in folder.glob(f"{UNFINISHED}*"):  # left by a killed process; no other process records here
             rmtree(left, ignore_errors=True)
         self.history = History(folder)
         self._is_closed = False
@@ -108,7 +108,7 @@ class Historian:
         self.history.close()
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant: the next segment has its metadata."""
+        """Use another plant: the next file of the history has its metadata."""
         self._writer.begin(plant.metadata())
 
     def health(self) -> str:
@@ -151,17 +151,17 @@ class Historian:
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return a file of these series, or of all, in pieces; `kind` is "csv" or "parquet".
+        """Return a file of these series (of all if `names` is empty) in pieces; `kind` is "csv" or "parquet".
 
-        Call and iterate it in threads, because it reads files. Raises the errors of `series`, those of wrong
-        arguments before the first piece.
+        Call and iterate it in threads, because it reads files. Raises the errors of `series`; wrong arguments
+        raise theirs at the call.
         """
         series, begin_ns, end_ns = names or None, begin * MS_NS, end * MS_NS
         if kind not in ("csv", "parquet"):
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
             return self.history.csv(series, begin_ns, end_ns)
-        self.history.read(series, begin_ns, end_ns)  # reports mistakes before the first piece
+        self.history.read(series, begin_ns, end_ns)  # raises errors of wrong arguments now
         return self._parquet(series, begin_ns, end_ns)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:

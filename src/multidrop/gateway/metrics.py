@@ -23,15 +23,15 @@ class Figures(NamedTuple):
     version: str
     viewers: int
     frames: int
-    dropped: int  # rows
+    dropped: int  # number of rows
     failures: Mapping[str, int]  # of parts, by name
-    parts: Sequence[MetricFamily]  # of the parts
+    parts: Sequence[MetricFamily]  # the parts' own metrics
 
 
 def families_of(
     hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures
 ) -> Iterator[MetricFamily]:
-    """Yield all families."""
+    """Yield the metrics of the plant, and of the gateway itself."""
     yield MetricFamily(
         "multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)]
     )

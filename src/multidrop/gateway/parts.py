@@ -20,7 +20,7 @@ from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
 
 START_S = 2.0  # how long a start waits for parts whose files do not answer
-BUILD_S = 5.0  # how long a reload waits for them
+BUILD_S = 5.0  # how long a reload waits for such parts
 END_S = 3.0  # time limit for closing a part
 
 # Module of each part, imported when its table is used. It has `Settings`, a frozen dataclass of the table's
@@ -47,7 +47,7 @@ class PartContext(NamedTuple):
     ask: Ask
     folder: Path  # base of relative paths in the settings
     version: str
-    page: str = ""  # address of the gateway's page; "": other machines cannot reach it
+    page: str = ""  # address of the gateway's page; "": unknown
 
 
 class Part(Protocol):
@@ -58,13 +58,13 @@ class Part(Protocol):
     """
 
     def take(self, batch: Batch) -> None:
-        """Take rows. Called in the loop; must return within 1 ms."""
+        """Process a batch. Called in the loop; must return within 1 ms."""
 
     async def run(self) -> None:
         """Run until cancelled."""
 
     async def close(self) -> None:
-        """Finish after the last batch."""
+        """Finish; called after the last batch."""
 
 
 class PartHost(Protocol):
@@ -107,7 +107,7 @@ class Replacement(NamedTuple):
 class LiveParts:
     """The running parts by table name, in `feeds`.
 
-    A part whose files do not answer delays nothing: it stays in `pending` until it is built.
+    A part whose files do not answer does not delay the gateway: it stays in `pending` until it is built.
     """
 
     def __init__(self, host: PartHost) -> None:

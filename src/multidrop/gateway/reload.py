@@ -1,4 +1,4 @@
-"""Reload: the plant file read again while the plant is polled; a mistake leaves all as it is."""
+"""Reload: read the plant file again during polling. A file with mistakes changes nothing."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from multidrop.gateway.settings import ServeSettings
 
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
-AT_ONCE = ("names", "tokens", "may", *PARTS)  # keys of [serve]; all others wait for a restart
-READ_S = 10.0  # that reading the file may take
-QUICK_S = 1.0  # that a later reload waits for the reading
-MOST_READS = 8  # that may hang at the same time
-ADOPTION_S = 60.0  # that ports and stops may take
+AT_ONCE = ("names", "tokens", "may", *PARTS)  # keys of [serve] that need no restart
+READ_S = 10.0  # time limit for reading the file
+QUICK_S = 1.0  # least time that reading gets before a later reload cancels it
+MOST_READS = 8  # concurrent reads, all of which may hang
+ADOPTION_S = 60.0  # a longer adoption, which opens ports and stops drives, counts as hanging
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant has no file to be read again"
 
@@ -31,7 +31,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Reloaded(NamedTuple):
-    """The end of a reload: the mistakes that kept it back, or what still needs a restart."""
+    """The result of a reload: the file's mistakes, or sentences about changes that need a restart."""
 
     is_done: bool
     text: str
@@ -40,30 +40,30 @@ class Reloaded(NamedTuple):
 
 
 class Reload:
-    """Reads the plant file anew with `read`, which raises ValueError or OSError for what is wrong with it.
+    """Reloads the plant file with `read`, which raises ValueError or OSError for a file with mistakes.
 
-    `read` runs in a thread: a file system that hangs ends one reload, and nothing else.
+    `read` runs in a thread, so a file system that hangs makes only this reload fail.
     """
 
     def __init__(self, gateway: Gateway, read: Read | None) -> None:
-        self.mistakes: tuple[str, ...] = ()  # of the newest reload
-        self.restart: tuple[str, ...] = ()  # what is in the file, and not yet in effect
+        self.mistakes: tuple[str, ...] = ()  # in the file, at the latest reload
+        self.restart: tuple[str, ...] = ()  # sentences about changes in the file that need a restart
         self._gateway = gateway
         self._read = read
         self._begun_with = dict(gateway.plant.serve)
         self._turn = asyncio.Lock()
         self._soon: asyncio.Task[None] | None = None
         self._is_wanted = False
-        self._is_overtaken = asyncio.Event()  # a later reload waits for the one that reads the file
-        self.coming: Plant | None = None  # while drives are on their way from one plant to this one
+        self._is_overtaken = asyncio.Event()  # set when a later reload was requested
+        self.coming: Plant | None = None  # the plant that is being adopted; None otherwise
 
     @property
     def has_file(self) -> bool:
-        """Return True where there is a file to be read again."""
+        """Return True if the plant has a file that can be read again."""
         return self._read is not None
 
     def begin(self) -> None:
-        """Reload as soon as the one that is under way has ended. To be called in the loop."""
+        """Start a reload, or repeat the one in progress when it has ended. Call this in the loop."""
         self._is_wanted = True
         self._is_overtaken.set()
         if self._soon is None or self._soon.done():
@@ -75,20 +75,20 @@ class Reload:
             await self.carry_out("a signal")
 
     async def close(self) -> None:
-        """Wait for nothing any more."""
+        """Cancel a reload that `begin` started."""
         if self._soon is not None:
             self._soon.cancel()
             await asyncio.gather(self._soon, return_exceptions=True)
 
     async def carry_out(self, by: str) -> Reloaded:
-        """Read the file, and poll what it says now, or go on as before and say why."""
+        """Read the file and poll its plant; if that fails, keep the old plant and return the reason."""
         self._is_overtaken.set()
         async with self._turn:
             _log.info("reload, asked for by %s", by)
             self._gateway.notifier.tell_reloading()
             try:
                 told = await self._carry_out()
-            except Exception as failure:  # whatever it is, the old plant goes on
+            except Exception as failure:  # the old plant continues after any failure
                 told = self._refused(failure)
             self._gateway.notifier.tell("READY=1", self._gateway.status)
             return told
@@ -119,7 +119,7 @@ class Reload:
         if self._read is None or poller is None:
             return Reloaded(False, NO_FILE)
         plant, settings, planned = await self._read_within(self._read)
-        if gateway.audit:  # the adoption opens it
+        if gateway.audit:  # the adoption opens this log
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         replaced = await gateway.parts.replace(settings.parts, plant)
         self.coming = plant
@@ -128,7 +128,7 @@ class Reload:
             self._take_up(poller, settings, planned)
             gateway.parts.take_up(replaced.built)
         except Exception:
-            if poller.plant.lines != gateway.plant.lines:  # it came half way: go on with what there is
+            if poller.plant.lines != gateway.plant.lines:  # some lines were adopted: use these
                 self._take_up(poller, gateway.settings, None)
             await gateway.parts.take_back(replaced)
             raise
@@ -143,9 +143,9 @@ class Reload:
         return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
 
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
-        """Go on with the plant that is polled now, and with those of its settings that need no restart."""
+        """Use the plant that is polled now, and its settings that need no restart."""
         gateway, plant = self._gateway, poller.plant
-        gateway.hand_out(poller)  # the rest of what is of the plant before
+        gateway.hand_out(poller)  # remaining rows of the previous plant
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
         lines = {line.name for line in gateway.plant.lines} - {line.name for line in plant.lines}
         for name in {*gateway.hub.drives} - there | lines:
@@ -165,11 +165,11 @@ class Reload:
         gateway.guarded("frames", gateway.frames.note_news)
 
     def _after_restart(self, plant: Plant, settings: ServeSettings) -> Iterator[str]:
-        """Yield a sentence for each key of [serve] that has changed, and that a running gateway keeps."""
+        """Yield a sentence for each changed key of [serve] that takes effect only after a restart."""
         before, now = self._begun_with, plant.serve
         for key in dict.fromkeys((*before, *now)):
             is_other = before.get(key) != now.get(key)
-            if key == "certificate":  # the file may be another one of the same name
+            if key == "certificate":  # the file may have changed under the same name
                 is_other |= settings.certificate != self._gateway.settings.certificate
             if is_other and key not in AT_ONCE:
                 yield f"{key} of [serve] {RESTART}"
@@ -178,7 +178,7 @@ class Reload:
         gateway, may = self._gateway, settings.may
         now = gateway.settings
         if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
-            may = may.bounded_by(now.may)  # who reaches it, and counts as being here, changes later
+            may = may.bounded_by(now.may)  # a restart changes which clients can connect
         gateway.settings = replace(gateway.settings, names=settings.names, tokens=settings.tokens, may=may)
         gateway.commands.may = may
         gateway.own_names.replace(settings.names)

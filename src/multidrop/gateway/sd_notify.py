@@ -16,7 +16,7 @@ class Notifier:
 
     @property
     def watchdog_s(self) -> float | None:
-        """Seconds within which the manager expects WATCHDOG=1; None if it expects none."""
+        """The longest time between two WATCHDOG=1 that the manager allows, in s; None without a watchdog."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
@@ -26,7 +26,7 @@ class Notifier:
         self.tell("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def tell(self, *lines: str) -> None:
-        """Send lines such as READY=1, without waiting; they are lost if the manager does not take them."""
+        """Send lines such as READY=1, without waiting; they are lost if the manager's queue is full."""
         if not self._address:
             return
         abstract = self._address.startswith("@")

@@ -61,7 +61,7 @@ class ServeSettings:
     port: int = 8750
     names: tuple[str, ...] = ()
     tls: ssl.SSLContext | None = None
-    certificate: str = ""  # digest of both files, which may be renewed in place
+    certificate: str = ""  # digest of the certificate and key files, which may be renewed in place
     behind_proxy: bool = False
     tokens: tuple[Token, ...] = ()
     may: May = May()  # noqa: RUF009 (it cannot change)
@@ -82,9 +82,9 @@ class ServeSettings:
 
 
 class Folders:
-    """The folders of named files: the service manager's credentials, then the plant file's folder.
+    """Finds the files that `[serve]` names: among the service's credentials, else beside the plant file.
 
-    Output goes to the service's state folder, or else beside the plant file.
+    Output files are in the service's state folder, or beside the plant file without one.
     """
 
     def __init__(self, plant: Path, environment: Mapping[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""Stops amid a reload: what the reload makes of a drive is stopped too, as soon as it is there."""
+"""Stops during a reload: if the reload changes a drive, stop the drive again when it is attached."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from multidrop import Drive, Plant, PlantLine
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-LOOK_S = 0.02  # between looks at what a reload changes
+LOOK_S = 0.02  # between checks for drives that a reload has changed
 
 
 class StopEnd(Protocol):
-    """The end of a stop."""
+    """The result of a stop."""
 
     @property
     def is_done(self) -> bool: ...
@@ -30,7 +30,7 @@ class ChangingLines(Protocol):
     def plant_now(self) -> Plant: ...
     @property
     def plant_coming(self) -> Plant | None:
-        """The plant that drives are on their way to; None where all are there."""
+        """The plant of a reload in progress; None without one."""
 
 
 def drives_of(plant: Plant) -> dict[str, Drive]:
@@ -38,7 +38,7 @@ def drives_of(plant: Plant) -> dict[str, Drive]:
 
 
 def names_of(lines: ChangingLines) -> dict[str, None]:
-    """Return the names of all drives that are there, and that are about to be."""
+    """Return the names of all drives of the present plant, and of the new plant during a reload."""
     plants = (lines.plant_now, lines.plant_coming or lines.plant_now)
     return dict.fromkeys(name for plant in plants for name in drives_of(plant))
 
@@ -48,7 +48,11 @@ async def stop_meant(
     drives: Sequence[str] | None,
     stop: Callable[[Plant, list[str]], Awaitable[dict[str, T]]],
 ) -> dict[str, T]:
-    """Stop the drives that these names mean, in whatever spelling, and those that they are about to mean."""
+    """Stop the drives with these names; during a reload, also those with these names in the new plant.
+
+    Names may have another spelling (see `drive_meant`). Return the result of each drive's latest stop by
+    name. `stop` is the same as in `stop_as_changed`.
+    """
     if drives is None:
         return await stop_as_changed(lines, None, stop)
     names = names_of(lines)
@@ -59,10 +63,10 @@ async def stop_meant(
 
 
 def _also_meant(lines: ChangingLines, drives: Sequence[str]) -> list[str]:
-    """Return the names, so far, of drives that have one of these names in the plant that comes.
+    """Return the present names of drives that have one of these names in the new plant.
 
-    A stop may mean either. One of another family at that address is left out: its stop may mean something
-    else there.
+    A stop by such a name may mean either drive. A drive is left out if the new plant has another family at
+    its address, because the same stop frame may mean something else there.
     """
     if lines.plant_coming is None:
         return []
@@ -80,7 +84,7 @@ def _by_place(plant: Plant) -> dict[tuple[str, int], Drive]:
 
 
 class _Latest:
-    """The latest stop of one drive: the drive as it was then, or None, and the lines as they were."""
+    """The latest stop of one drive, with the drive (None if missing) and the lines at that time."""
 
     def __init__(self, drive: Drive | None, lines: Sequence[PlantLine]) -> None:
         self.drive = drive
@@ -93,11 +97,11 @@ async def stop_as_changed(
     drives: Sequence[str] | None,
     stop: Callable[[Plant, list[str]], Awaitable[dict[str, T]]],
 ) -> dict[str, T]:
-    """Stop these drives, or all with None; by drive's name what became of the latest stop of each.
+    """Stop these drives, or all if None; return the result of each drive's latest stop by name.
 
-    `stop` is called with the plant as it is polled now. It is called again with the drives that a reload has
-    changed since, though their stops before go on, and with those whose stop failed while anything changed.
-    It ends when no reload is under way, and nothing of that is left.
+    `stop` is called with the present plant and the names. During a reload it is called again for drives that
+    the reload has changed since, even if their earlier stops continue, and for drives whose stop failed, if
+    any line has changed since. Return when no reload is in progress and all stops have ended.
     """
     latest: dict[str, _Latest] = {}
     told: dict[str, T] = {}
@@ -132,12 +136,12 @@ async def stop_as_changed(
             else:
                 await asyncio.sleep(LOOK_S)
     finally:
-        for task in under_way:  # the stops themselves go on
+        for task in under_way:  # the stops themselves continue
             task.cancel()
 
 
 def _is_left(before: _Latest | None, drive: Drive | None, lines: Sequence[PlantLine]) -> bool:
-    """Return True where this drive is to be stopped, or stopped again."""
+    """Return True if this drive must be stopped, or stopped again."""
     if before is None:
         return True
     if drive is None:

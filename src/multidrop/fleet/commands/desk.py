@@ -1,7 +1,8 @@
 """CommandDesk: carry out commands on the lines of which this gateway is master, each once.
 
-A command is offered first, and carried out when its token comes back within a second of this machine's
-CLOCK_BOOTTIME. It is recorded on the disk before it is sent, and again at its end.
+The gateway checks a command and offers to carry it out. It does so if the sender returns the offer's token
+within a second of this computer's CLOCK_BOOTTIME. The command is recorded on the disk before it is sent, and
+again at its end.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ from multidrop.fleet.leases.lease import boottime_ns
 from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
 from multidrop.supervisor import supervisor
 
-HOLD_S = 0.5  # that an answer waits for the end, before it says "under way"
-AWAITED_S = 3.0  # that releasing a line waits for commands; most writes and read-backs are faster
-POLL_S = 0.01  # between checks for their end
-MOST_WRITES = 8  # under way on a line, without stops
-WAY = "fleet"  # in the audit log
+HOLD_S = 0.5  # wait this long for the result before answering "under way"
+AWAITED_S = 3.0  # releasing a line waits this long for commands; most writes and read-backs are faster
+POLL_S = 0.01  # between checks whether these commands have ended
+MOST_WRITES = 8  # concurrent writes on one line; stops are not counted
+WAY = "fleet"  # the sender's way in the audit log
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class CommandDesk:
-    """Commands on the lines that this gateway holds; tokens come back on `subject`."""
+    """Offers and carries out commands on this gateway's lines; senders return tokens on `subject`."""
 
     def __init__(
         self,
@@ -57,12 +58,12 @@ class CommandDesk:
         self._log = log
         self._under_way: dict[str, int] = {}  # by line
 
-    # ---- an offer ----
+    # ---- offering a command ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         """Return an offer or a refusal; None unless this gateway is the line's master.
 
-        The asker takes the first answer, so only the master may give one.
+        The sender uses the first answer, so only the master may give one.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -74,13 +75,13 @@ class CommandDesk:
             return CommandAnswer(CommandOutcome.REFUSED, str(mistake), self.gateway)
         return Offered(offer.token, self.subject, offer.prepared.text, self.gateway)
 
-    # ---- and doing it ----
+    # ---- carrying it out ----
 
     async def do(self, data: bytes) -> CommandAnswer:
         """Carry out an offered command once; a copy of the message gets the same answer.
 
-        A message with `ask` instead of `do` asks for the result. If no `do` came before it, the offer is
-        withdrawn, so that the answer "not sent" is certain.
+        A message with `ask` instead of `do` asks for the result. If it comes before any `do`, the offer is
+        withdrawn, so that the answer "not sent" stays true.
         """
         try:
             message = read_json(data)
@@ -144,7 +145,7 @@ class CommandDesk:
         return answer
 
     def _limit_ns(self, offer: Offer) -> float:
-        """Return until when it may be sent (CLOCK_MONOTONIC); 0 once it is void."""
+        """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 once its offer is void."""
         now_ns = time.monotonic_ns()  # read before the offer's clock: a pause between them shortens the time
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 
@@ -153,7 +154,7 @@ class CommandDesk:
         return CommandResult(CommandOutcome.NOT_SENT, offer.unsent(why).text) if why else None
 
     def _why_not(self, offer: Offer) -> str:
-        """Return why it must not be sent now, or an empty string."""
+        """Return why the command must not be sent now; "" if it may."""
         line = offer.held.name
         if offer.why_void:
             return offer.why_void

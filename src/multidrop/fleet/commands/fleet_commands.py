@@ -33,9 +33,9 @@ from multidrop.fleet.servers.setup import open_all
 from multidrop.plant import drive_meant
 from multidrop.supervisor import Ended, end_tasks, reason_of
 
-LOST_S = 6.0  # without any answer, after which what became of a command stays unknown
+LOST_S = 6.0  # without any answer, until the result counts as unknown
 AGAIN_S = 0.2
-NO_MASTER_S = 6.0  # of retries without a master; a line gets one within 1 s, or 4 s after a death
+NO_MASTER_S = 6.0  # retry a stop this long without a master; a line gets one within 1 s, 4 s after a death
 HARD_WIRED = "use the hard-wired stop"
 
 News = Callable[[CommandAnswer], object]
@@ -50,9 +50,9 @@ def _ignore(answer: CommandAnswer) -> None:
 class FleetCommands:
     """A client that commands the drives of a fleet.
 
-    `by` is its name in the logs of both sides; `log` is the file of this side. A command is sent once; a stop
-    is sent until a gateway answers. A command that cannot be recorded in `log` is not sent; a stop is. Raises
-    FleetError if no server can be reached.
+    `by` is the client's name in its own log and in the gateways' logs; `log` is the path of its own log. A
+    command is sent once; a stop is sent until a gateway answers. A command that cannot be noted in `log` is
+    not sent, but a stop is sent nevertheless. Raises FleetError if no server can be reached.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class FleetCommands:
         return self
 
     async def stay(self) -> None:
-        """Stay connected until cancelled. Raises Ended if what keeps a connection has ended."""
+        """Stay connected until cancelled. Raises Ended if a task that keeps a connection open has ended."""
         ended, _ = await asyncio.wait(self._keeping, return_when=asyncio.FIRST_COMPLETED)
         for task in ended:
             failure = None if task.cancelled() else task.exception()
@@ -84,7 +84,7 @@ class FleetCommands:
         await self.close()
 
     async def close(self) -> None:
-        """Leave the servers."""
+        """Disconnect from the servers, and close the log."""
         await end_tasks(*self._keeping)
         for path in self._paths:
             await path.close()
@@ -93,7 +93,7 @@ class FleetCommands:
     # ---- commands ----
 
     async def preview(self, request: CommandRequest) -> Offered | CommandAnswer:
-        """Return the offer for a command, or its refusal, without carrying it out."""
+        """Return the line master's offer to carry out a command, or its refusal; do not carry it out."""
         return await self._offer(await self._line_of(request.drive), request)
 
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
@@ -112,10 +112,10 @@ class FleetCommands:
         return CommandRequest(uuid.uuid4().hex, self.by, drive, **what)
 
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
-        """Have a command carried out once, and return its answer. Raises as `write`.
+        """Send a command once, and return its result. Raises as `write`.
 
-        `agreed` is the text of a preview that a person agreed to. If it has changed since, the command is not
-        sent.
+        `agreed` is the text of a preview that a person agreed to. If the text would be another one now, the
+        command is not sent.
         """
         line = await self._line_of(request.drive)
         record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
@@ -136,7 +136,7 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask on one path after another. An offer alone has no effect, so it may be repeated."""
+        """Ask for an offer on one path after another. An offer has no effect, so asking twice is harmless."""
         why = ""
         for path in self._paths:
             try:
@@ -170,7 +170,7 @@ class FleetCommands:
     async def _end_of(
         self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _ignore
     ) -> CommandAnswer:
-        """Ask on all paths in turn until it is over; UNKNOWN after LOST_S without any answer."""
+        """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without answer."""
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
         told = {""}
@@ -200,7 +200,7 @@ class FleetCommands:
         on_news: News = _ignore,
         by: str = "",
     ) -> CommandAnswer:
-        """Stop these drives, or all of the plant with None; the lines are stopped in parallel.
+        """Stop these drives, or all drives of the plant if None; the lines are stopped in parallel.
 
         `by` replaces this object's `by` in the logs. With `line` the plant is not read, and the drives are
         those of the line. `on_news` is called in the loop with the progress of a stop that takes longer than
@@ -307,9 +307,10 @@ class FleetCommands:
 async def _first_answer(
     paths: Sequence[ServerPath], line: str, request: StopRequest, what: str, on_news: News
 ) -> CommandAnswer:
-    """Send the request until a gateway answers or may have got it; else return that certainly none did.
+    """Send a stop until a gateway answers or may have received it; return that answer or UNDER_WAY.
 
-    Meanwhile `on_news` reports that no gateway is there yet.
+    Return NOT_SENT if none can have received it within NO_MASTER_S, or if this client may not send it. Until
+    then, `on_news` reports that the stop was not sent yet.
     """
     loop = asyncio.get_running_loop()
     ends, told = loop.time() + NO_MASTER_S, ""
@@ -331,7 +332,8 @@ async def _first_answer(
 async def _ask_all(paths: Sequence[ServerPath], line: str, request: StopRequest, what: str) -> CommandAnswer:
     """Ask on all paths in parallel, and return the first answer.
 
-    Raises NotDelivered if all paths say that it was not delivered; NobodyThere if one of them says so.
+    Return UNDER_WAY if a gateway may have received the stop. Raises NotDelivered if all paths report that it
+    was not delivered: NobodyThere if a path reports that the line has no master.
     """
     subject, data = names.stop_subject(line), encode(request)
     asking = [asyncio.create_task(path.request(subject, data)) for path in paths]

@@ -1,4 +1,4 @@
-"""CommandLog: one line of JSON for each step of a command, on the disk before the next step is taken."""
+"""CommandLog: a file with one line of JSON for each step of a command, written before the next step."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from typing import Any
 from multidrop.control import AuditLog
 from multidrop.supervisor import supervisor
 
-WRITING_S = 10.0  # after which a record is reported as hanging
-CLOSING_S = 1.0  # that closing waits for the record that is being written
+WRITING_S = 10.0  # a record that takes longer is reported as hanging
+CLOSING_S = 1.0  # closing waits this long for the record that is being written
 
 
 class CommandLog:
-    """The log in this file, which only grows. Raises OSError if it cannot be opened.
+    """The log in this file, which is only appended to. Raises OSError if it cannot be opened.
 
-    Each record has a daemon thread of its own: a disk that hangs neither blocks the loop nor the exit.
+    Each record is written in its own daemon thread, so a disk that hangs blocks neither the loop nor the
+    exit.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,7 +44,7 @@ class CommandLog:
                 await supervisor().thread("command log", WRITING_S, lambda: self._add(record, now_ns))
             except OSError:
                 raise
-            except Exception as failure:  # of its thread: there is none, or it was ended
+            except Exception as failure:  # the thread could not start, or failed
                 raise OSError(f"{self.path}: {type(failure).__name__}: {failure}") from failure
 
     def _add(self, record: Mapping[str, Any], now_ns: int) -> None:

@@ -12,12 +12,13 @@ from multidrop.control import CommandResult, with_name
 
 MOST_BYTES = 64 * 1024  # of a request
 MOST_CHARACTERS = 200  # of a name, an id or a value's text
-UNNAMED = "somebody"  # an asker without a name
+UNNAMED = "somebody"  # sender of a stop without a name
 
 
 class CommandAnswer(NamedTuple):
-    """The end of a command: `held` is the value that the drive then said it holds, as text with its unit.
+    """The outcome of a command or a stop.
 
+    `held` is the value that the drive holds after a write, as text with its unit.
     `drives` has an answer for each drive of a stop.
     """
 
@@ -37,7 +38,7 @@ class CommandAnswer(NamedTuple):
         return cls(result.outcome, with_name(drive, result.text), held=result.held)
 
     def as_json(self) -> dict[str, Any]:
-        """Return it for a message or a log, without empty fields."""
+        """Return this answer for a message or a log, without empty fields."""
         found: dict[str, Any] = {"outcome": self.outcome.value, "text": self.text}
         found |= {key: text for key, text in (("gateway", self.gateway), ("held", self.held)) if text}
         if self.drives:
@@ -48,7 +49,7 @@ class CommandAnswer(NamedTuple):
 class CommandRequest(NamedTuple):
     """One command to one drive: a verb with its options, or a register and the value to write.
 
-    `id` is chosen by the asker, anew for each command, so that copies of a message are recognised.
+    The sender chooses a new `id` for each command, so that copies of a message are recognised.
     """
 
     id: str
@@ -61,7 +62,7 @@ class CommandRequest(NamedTuple):
 
     @property
     def entry(self) -> str:
-        """Return the entry of the plant's list that allows it."""
+        """Return the entry that the plant's list must have to allow this command."""
         return f"{self.drive}.{self.verb or self.register}"
 
     @property
@@ -74,7 +75,7 @@ class CommandRequest(NamedTuple):
 
 
 class StopRequest(NamedTuple):
-    """A stop of these drives of a line, or of all with None; each stop has an `id` of its own."""
+    """A stop of these drives of a line, or of all drives if None; each stop has its own `id`."""
 
     id: str
     by: str
@@ -82,10 +83,10 @@ class StopRequest(NamedTuple):
 
 
 class Offered(NamedTuple):
-    """A gateway's offer to carry out a command once, if its token comes back soon."""
+    """A gateway's offer to carry out a checked command once, if the sender returns its token soon."""
 
     token: str
-    subject: str  # for the token
+    subject: str  # to send the token to
     text: str  # description of the command
     gateway: str
 
@@ -124,7 +125,7 @@ def read_command(data: bytes) -> CommandRequest:
 
 
 def read_stop(data: bytes) -> tuple[StopRequest, str]:
-    """Return the stop in a message, and why it stops all drives if the message is damaged.
+    """Return the stop in a message. For a damaged message, stop all drives, and also return the reason.
 
     A stop is never refused: stopping too many drives does less harm than stopping none. Names are made
     printable; a missing id is "".
@@ -169,12 +170,12 @@ def _value(found: Mapping[str, Any]) -> float | str:
 def _is_finite(value: float) -> bool:
     try:
         return isfinite(value)
-    except OverflowError:  # an int that no float holds
+    except OverflowError:  # an int that is too large for a float
         return False
 
 
 def read_offer(data: bytes) -> Offered | CommandAnswer:
-    """Return a gateway's offer, or its answer if it makes none. Raises ValueError."""
+    """Return a gateway's offer, or its answer if it refuses. Raises ValueError if the message is invalid."""
     found = read_json(data)
     if "token" not in found:
         return read_answer(data)
@@ -182,7 +183,7 @@ def read_offer(data: bytes) -> Offered | CommandAnswer:
 
 
 def read_answer(data: bytes) -> CommandAnswer:
-    """Return a gateway's answer. Raises ValueError."""
+    """Return a gateway's answer. Raises ValueError if the message is invalid."""
     return _answer(read_json(data))
 
 
@@ -209,7 +210,7 @@ def _long_text(found: Mapping[str, Any], key: str) -> str:
 
 
 def worst(answers: Sequence[CommandAnswer]) -> CommandOutcome:
-    """Return the most important outcome of several drives' commands."""
+    """Return the most serious outcome of several drives' commands."""
     order = (
         CommandOutcome.UNKNOWN,
         CommandOutcome.NOT_SENT,

@@ -1,6 +1,6 @@
-"""Offers: commands that a line's master has offered, each to be carried out once within a second.
+"""Offers: commands that a line's master has checked and offered to carry out, each once within a second.
 
-They are in memory only: a restarted gateway forgets them, and never carries out an offer of its predecessor.
+Offers are only in memory: a restarted gateway never carries out an offer that it made before the restart.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, Com
 from multidrop.fleet.leases.rules import SECOND
 from multidrop.fleet.lines.held_lines import HeldLine
 
-LIMIT_NS = 1 * SECOND  # from the offer until its first frame
-REMEMBERED = 10_000  # newest offers
+LIMIT_NS = 1 * SECOND  # from the offer until the command's first frame
+REMEMBERED = 10_000  # limit of offers in memory; the oldest are removed
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
 
 
@@ -74,14 +74,15 @@ def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
     return Prepared(text, partial(write_register, drive, register.name, request.value))
 
 
-# ---- offering it ----
+# ---- offers ----
 
 
 @dataclass(eq=False)
 class Offer:
     """One command that was offered for a held line.
 
-    `is_taken` is set when its token comes back; `answer` and `over` are set at its end.
+    `is_taken` is set when the sender returns the token; `answer` and `over` are set when the command has
+    ended.
     """
 
     token: str
@@ -95,7 +96,7 @@ class Offer:
     over: asyncio.Event = field(default_factory=asyncio.Event)
 
     def unsent(self, why: str) -> CommandAnswer:
-        """Return the answer that it was certainly not sent."""
+        """Return the answer for a command that was certainly not sent."""
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{self.prepared.text} was not sent: {why}")
 
 
@@ -126,17 +127,17 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Return True for the first call; only that one carries it out."""
+        """Return True at the first call for an offer; only then may the command be carried out."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
 
     def left_ns(self, offer: Offer) -> int:
-        """Return for how many ns it may still be sent; 0 or less if it is too late."""
+        """Return for how many ns the command may still be sent; 0 or less if it is too late."""
         return offer.made_ns + LIMIT_NS - self._clock()
 
     def why_late(self, offer: Offer) -> str:
-        """Return why it is too late for an offer, or an empty string."""
+        """Return why it is too late for an offer; "" if it is not."""
         left = self.left_ns(offer)
         if left > 0:
             return ""
@@ -144,7 +145,7 @@ class Offers:
         return f"{age_s:.1f} s have passed since the offer, and {LIMIT_NS / SECOND:g} s is allowed"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
-        """Withdraw the unsent offers for these drives of a line, or all with None."""
+        """Make unfinished offers for these drives of a line void; None means all drives."""
         for offer in self._by_token.values():
             is_one = offer.held.name == line and (drives is None or offer.request.drive in drives)
             if is_one and offer.answer is None:
@@ -158,6 +159,6 @@ class Offers:
             )
 
     def end(self, offer: Offer, answer: CommandAnswer) -> None:
-        """Set its answer, which later copies of the message get too."""
+        """Set an offer's answer, which later copies of the message get too."""
         offer.answer = answer
         offer.over.set()

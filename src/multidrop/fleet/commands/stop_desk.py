@@ -1,7 +1,7 @@
-"""StopDesk: stop drives at once on the lines of which this gateway is master.
+"""StopDesk: stop drives immediately on the lines of which this gateway is master.
 
-A stop needs neither an offer nor a list, because a second stop does no harm and a late one may. It is sent
-first and recorded afterwards.
+A stop needs no offer and no permission in the plant's list, because a repeated stop is harmless, but a late
+one may do harm. It is sent first and recorded afterwards.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from multidrop.fleet.lines.held_lines import HeldLine, HeldLines
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-REMEMBERED = 1000  # newest stops
+REMEMBERED = 1000  # limit of stops in memory; the oldest are removed
 CALLED = "a stop was called"
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class StopDesk:
-    """Stops on the lines that this gateway holds; each withdraws the offers before it."""
+    """Carries out stops on this gateway's lines; each makes earlier offers for its drives void."""
 
     def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
         self.gateway = gateway
@@ -52,8 +52,8 @@ class StopDesk:
 
         A damaged message stops all drives. A copy of a message gets the answer of the same stop; a message
         without an id is always a new stop. A stop that takes longer than HOLD_S is answered with "under way"
-        and its progress, and the asker asks again. If the line was lost or released meanwhile, return None
-        unless the motors have stopped: the next master answers.
+        and its progress, and the sender asks again. If this gateway has lost or released the line since,
+        return None unless the motors have stopped: the next master answers.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -87,7 +87,7 @@ class StopDesk:
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop_or_report(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Stop them; log an error of this gateway, and return it as the answer."""
+        """Carry out a stop. Log an unexpected exception, and return it as the answer."""
         try:
             return await self._stop(held, request)
         except Exception as failure:
@@ -96,7 +96,7 @@ class StopDesk:
             return CommandAnswer(CommandOutcome.UNKNOWN, text, self.gateway)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Stop all drives in parallel; of a drive whose stop is already repeated, send one more."""
+        """Stop the drives in parallel. If a drive's stop is being repeated already, send one more stop."""
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
@@ -119,7 +119,7 @@ class StopDesk:
         return answer
 
     def _note(self, record: Mapping[str, Any]) -> None:
-        """Record it in the order of the calls, without waiting."""
+        """Write a record in a task; records are in the order of the calls."""
         supervisor().start("note of a stop", self._write(record))
 
     async def _write(self, record: Mapping[str, Any]) -> None:

@@ -1,8 +1,8 @@
-"""CommandSubjects: receive commands and stops on NATS, on all paths of a gateway, and answer them.
+"""CommandSubjects: receive commands and stops from NATS on all paths of a gateway, and answer them.
 
-A gateway subscribes to a line's subjects only while it polls the line, so a server itself reports a line
-without a master. Each message comes once on each path; the desks recognise copies by the asker's id. No
-stream is used.
+A gateway subscribes to a line's subjects only while it polls the line, so the server reports to a sender that
+a line has no master. Each message arrives once on each path; CommandDesk and StopDesk recognise copies by the
+id that the sender chose. No stream is used.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Heard = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
 
 
 class CommandSubjects:
-    """The desks of one run of a gateway, and the lines that they are open for."""
+    """The subscriptions for commands and stops, in one run of a gateway."""
 
     def __init__(self, gateway: str, paths: Sequence[ServerPath], lines: HeldLines, log: CommandLog) -> None:
         self._paths = paths
@@ -42,7 +42,7 @@ class CommandSubjects:
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
 
     async def begin(self) -> None:
-        """Subscribe to the tokens of this run's offers."""
+        """Subscribe to the subject for the tokens of this run's offers."""
         await self._subscribe(self.desk.subject, self.desk.do)
 
     def open(self, line: str, description: Any) -> None:
@@ -52,12 +52,12 @@ class CommandSubjects:
         self._change(self._subscribe(names.stop_subject(line), partial(self._stops.stop, line)))
 
     def leave(self, line: str) -> None:
-        """From now on accept stops only."""
+        """Accept only stops for a line from now on."""
         self._lines.leave(line)
         self._change(self._unsubscribe(names.command_subject(line)))
 
     def shut(self, line: str) -> None:
-        """Accept neither commands nor stops from now on."""
+        """Accept neither commands nor stops for a line from now on."""
         self._lines.shut(line)
         self._change(self._unsubscribe(names.command_subject(line), names.stop_subject(line)))
 
@@ -66,7 +66,7 @@ class CommandSubjects:
 
     async def _subscribe(self, subject: str, heard: Heard) -> None:
         async def take(message: Msg) -> None:
-            supervisor().start("answer", _answer(message, heard))  # none waits for another
+            supervisor().start("answer", _answer(message, heard))  # so no message waits for another
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
 
@@ -94,7 +94,7 @@ async def _answer(message: Msg, heard: Heard) -> None:
     if answer is None or not names.is_inbox(message.reply):
         return
     data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
-    with suppress(Exception):  # the asker may be gone
+    with suppress(Exception):  # the sender may be gone
         await message.respond(data)
 
 
@@ -112,7 +112,7 @@ class CommandedLines:
         self._may_wait = may_wait
 
     async def take(self, line: str, description: Any) -> None:
-        """Poll a line and accept commands; if that raises, the line is released again."""
+        """Poll a line and accept commands for it. If that raises, the line is closed again."""
         await self._lines.take(line, description)
         try:
             self._subjects.open(line, description)
@@ -123,8 +123,8 @@ class CommandedLines:
     async def let_go(self, line: str) -> None:
         """Accept no more commands, stop polling the line, and close it.
 
-        Waits for its stops under way, whose askers are answered until then; and briefly for commands that
-        were sent, whose result would otherwise stay unknown.
+        Closing waits for stops in progress, so that their senders get answers. Wait a short time for commands
+        in progress, whose results would otherwise stay unknown.
         """
         self._subjects.leave(line)
         try:

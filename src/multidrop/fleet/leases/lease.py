@@ -21,11 +21,11 @@ from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 _log = logging.getLogger("multidrop.fleet")
 
 JOIN_S = 0.25  # between attempts to start a session
-AGAIN_S = 0.1  # after a renewal that failed
+AGAIN_S = 0.1  # before a failed renewal is repeated
 
 
 def boottime_ns() -> int:
-    """Return CLOCK_BOOTTIME in ns: it also counts while the machine sleeps, and no one can set it."""
+    """Return CLOCK_BOOTTIME in ns: it also runs while the computer sleeps, and cannot be set."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
@@ -33,7 +33,7 @@ class MayPoll(Protocol):
     """The engine's right to send; `multidrop.core.Mastership` is one."""
 
     def extend(self, until_ns: int) -> object:
-        """Let the engine send until then, and postpone the kernel's timer.
+        """Let the engine send until this time (CLOCK_BOOTTIME), and postpone the kernel's timer.
 
         Raises ValueError without any change if that time is in the past.
         """
@@ -69,7 +69,7 @@ class Lease:
     ) -> None:
         self.name = name
         self.terms = terms
-        self.session = 0  # 0: none
+        self.session = 0  # number of the present session; 0: none
         self.until = 0
         self.trouble = ""  # why the session cannot start
         self.began_ms = 0  # UTC
@@ -92,7 +92,7 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return how long it may still send (s); negative after the deadline."""
+        """Return how long this gateway may still send (s); negative after the deadline."""
         return (self.until - self.clock()) / SECOND
 
     @property
@@ -118,7 +118,7 @@ class Lease:
     # ---- start ----
 
     async def begin(self) -> None:
-        """Start a session as soon as every earlier one is over."""
+        """Start a session as soon as every earlier one of this gateway is over."""
         told = ""
         while not await self.try_to_begin():
             if self.trouble != told:
@@ -127,7 +127,7 @@ class Lease:
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:
-        """Take the records that are free. Return False if too few are, and the call must be repeated."""
+        """Start a session by taking the free records. Return False if too few are free: then call again."""
         paths = range(len(self._buckets))
         records = await asyncio.gather(*(self._read(path) for path in paths))
         known = {path: record for path, record in enumerate(records) if record is not None}
@@ -235,13 +235,13 @@ class Lease:
                 self._extend()
 
     async def _look_again(self, path: int, nonce: str, held: Held) -> None:
-        """Read the record after a renewal whose outcome is unknown."""
+        """Read the record after a renewal that failed, or whose outcome is unknown."""
         record = await self._read(path)
         if record is None or nonce != self._nonce:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, held.sent)  # the older, safe time
+            self.held[path] = Held(record.revision, held.sent)  # the earlier time is the safe one
         elif record.revision > held.revision:
             self._lose(path)
 
@@ -255,8 +255,8 @@ class Lease:
     async def _take_late(self, path: int) -> None:
         """Take a path that was not available when the session started.
 
-        Any record there is of a session that our other paths have ended. Before we hold them, another gateway
-        of this name may still depend on it.
+        A record on this path belongs to a session that was ended when we took the other paths. Before we hold
+        those, another gateway of this name may still depend on this record.
         """
         nonce = self._nonce
         record = await self._read(path)
@@ -281,7 +281,7 @@ class Lease:
     # ---- end ----
 
     async def end(self) -> None:
-        """Write the end of this session, so that no one has to wait for it. Sending stops first."""
+        """Stop sending, and record the end of this session, so that other gateways need not wait for it."""
         self._mastership.end()
         self.until = 0
         held, value = self.held, self._value(ended=True)

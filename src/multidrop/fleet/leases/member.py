@@ -1,6 +1,6 @@
 """Member: the state machine of one gateway of a fleet.
 
-    NO_LEASE  no session, or its lease expired: no line is polled. Ends when two of three paths are renewed.
+    NO_LEASE  no session, or its lease expired: no line is polled. Ends when two of three records are renewed.
     STARTING  the first 3 s: lines of dead gateways and released lines are taken, but no line that never had
               a master, so that in a cold start each gateway takes its own share.
     WORKING   every line of its share is claimed and polled.
@@ -8,8 +8,8 @@
 
 When the last line is closed before the lease expires, the kernel's timer is cancelled. (The engine sends
 nothing after the deadline, whether ports are open or closed. Closing discards unsent bytes in the system's
-buffers, so a process that is suspended before that must be killed.) A session that is renewed before another
-gateway has ended it continues.
+buffers, so a process that is suspended before it has closed its ports must be killed.) A session continues if
+it is renewed before another gateway has ended it.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 _log = logging.getLogger("multidrop.fleet")
 
 WEAK_LOOK_S = 1.0
-WEAK_NS = 10 * SECOND  # how long it continues after its gateway has settled
+WEAK_NS = 10 * SECOND  # a weak session is kept at least this long after its gateway has settled
 
 
 class WeakSession:
-    """Gives our own session up when others have ended one of its paths: `is_too_weak` is then True.
+    """Decides when to give up this gateway's session after others ended one of its three records.
 
-    Otherwise the next server that fails would end it.
+    `is_too_weak` is True then. If the session were kept, it would end as soon as one more server fails.
     """
 
     def __init__(self, lease: Lease, observer: Observer, path: Callable[[], ServerPath]) -> None:
@@ -60,8 +60,8 @@ class WeakSession:
     async def watch(self, settled_at: Callable[[], int]) -> None:
         """Check the session forever.
 
-        Its lines have no master for a moment, so one gateway at a time gives up, once all paths answer and
-        lines can be claimed.
+        Giving up leaves the lines without a master for a moment. So one gateway at a time does so, and only
+        when all paths answer and lines can be claimed.
         """
         while True:
             await asyncio.sleep(WEAK_LOOK_S)
@@ -72,7 +72,7 @@ class WeakSession:
                 self.is_too_weak = await have_leaders(self._path()) and await lease.could_be_whole()
 
 
-FIRST_RULES = 1  # of a gateway whose record names no version
+FIRST_RULES = 1  # version of the rules of a gateway whose record names none
 
 
 class OtherRules:
@@ -99,7 +99,7 @@ class OtherRules:
 
     @property
     def trouble(self) -> str:
-        """Return a sentence about them; "" if there are none."""
+        """Return a sentence about the incompatible gateways; "" if there are none."""
         if not self.gateways:
             return ""
         names = ", ".join(sorted(self.gateways))
@@ -107,13 +107,13 @@ class OtherRules:
 
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.05  # between steps; less if records change
-LEAST_STEP_S = 0.01  # at least
-TIDY_NS = SECOND // 2  # between checks of all lines of the share without a known change
+STEP_S = 0.05  # time between steps if no record changes
+LEAST_STEP_S = 0.01  # least time between steps
+TIDY_NS = SECOND // 2  # between checks of all lines of the share if no change is known
 SETTLE_S = 3.0
-SOUND_S = (
-    1.0  # left of our own lease, to end others': with less, the servers may be failing all gateways alike
-)
+# Other gateways' sessions are ended only with this much left of the own lease: with less, the servers may be
+# failing all gateways alike.
+SOUND_S = 1.0
 
 
 class MemberState(StrEnum):
@@ -204,7 +204,7 @@ class Member:
         self._is_dirty = True
 
     def _wake(self) -> None:
-        """Take the next step at once."""
+        """Take the next step immediately."""
         self._is_dirty = True
         self._woken.set()
 
@@ -229,7 +229,7 @@ class Member:
     async def run(self) -> None:
         """Work until `end` is called or this is cancelled; then release all lines and end the session.
 
-        Raises Ended, after the same, if one of its tasks has ended by itself.
+        Raises Ended, after the same cleanup, if one of its tasks has ended by itself.
         """
         works = {f"{self.name}: {name}": work for name, work in self._works().items()}
         tasks = {name: supervisor().keep(name, work) for name, work in works.items()}
@@ -267,7 +267,7 @@ class Member:
         }
 
     async def _leave(self) -> None:
-        """Release all lines, and end the session: others take over at once."""
+        """Release all lines, and end the session, so that others take over immediately."""
         await self.keeper.let_all_go()
         await self.lease.end()
 
@@ -292,7 +292,7 @@ class Member:
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _prepare(self) -> None:
-        """Wait until all records were read; for a large plant that takes longer than a lease.
+        """Wait until all records were read, which for a large plant takes longer than a lease lasts.
 
         Also wait until incompatible gateways have ended.
         """
@@ -325,7 +325,7 @@ class Member:
     # ---- one step ----
 
     async def step(self) -> None:
-        """Do the work that is due. Only the ending of dead gateways waits for a server."""
+        """Do the work that is due. Only ending the sessions of dead gateways waits for a server."""
         observer = self.records.observer
         present = observer.sessions()
         if not self.lease.is_valid:
@@ -371,9 +371,10 @@ class Member:
     def _unopened(
         self, present: Mapping[str, Mapping[str, Any]], sharing: Iterable[str], lines: Iterable[str]
     ) -> tuple[tuple[str, frozenset[str]], ...]:
-        """Return the lines that each gateway could not open; none of versions that do not report any.
+        """Return the lines that each gateway could not open.
 
-        Such a version would not take the lines handed over to it.
+        Gateways of versions that do not report such lines are left out: they would not take lines handed over
+        to them.
         """
         told = {name: value.get("unopened") for name, value in present.items()}
         told[self.name] = list(self.unopened.named())

@@ -1,9 +1,9 @@
 """Observer: watches the sessions of all gateways, and ends those that are no longer renewed.
 
-An end written by the gateway itself counts at once. An end written by another gateway counts only when the
-last renewal that this process read is older than a lease by its own clock: a hasty gateway or a wrong clock
-cannot create a second master. A malicious gateway could, by an end right after a renewal that followed a long
-silence and that was never read here.
+An end written by the gateway itself counts immediately. An end written by another gateway counts only when
+the last renewal that this process read is older than a lease by its own clock: a hasty gateway or a wrong
+clock cannot create a second master. A malicious gateway could create one, if a session is renewed after a
+long silence and the malicious end is stored before this process has read that renewal.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from multidrop.fleet.leases.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.supervisor import end_tasks
 
-BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for viewers: every end counts at once
+BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for viewers: every end counts immediately
 
-LOOK_S = 0.1  # between reads of a path: it adds to the silence of a dead gateway's lines
-ENDING_S = 0.1  # for answers when a session is ended; later ones are read as records
+LOOK_S = 0.1  # between reads of a path; lines of a dead gateway are not polled for that much longer
+ENDING_S = 0.1  # wait for answers when a session is ended; later ones are seen as records
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class Observer:
-    """The lease records on all paths, and when this machine saw them change."""
+    """The lease records on all paths, and when this process saw them change."""
 
     def __init__(
         self, me: str, buckets: Sequence[Bucket], terms: Terms, clock: Callable[[], int] = boottime_ns
@@ -66,7 +66,7 @@ class Observer:
         return any(record.value and record.value["ended"] for record in found) or bool(self.dead())
 
     async def rest(self, path: int) -> None:
-        """Wait for the next read: earlier if a record may become stale."""
+        """Wait until the next read is due, or until a record may have become stale."""
         begins = self._clock() - self.terms.lease
         due = ((one.since - begins) / lease_rules.SECOND for one in self._watched[path].values())
         await asyncio.sleep(min([LOOK_S, *(left for left in due if left > 0)]))
@@ -150,9 +150,10 @@ class Observer:
     # ---- dead gateways ----
 
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
-        """Return the gateways that may be ended, with the watched records by path.
+        """Return the gateways whose sessions may be ended, each with its stale records by path.
 
-        A record that was not read again since may have been renewed: a suspended server answers no one.
+        A record must be stale at the last read that was answered: while a server answers no reads, the record
+        may be renewed unseen.
         `present` are the names in `sessions`, if the caller already has them.
         """
         found = {}
@@ -180,9 +181,9 @@ class Observer:
         )
 
     async def end_the_dead(self, present: Iterable[str] | None = None) -> bool:
-        """End the sessions that are no longer renewed, each record only at the revision that was judged.
+        """End the sessions that are no longer renewed; return True if one was ended.
 
-        Return True if one was ended.
+        A record is replaced only if it still has the revision that was found stale.
         """
         before = self.ended
         self._keep_what_is_over()
@@ -194,14 +195,14 @@ class Observer:
         return self.ended > before
 
     def _keep_what_is_over(self) -> None:
-        """Remember which sessions are over while this process saw everything without a gap."""
+        """Remember which sessions are over, as long as this process has read all records without a gap."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):
                 self._over[name] = max(session, self._over.get(name, 0))
 
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
-        """End these records at once, and wait for as many answers as needed: a path may have no leader.
+        """End these records concurrently, and wait for as many answers as needed: a path may have no leader.
 
         Return True if any was ended. Another gateway may have ended the others; the next read shows it.
         """

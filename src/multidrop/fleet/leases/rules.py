@@ -1,13 +1,14 @@
 """Lease rules: until when a gateway may send, and when another may end its session. Pure.
 
 A session has one record on each of three paths. Its holder renews all three; a gateway that takes over ends
-them. `needed` and `ended` are each more than half of the paths, so both sets share a path, and the server of
-that path decides. The holder counts from the moment before it sent a renewal. An observer counts from the
-moment at which it first saw a revision, by its own clock, and after the time of a lease ends exactly that
-revision. So no clocks of two machines are compared. An ended path stays ended for its session.
+them. `needed` and `ended` are each more than half of the paths. So the paths that the holder renews and those
+that another gateway ends have one in common, and the server of that path decides. The holder counts the lease
+from the moment before it sent a renewal. An observer counts from the moment at which it first saw a revision,
+by its own clock, and after the time of a lease it ends exactly that revision. So clocks of different
+computers are never compared. An ended path stays ended for its session.
 
-Once a session is over, its lines are claimed and opened at once. The guard starts then: the engine listens
-for at least that long before the first request on a line (csrc/listen.c).
+Once a session is over, its lines are claimed and opened immediately. The guard starts then: the engine
+listens for at least that long before the first request on a line (csrc/listen.c).
 
 tests/fleet/test_lease_model.py checks all interleavings with these functions.
 """
@@ -62,7 +63,7 @@ def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
 
 
 def is_stale(watched: SeenRevision, now: int, terms: Terms) -> bool:
-    """Return True if this revision may be ended: it was not renewed for the time of a lease."""
+    """Return True if this revision may be ended: it has not changed for the time of a lease."""
     return now - watched.since >= terms.lease
 
 

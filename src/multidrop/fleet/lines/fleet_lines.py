@@ -1,4 +1,4 @@
-"""Fleet lines: the lines that a gateway has taken, in one Poller that sends only while it is their master."""
+"""Fleet lines: the lines that a gateway polls, in one Poller that sends only while the lease is valid."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
 from multidrop.supervisor import supervisor
 
-THREADS = 32  # at most, at once
+THREADS = 32  # concurrent openings and closings
 
 
 class FleetLines:
-    """Takes lines into a poller and releases them, in threads: both wait for ports."""
+    """Adds lines to a poller and removes them, in threads, because both wait for ports."""
 
     def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
         self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
@@ -39,7 +39,7 @@ class FleetLines:
         await self._in_thread(self._take, Record(line, 0, description))
 
     async def _in_thread(self, act: Callable[..., object], *details: object) -> None:
-        """Call it in a daemon thread. SystemExit, which would end the loop, becomes RuntimeError."""
+        """Call `act` in a daemon thread. SystemExit, which would end the loop, becomes RuntimeError."""
         async with self._free:
             await supervisor().thread("line", inf, partial(act, *details))
 
@@ -51,7 +51,7 @@ class FleetLines:
         before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)
-        except BaseException:  # half done: another gateway may soon be its master
+        except BaseException:  # the line may be half open, and another gateway may soon be its master
             if self.poller.buses.get(line.name) is not before:
                 self.poller.remove_line(line.name)
             raise
@@ -63,7 +63,7 @@ class FleetLines:
     def _let_go(self, line: str) -> None:
         try:
             self.poller.remove_line(line)
-        except PollingFailed:  # on all lines: only the port is left to close
+        except PollingFailed:  # polling of all lines has ended: only the port must be closed
             self.poller.bus(line).close()
 
     def bus(self, line: str) -> Bus:

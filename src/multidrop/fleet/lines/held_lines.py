@@ -1,4 +1,4 @@
-"""Held lines: the lines that accept commands here, and the commands that each allows."""
+"""Held lines: the lines for which this gateway accepts commands, and the commands that each allows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PolledBuses(Protocol):
 
 
 class HeldLine:
-    """A line while this gateway polls it. Each time it is taken it gets a new number."""
+    """A line while this gateway polls it. It gets a new number each time this gateway takes it."""
 
     _numbers = count(1)
 
@@ -45,8 +45,8 @@ class HeldLines:
     """The lines that accept commands.
 
     `may_stop` returns True while this gateway is the line's master. `may_command` returns True once no frame
-    of the master before can arrive: a stop that collides with such a frame is repeated, a command would be
-    lost.
+    of the previous master can still be on the line. A stop that collides with such a frame is repeated; a
+    command would be lost.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class HeldLines:
         self._held.pop(line, None)
 
     def for_command(self, line: str) -> HeldLine | None:
-        """Return the line if a command may be sent on it now."""
+        """Return the line if a command may be sent on it now, else None."""
         held = self._held.get(line)
         return held if held and not held.is_leaving and self._may_command(line) else None
 
     def for_stop(self, line: str) -> HeldLine | None:
-        """Return the line if a stop may be sent on it now."""
+        """Return the line if a stop may be sent on it now, else None."""
         return self._held.get(line) if self._may_stop(line) else None
 
 

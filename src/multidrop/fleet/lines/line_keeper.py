@@ -21,9 +21,9 @@ from multidrop.fleet.lines.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")
 
-SILENT_S = 0.5  # before the lease expires: time for closing; the timer adds guard / 2
-TAKE_AGAIN_S = 2.0  # after a line could not be opened
-WRITTEN_AT_ONCE = 64  # records; more would delay renewals of the lease
+SILENT_S = 0.5  # close lines this long before the lease expires; the kernel's timer adds guard / 2
+TAKE_AGAIN_S = 2.0  # between attempts to open a line
+WRITTEN_AT_ONCE = 64  # records written together; more would delay renewals of the lease
 LINES_AT_ONCE = 32
 
 
@@ -33,7 +33,7 @@ class Lines(Protocol):
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it.
 
-        If that raises, the line is closed again, and it is retried.
+        If this raises, the line must be closed again; the keeper repeats the call later.
         """
 
     async def let_go(self, line: str) -> None:
@@ -83,8 +83,8 @@ class LineKeeper:
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # why lines could not be opened
         self.lost: dict[str, str] = {}  # why lines are not polled: their ports are lost
-        self.releasing: set[str] = set()  # ours, to be released
-        self.may_claim = True  # False beside an incompatible version
+        self.releasing: set[str] = set()  # our lines that must be released
+        self.may_claim = True  # False while a gateway of an incompatible version is alive
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
@@ -123,7 +123,7 @@ class LineKeeper:
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
-        """Return True if this gateway is the line's master now. A stop waits for no guard."""
+        """Return True if this gateway is the line's master now, even during the guard of `may_command`."""
         return self._lease.is_valid and self.is_mine(line) and line in self.polled
 
     def may_command(self, line: str) -> bool:
@@ -141,7 +141,7 @@ class LineKeeper:
     # ---- all lines ----
 
     def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Claim lines, each at the revisions that were judged."""
+        """Claim lines whose records still have the revisions in `claims`."""
         free = claims.keys() - self._at_work.keys() if self.may_claim else ()
         for lines in _some_at_once(free):
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
@@ -238,7 +238,7 @@ class LineKeeper:
                 return
             try:
                 await self.lines.take(line, record.value)
-            except Exception as failure:  # such as in a user's own class: it concerns this line only
+            except Exception as failure:  # such as in a user's own class: other lines continue
                 is_foreseen = isinstance(failure, (OSError, ValueError))
                 why = str(failure) if is_foreseen else f"{type(failure).__name__}: {failure}"
                 reported, self.troubles[line] = self.troubles.get(line), why
@@ -269,7 +269,7 @@ class LineKeeper:
 
 
 def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
-    """Yield the lines in batches of the size that is written at once."""
+    """Yield the lines in batches of at most WRITTEN_AT_ONCE."""
     left = iter(lines)
     while some := list(islice(left, WRITTEN_AT_ONCE)):
         yield some

@@ -9,20 +9,20 @@ from typing import Any, NamedTuple
 from multidrop.fleet.lines.ownership import NOBODY
 
 MOST = 100
-TOLD = 20  # in a gateway's answer about its state
+TOLD = 20  # number of moves in a gateway's answer about its state
 
 
 class Move(NamedTuple):
-    """A line that went from one gateway to another; "" is none, None is an unknown one."""
+    """A line's change from one gateway to another; "" means no gateway, None an unknown one."""
 
     line: str
     turn: int  # number of the change: the same for every observer of a move
-    at_ms: int  # UTC, by the clock of the gateway that wrote it: only for display
+    at_ms: int  # UTC, by the clock of the gateway that wrote the record: only for display
     before: str | None
     after: str
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as gateways send it and `--json` prints it."""
+        """Return this move as gateways send it and `--json` prints it."""
         return {
             "line": self.line,
             "turn": self.turn,
@@ -65,8 +65,8 @@ class Moves:
     def newest(self, number: int) -> list[Move]:
         """Return at most this many moves, newest first.
 
-        The releasing gateway does not see who takes the line, and the taking one may not know whose it was:
-        the two reports are joined into one move.
+        A gateway that releases a line does not see which gateway takes it, and that gateway may not know the
+        previous one. Such two reports are joined into one move.
         """
         moves = dict(self._moves)
         for (line, turn), move in self._moves.items():

@@ -29,9 +29,9 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
 from multidrop.supervisor import end_tasks
 
-WRITERS = 2  # batches at a time in each bucket
+WRITERS = 2  # concurrent batches in each bucket
 LAG_NS = SECOND  # two renewals
-SPARE_S = 0.15  # after one bucket has answered, before the spare one is used
+SPARE_S = 0.15  # wait after the first bucket's answer before the spare one is used
 
 
 class OwnerRecords:
@@ -53,7 +53,7 @@ class OwnerRecords:
         self._records = records
         self._may_write = may_write
         self._on_mine = on_mine
-        self._offered: dict[tuple[str, str], int] = {}  # by line and bucket, the revision released last
+        self._offered: dict[tuple[str, str], int] = {}  # revision released last, by line and bucket
         self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
 
     @property
@@ -61,7 +61,7 @@ class OwnerRecords:
         return self._lease.name, self._lease.session
 
     def is_mine(self, line: str) -> bool:
-        """Return True if we have enough votes, without records that we have released."""
+        """Return True if we have enough votes, not counting records whose release was sent."""
         me, votes = self._me, 0
         for bucket, record in self._records.of(line).items():
             if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
@@ -69,7 +69,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets in which the line was released without a known outcome."""
+        """Return the buckets in which the line's release was sent, and its outcome is unknown."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -83,7 +83,7 @@ class OwnerRecords:
         }
 
     def owned(self) -> set[str]:
-        """Return the lines that at least one record names us for."""
+        """Return the lines with at least one record that names our session."""
         return self._records.owned_by(*self._me)
 
     def claim_of(self, line: str) -> Claim | None:
@@ -92,16 +92,16 @@ class OwnerRecords:
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the bucket that may have no leader, if any: the lease of its home server lags behind."""
+        """Return the bucket that may have no leader: our lease is not being renewed on its home server."""
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the first records of claims, and spare ones if one bucket takes much longer than another.
+        """Write the first records of claims, and the spare ones if a bucket takes much longer than another.
 
-        After a refused claim, do not wait for answers that no longer matter, nor long for a bucket that may
-        have no leader: the claim is repeated soon with newer records.
+        After a refused claim, do not wait for a bucket that may have no leader, nor for other answers that no
+        longer matter: the claim is repeated soon with newer records.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -137,7 +137,7 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is ours or refused; add the refused, and return unanswered writes."""
+        """Wait until each line is ours or refused; fill `refused`, and return the unanswered writes."""
         late = set(writes)
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
@@ -147,10 +147,10 @@ class OwnerRecords:
         return late
 
     async def give_away(self, lines: Sequence[str]) -> None:
-        """Release these lines: write that each record naming us names no one.
+        """Release these lines: replace each record that names us by one that names no gateway.
 
-        All lines stop being ours before the first write is sent, so the answer to a late claim cannot make
-        one ours.
+        `is_mine` is False for all lines before the first write is sent, so the answer to a late claim cannot
+        make a line ours.
         """
         now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
         given: list[tuple[str, Record]] = []
@@ -173,7 +173,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace records; the server decides by the revision of each. Open the lines that become ours."""
+        """Replace records whose revisions are unchanged; return the refused lines. Report lines now ours."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

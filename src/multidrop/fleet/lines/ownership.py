@@ -1,8 +1,9 @@
 """Ownership: the records that name a line's master, and who may write them when. Pure.
 
-A line has one record in each of three buckets, with one vote each. Its master is the session with two votes,
-so no line waits for a bucket without a leader. A record that names a living session is replaced only by that
-session, at the revision that it knows. So no two sessions ever have two votes.
+A line has one record in each of three buckets, with one vote each. Its master is the session that two of them
+name, so no line waits for one bucket without a leader. A record that names a living session is replaced only
+by that session, and only at the revision that the session has read. So two sessions never have two votes
+each.
 
 The very first record of a line has two votes, which saves a large fleet's cold start a second. It is written
 in the line's first bucket, where the server stores only one first record. A gateway that has not read it
@@ -26,9 +27,9 @@ LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: 
 
 
 class Claim(NamedTuple):
-    """The records to write for a line to become ours: the revision of each, by bucket.
+    """The records to write in order to become master of a line: their present revisions, by bucket.
 
-    The `spare` ones are written if one of the `first` gets no answer. Each record has this many `votes`.
+    `spare` ones are written if one of the `first` gets no answer. Each record will have this many `votes`.
     """
 
     first: dict[str, int]
@@ -65,7 +66,7 @@ def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
 
 
 def owner_by(records: LineRecords) -> Record | None:
-    """Return the newest record of an owner with enough votes, or of a free line, or None."""
+    """Return the newest record whose owner (NOBODY for a free line) has enough votes; None without one."""
     known = [record for record in records.values() if record and record.value]
     decided = [record for record in known if votes_of(owner_of(record), known) >= NEEDED]
     return max(decided, key=lambda record: record.value["turn"], default=None)
@@ -87,14 +88,14 @@ def claim_of(
     doubted: Collection[str] = (),
     leaderless: Collection[str] = (),
 ) -> Claim | None:
-    """Return the records to write for us to have enough votes; None if we have them or cannot get them.
+    """Return the records to write to get enough votes; None if we have enough, or cannot get them.
 
     In the `doubted` buckets we released the line without a known outcome. Buckets that may be `leaderless`
     are written last.
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None  # the unread record may have two votes
+        return None  # the first record, still unread, may have two votes
     if first.revision == NONE_YET:
         return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}

@@ -1,7 +1,8 @@
 """Records that a gateway or viewer reads about its fleet: sessions, masters of lines, the plant.
 
-A large fleet has thousands of lines. A gateway reads only the masters of the lines that it should have and
-does not: no one takes its other lines while its session lasts. So an idle gateway reads no masters at all.
+A large fleet has thousands of lines. A gateway reads only the masters of the lines that it should have but
+does not have yet: no other gateway takes its own lines while its session lasts. So a gateway whose lines do
+not change reads no masters at all.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # by line
-        self._owned: dict[Owner, set[str]] = {}  # the lines that at least one record names this session for
-        self._masters: dict[str, tuple[str, int]] = {}  # of each line, with its turn
+        self._owned: dict[Owner, set[str]] = {}  # by session: lines with at least one record that names it
+        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the number of its turn
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
@@ -64,7 +65,7 @@ class FleetRecords:
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return a record that names the line's master or no one; None if no one has enough votes."""
+        """Return a record that names the line's master, or no one; None if neither has enough votes."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
@@ -159,7 +160,7 @@ class ShareFollower(Follower):
         self._is_mine = is_mine
         self._has = has
         self._share: frozenset[str] = frozenset()
-        self._asked: frozenset[str] | None = frozenset()  # its lines that may change; None: to be found
+        self._asked: frozenset[str] | None = frozenset()  # lines of the share that may change; None: unknown
         self._doubted: dict[str, float] = {}  # lines with an unanswered write, and since when
         self._is_urgent = asyncio.Event()
 
@@ -170,12 +171,12 @@ class ShareFollower(Follower):
         self._is_urgent.set()
 
     def doubt(self, lines: Iterable[str]) -> None:
-        """Read these lines again for a while: a write of theirs had no clear answer."""
+        """Read these lines again for a while, because the outcome of a write to their records is unknown."""
         self._doubted |= dict.fromkeys(lines, time.monotonic())
         self._is_urgent.set()
 
     def look_anew(self) -> None:
-        """Find again which lines may change, because a record in this or another bucket has changed."""
+        """Recompute which lines may change, because a record in this or another bucket has changed."""
         self._asked = None
 
     async def look(self) -> list[Record]:
@@ -198,14 +199,14 @@ class ShareFollower(Follower):
         return sorted(self._doubted.keys() | self._asked)
 
     def _may_change(self, line: str) -> bool:
-        """Return True if the record is unknown or names another gateway; a claim settles a free line."""
+        """Return True if the record is unknown or names another gateway. A claim shows if a line is free."""
         record = self.records.get(line)
         if record is None:
             return True
         return owner_of(record)[0] != NOBODY and not self._is_mine(record) and not self._has(line)
 
     async def rest(self) -> None:
-        """Wait for the next read."""
+        """Wait until the next read is due; `want` and `doubt` make it due immediately."""
         with suppress(TimeoutError):
             await asyncio.wait_for(self._is_urgent.wait(), FOLLOW_S)
 

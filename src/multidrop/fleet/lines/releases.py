@@ -1,9 +1,9 @@
-"""Releases: which lines may be closed for another gateway now, so that it can claim them at once.
+"""Releases: which lines may be closed for another gateway now, so that it can claim them immediately.
 
 A line is closed before it is released, and has no master until the release is stored and the other gateway
-has claimed it. While too few buckets have a leader, nothing is stored, so the line is better polled here. The
-same holds while a server is silent: when a server that was cut off returns, it may unseat leaders for
-seconds, between release and claim.
+has claimed it. While too few buckets have a leader, a release cannot be stored, so this gateway continues to
+poll the line. It also does while a server is silent: when a server that was cut off returns, buckets may lose
+their leaders for seconds, between release and claim.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import known_cluster
 
-LOOK_S = 0.05  # between checks while lines are to be released
-WAIT_S = 60.0  # for a silent server; one that is silent for longer is ignored
+LOOK_S = 0.05  # between checks
+WAIT_S = 60.0  # a server that is silent for longer is ignored
 
 
 class Releases:
-    """The lines that should go to others, and the latest state of the servers.
+    """Decides which lines may be closed for other gateways, from the latest state of the servers.
 
-    `on_change` is called when more or fewer lines may be closed.
+    `on_change` is called when that state has changed.
     """
 
     def __init__(
@@ -44,8 +44,8 @@ class Releases:
     def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
         """Return the lines that may be closed now; the others must wait.
 
-        Two records must be writable, and the first one of the line, which may have two votes. `wait_s` limits
-        the wait for a silent server.
+        At least two buckets must be ready, among them the line's first one, whose record may have two votes.
+        A server that is silent for longer than `wait_s` is ignored.
         """
         self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
@@ -55,13 +55,13 @@ class Releases:
         return {line for line in lines if names.owner_buckets(line)[0] in ready}
 
     async def watch(self) -> None:
-        """Check the buckets forever while lines are to be released."""
+        """Check the servers forever."""
         while True:
             await self.look()
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
-        """Check the servers once, if any line is to be released."""
+        """Check the servers once if any line waits for its release."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}

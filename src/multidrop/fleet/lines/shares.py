@@ -1,7 +1,8 @@
 """Shares: which gateway each line is assigned to, by rendezvous hashing with a bound.
 
-Each line goes to the gateway with the highest weight for this pair that is not full; full is 110 % of the
-mean. So a gateway that comes or goes moves its own share and few other lines.
+Each pair of line and gateway has a weight. A line goes to the gateway with the highest weight that is not
+full; a gateway with 110 % of the mean number of lines is full. So when a gateway comes or goes, its own share
+moves, and few other lines.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def _hash(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
-QUIET_NS = SECOND // 2  # without a change of gateways, before lines are assigned while we settle
+QUIET_NS = SECOND // 2  # while settling, assign lines only after this time without a change of gateways
 
 
 class Sharers(NamedTuple):
@@ -98,7 +99,7 @@ class Shares:
 
     def __init__(self) -> None:
         self.wanted: dict[str, str] = {}  # each line's gateway
-        self.home: dict[str, str] = {}  # the same if each gateway could open all lines
+        self.home: dict[str, str] = {}  # each line's gateway if every gateway could open every line
         self._made: Sharers | None = None
         self._others: frozenset[str] = frozenset()
         self._seen_at = 0
@@ -108,15 +109,15 @@ class Shares:
         self._made = None
 
     def see(self, others: frozenset[str], now: int) -> None:
-        """Note the other gateways that are present."""
+        """Note the other gateways that take lines; `now` is in ns."""
         if others != self._others:
             self._others, self._seen_at = others, now
 
     async def make(self, sharers: Sharers, now: int, *, is_settled: bool) -> bool:
         """Assign the lines to gateways if anything changed; return True if they were assigned now.
 
-        The work is done in a thread because it takes long. Until we are settled, wait for further gateways,
-        as in a cold start. Otherwise the first gateway would read the records of all lines.
+        A thread does the work, because it takes long. Until `is_settled`, do not assign lines while other
+        gateways still appear, as in a cold start: the first gateway would read the records of all lines.
         """
         is_early = not is_settled and now - self._seen_at < QUIET_NS
         if sharers == self._made or is_early:

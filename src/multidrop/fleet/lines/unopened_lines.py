@@ -1,9 +1,10 @@
 """Unopened lines: lines whose port this gateway cannot open, so that others may try. Pure.
 
 A gateway that is cut off from a line, but not from the servers, reports the line in its lease after some
-failures. The line then goes to a gateway that has not reported it. It comes back by trials, one line at a
-time and less and less often, because the line is not polled during a failed trial. Trials of a line that all
-gateways have reported do not become rarer, because no one polls it anyway.
+failures. The line then goes to a gateway that has not reported it. Sometimes the first gateway withdraws the
+report of one line, as a trial: the line comes back, and is not polled while its port cannot be opened. So
+trials become rarer, except for a line that all gateways have reported, because no gateway polls that one
+anyway.
 """
 
 from __future__ import annotations
@@ -12,27 +13,27 @@ from collections.abc import Callable
 
 from multidrop.fleet.leases.rules import SECOND
 
-OPENINGS = 3  # failed ones, before a line is reported
-LOST_NS = 6 * SECOND  # from the last reply on a line whose port is lost, before the line is reported
-REPLY_NS = 3 * SECOND  # an older reply does not tell when the port was lost
-FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # until a trial
-TRIAL_NS = 60 * SECOND  # after which the trial of a line that did not come back ends
+OPENINGS = 3  # failed attempts to open a line before it is reported
+LOST_NS = 6 * SECOND  # a line whose port is lost is reported this long after its last reply
+REPLY_NS = 3 * SECOND  # an older reply does not show when the port was lost
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait for a trial
+TRIAL_NS = 60 * SECOND  # the trial of a line that did not come back ends after this time
 MOST_BYTES = 8_000  # of line names in a lease record
 
 
 class UnopenedLines:
-    """The lines that others should take. Times are of `clock`, in ns.
+    """The lines that other gateways should take. `clock` returns ns.
 
     No more lines are reported than fit into a lease record; the others are retried here.
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have reported
-        self.home: frozenset[str] | None = None  # lines that the balance gives this gateway; None: unknown
+        self.home: frozenset[str] | None = None  # our lines if all ports could be opened; None: unknown
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
-        self._named: dict[str, None] = {}  # reported, in order of trial
+        self._named: dict[str, None] = {}  # reported lines, in the order of their trials
         self._wait_ns = FIRST_WAIT_NS
         self._trial_at = 0
         self._tried = ""
@@ -61,7 +62,7 @@ class UnopenedLines:
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
         self._named.pop(line, None)
-        if line == self._tried:  # the network is back: try the others at once
+        if line == self._tried:  # the network is back: try the other lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
                 del self._named[other]  # not of this gateway's share: a trial would not bring it back

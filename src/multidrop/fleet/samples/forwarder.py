@@ -1,9 +1,9 @@
 """Forwarder: sends a spool's messages into the stream, in order, each once.
 
 One message is in flight at a time. It names the position that the last message of its subject must have, and
-the stream takes it there or not at all. After any doubt (start, timeout, refusal) ask the stream for the last
-message, and continue after it. There is no offset file, and no time window after which duplicates could
-appear.
+the stream stores it only if that is true. At the start, and after a timeout or refusal, the forwarder asks
+the stream for the last message, and continues after that one. There is no offset file, and no time window
+after which duplicates could appear.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from multidrop.fleet.samples.samples_stream import (
 from multidrop.fleet.samples.spool import Spool, StoredMessage
 
 AGAIN_S = 0.25  # between attempts after a failure
-LOOKING_S = 1.0  # between checks for an unannounced message
+LOOKING_S = 1.0  # between checks for a message that the spool did not announce
 SET_BACK = (
     "the servers have message {} of the log {}, and the spool has {}: its folder was copied or set back; "
     "move it away to start a new log"
@@ -45,7 +45,7 @@ class ForwarderState(NamedTuple):
     """Messages sent since the start, the last sequence in the stream, and the present problem."""
 
     sent: int
-    last: int | None  # None: not asked yet
+    last: int | None  # None: unknown so far
     trouble: str | None
 
 
@@ -70,7 +70,7 @@ class Forwarder:
     def lag_s(self) -> float | None:
         """Return the age (s, by the system's clock) of the oldest message that the stream lacks.
 
-        Return 0 if it lacks none, None if it was not asked yet or the message was removed.
+        Return 0 if the stream lacks none; None if that is still unknown, or the message was removed.
         """
         if self._last is None:
             return None
@@ -100,7 +100,7 @@ class Forwarder:
             await asyncio.sleep(AGAIN_S)
 
     async def _forward(self) -> None:
-        """Ask for the stream's position, and send the messages after it until there is a doubt."""
+        """Ask for the stream's position, and send the messages after it until one is refused."""
         place, sequence = await self._ask()
         while True:
             self._news.clear()
@@ -116,7 +116,7 @@ class Forwarder:
                 continue
             found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
             end_if_cancelled()
-            if found is None:  # an earlier attempt of ours succeeded
+            if found is None:  # refused because an earlier attempt of ours succeeded
                 return
             place, sequence = found, stored.sequence
             self._sent += 1

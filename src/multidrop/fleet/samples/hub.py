@@ -1,7 +1,7 @@
 """Hub: reads the stream into a sink, which stores the last message's position in the same commit as the rows.
 
-There is no consumer and no acknowledgement to NATS. After any doubt ask the sink for its position, and read
-the stream from there.
+The hub uses no consumer of NATS, and acknowledges no messages. After a failure it asks the sink for its
+position, and reads the stream from there.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class SourceCheck:
         self.alarms = 0
         self.missing = 0  # messages
         self.doubled = 0  # repeated messages, ignored
-        self._lost: dict[str, int] = {}  # rows, as each gateway reports
+        self._lost: dict[str, int] = {}  # rows that each gateway has lost, as it reports
 
     def take(self, message: StreamMessage) -> bool:
-        """Return True if the message is new and must be kept."""
+        """Return True if the message is new and must be stored."""
         name = f"{message.gateway}.{message.log}"
         if message.sequence == 0:
             self.alarm(f"message {message.place} of the stream, by {name}, has no number and is ignored")
@@ -68,7 +68,7 @@ MOST_ROWS = 1_000_000  # of one commit: 50 MB
 MOST_BYTES = 256 << 20  # of one commit: messages and rows; one answer may exceed it
 LOOKING_S = 0.2  # between reads without a new message
 AGAIN_S = 1.0  # after a failure
-BEHIND_S = 5.0  # for a server that still lacks messages that its leader has
+BEHIND_S = 5.0  # how long to wait for a server that lacks messages of its leader
 
 T = TypeVar("T")
 
@@ -113,7 +113,7 @@ class SampleSink(Protocol):
 
 
 async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
-    """Return act(*arguments), called in a thread. A cancelled caller waits for it too."""
+    """Return act(*arguments), called in a thread. If cancelled, wait for the thread before raising."""
     done = asyncio.ensure_future(asyncio.to_thread(act, *arguments))
     try:
         return await asyncio.shield(done)
@@ -174,7 +174,7 @@ class SampleHub:
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
-        self._end = found.last if found.first <= found.last else kept.place  # otherwise it was emptied
+        self._end = found.last if found.first <= found.last else kept.place  # otherwise it is empty
         self._sources.last = dict(kept.sources)
         self._check_end(found)
         if found.first > kept.place + 1 and found.last > kept.place:
@@ -189,7 +189,7 @@ class SampleHub:
             )
 
     async def _commit(self, once: bool) -> bool:
-        """Collect messages and store them; True once the sink has all that the stream had when asked."""
+        """Collect messages and store them; return True if `once` and all up to `_end` are stored."""
         messages: list[StreamMessage] = []
         tables: list[Any] = []
         rows, size, ends = 0, 0, None

@@ -2,7 +2,7 @@
 
 | column           | type                            | meaning                                               |
 |------------------|---------------------------------|-------------------------------------------------------|
-| `time`           | timestamp[ns, UTC]              | the request was sent                                  |
+| `time`           | timestamp[ns, UTC]              | when the request was sent                             |
 | `clock_ns`       | int64                           | time - monotonic_ns: nearly the same in all rows      |
 | `uncertainty_us` | int32, null for a miss          | the value was taken between time and this much later  |
 | `drive`          | dictionary of utf8              | the drive's name                                      |
@@ -42,8 +42,8 @@ import pyarrow.compute as pc
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.polling import BatchColumns
 
-LATEST = 4  # MetadataVersion.V5: older ones mark compressed buffers differently
-MOST_MESSAGES = 100  # of a stream: the schema, dictionaries and rows
+LATEST = 4  # MetadataVersion.V5: older versions mark compressed buffers differently
+MOST_MESSAGES = 100  # Arrow messages in a stream: the schema, dictionaries and rows
 _DICTIONARY, _RECORD_BATCH = 2, 3  # MessageHeader
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # offset in the body, and length
@@ -51,7 +51,7 @@ _NOT_COMPRESSED = -1  # marks a buffer that compression would not shrink
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
-    """Return the total size of all buffers. Raises ValueError or pa.ArrowException for an invalid stream."""
+    """Return the unpacked size of all buffers. Raises ValueError or pa.ArrowException if they are invalid."""
     size = 0
     for number, message in enumerate(pa.ipc.MessageReader.open_stream(data)):
         if number == MOST_MESSAGES:
@@ -119,14 +119,14 @@ class _Table:
         return _BUFFER.iter_unpack(self._data[begin : begin + count * _BUFFER.size])
 
 
-MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
+MOST_BYTES = 900_000  # of a message: NATS accepts 1 MiB by default, its headers included
 MOST_ROWS = 1 << 16
 MOST_UNPACKED = 4 << 20  # bytes: 2.4 MB of rows, and names
 MOST_NAME = 1000  # bytes of a name, status or unit; PostgreSQL indexes names
 MOST_SAID = 300  # characters of an error about a message
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-NAMED = pa.dictionary(pa.int32(), pa.utf8())  # for many messages together
+NAMED = pa.dictionary(pa.int32(), pa.utf8())  # codes are wide enough for the names of many messages together
 TIMES = pa.timestamp("ns", "UTC")
 ROWS = pa.schema(  # as `unpack` returns them, and as in recordings
     [
@@ -206,7 +206,7 @@ class RowBuffer:
 def _units(
     column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: PolledUnits
 ) -> tuple[Any, Sequence[str]]:
-    """Return each row's unit code, and the units."""
+    """Return the unit code of each row, and the unit of each code."""
     table = units.table(names["drive"], names["register"])
     registers = pa.scalar(len(names["register"]), pa.uint32())
     series = pc.add(pc.multiply(column["drive"].cast(pa.uint32()), registers), column["register"])
@@ -244,7 +244,7 @@ def unpack(data: bytes | memoryview) -> Any:
 
 
 def _table(data: bytes | memoryview) -> Any:
-    """Read a stream of ours. Raises ValueError for any other before it is unpacked."""
+    """Return the table in a stream. Raises ValueError if the stream is too large or has other types."""
     size = unpacked_size(data)
     if size > MOST_UNPACKED:
         raise ValueError(f"{size} bytes unpacked; the limit is {MOST_UNPACKED}")

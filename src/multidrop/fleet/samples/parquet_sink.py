@@ -1,13 +1,14 @@
-"""Samples as Parquet files, which are a history: `History(folder)` and DuckDB read them.
+"""Samples as Parquet files in a folder that `History(folder)` and DuckDB can read.
 
 | in the folder                           | content                                                   |
 |-----------------------------------------|-----------------------------------------------------------|
 | `rows/FIRST-LAST.BEGIN-END.parquet`     | all rows of these messages of the stream, by drive, time  |
-| `tens/FIRST-LAST.BEGIN-END.parquet`     | of these messages, ten seconds of a register in each row  |
+| `tens/FIRST-LAST.BEGIN-END.parquet`     | the same messages, one row per ten seconds of a register  |
 | `.hub.lock`                             | locked by the process that writes here                    |
 
-A file gets its name once it is complete and on the disk: that commits its rows and LAST. The newest file
-holds the last message of each source, and must stay. BEGIN and END are UTC and enclose all times.
+A file is renamed to its final name once it is synced to the disk: that commits its rows and LAST. The newest
+file has the number of each source's last message, and must be kept. BEGIN and END are UTC and enclose all
+times.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ from multidrop.fleet.file_lock import lock
 from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
 from multidrop.fleet.samples.message import ROWS
 
-KEY = "multidrop"  # of the files' metadata, as in all recordings
+KEY = "multidrop"  # key of the files' metadata, as in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"
-WRITTEN = {  # names are dictionary-encoded, and plain texts for readers
+WRITTEN = {  # names are dictionary-encoded in the file, and plain texts for readers
     "compression": "zstd",
     "compression_level": 1,
     "store_schema": False,
@@ -77,7 +78,7 @@ class ParquetSink:
             self._lock = -1
 
     def begin(self, stream: str) -> KeptPlace:
-        """Return the position in the newest file."""
+        """Return the position that the newest file has, and remove unfinished files."""
         try:
             for part in self._rows.glob(".*.writing"):
                 part.unlink()
@@ -102,7 +103,7 @@ class ParquetSink:
         return [(int(match[2]), path) for match, path in found if match]
 
     def write(self, commit: Commit) -> None:
-        """Write the rows into a file, which gets its name once it is on the disk."""
+        """Write the rows into a temporary file, sync it to the disk, and rename it."""
         table = _joined(commit)
         path = self._rows / _name(commit, table)
         part = path.with_name(f".{path.name}.writing")
@@ -180,7 +181,7 @@ async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
         await asyncio.sleep(every)
         try:
             await _compact(words)
-        except Exception as failure:  # such as no process left: retry
+        except Exception as failure:  # such as a process that cannot start: retry
             _log.error("merging files failed; retrying", exc_info=failure)
 
 

@@ -1,4 +1,4 @@
-"""Polled units: the units of a gateway's rows, by the description under which they were polled."""
+"""Polled units: the units of a gateway's rows, from the description that each row was polled by."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pyarrow as pa
 
 from multidrop import Drive, PlantLine, Register
 
-RAW = "raw count"  # as in a history
+RAW = "raw count"  # the same text as in a history
 
 
 class Change(NamedTuple):
-    """The code that a series had until a time of the monotonic clock in ns."""
+    """The unit code that a series had until a monotonic time in ns."""
 
     until_ns: int
     series: int
@@ -22,11 +22,11 @@ class Change(NamedTuple):
 
 
 class UnitTable(NamedTuple):
-    """Unit codes by series; series are numbered drive * len(registers) + register."""
+    """Unit codes by series; a series has the number drive * len(registers) + register."""
 
     newest: Any  # pa.Array; null if unknown
     changes: Sequence[Change]  # latest first
-    texts: Sequence[str]  # by code
+    texts: Sequence[str]  # units by code
 
 
 class PolledUnits:
@@ -38,7 +38,7 @@ class PolledUnits:
         self._made: tuple[Sequence[str], Sequence[str], UnitTable] | None = None
 
     def note(self, line: PlantLine, since_ns: int) -> None:
-        """Note the units of rows of this line that are requested from now on."""
+        """Note the units of this line's rows that are requested from `since_ns` (monotonic) on."""
         with self._lock:
             for polled in line.drives:
                 for poll in polled.polls:
@@ -76,7 +76,7 @@ class PolledUnits:
 
 
 def unit_of(drive: Drive, register: Register[Any]) -> str:
-    """Return a unit; "" is a number without one, "names of yd1000" are that family's names."""
+    """Return a unit: "" for a number without one, "names of yd1000" for named values of that family."""
     if register.values:
         return f"names of {drive.model or type(drive).__name__}"
     return RAW if register.step is None else register.unit

@@ -13,8 +13,9 @@ that advances the position. If another hub has moved the position, the transacti
 at a time, and others wait until it ends. A timestamptz has microseconds; `time_ns` is exact. The drive's
 monotonic clock is not stored.
 
-COPY has the format of the manual's section "COPY, Binary Format". An array is its number of dimensions, a
-flag for nulls, its elements' type, a size, a lower bound, and the elements, each after its length.
+The data of a COPY has the format in PostgreSQL's manual, section "COPY, Binary Format". An array is its
+number of dimensions, a flag for nulls, its elements' type, a size, a lower bound, and the elements, each
+after its length.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ END = b"\xff\xff"
 EPOCH_US = 946_684_800_000_000  # 2000-01-01, the epoch of PostgreSQL
 FLOAT8, TEXT = 701, 25  # oids
 NULL = b"\xff\xff\xff\xff"
-PIECE = 1 << 18  # bytes, about
-_FIRST = Struct(">hiqiq")  # number of columns, and twice a time of 8 bytes
+PIECE = 1 << 18  # approximate bytes of a piece of a COPY
+_FIRST = Struct(">hiqiq")  # number of columns; then time and time_ns, each after its length
 _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
 
 
 class RegisterSet(NamedTuple):
-    """The registers of one request, and their units; None if unknown."""
+    """The names and units of the registers that one request reads; a unit is None if it is unknown."""
 
     names: tuple[str, ...]
     units: tuple[str | None, ...]
@@ -58,7 +59,7 @@ class ExchangeRow(NamedTuple):
     drive: str
     asked: RegisterSet
     values: list[float | None]
-    misses: list[str] | None  # None if all are ok, otherwise "ok" or the reason
+    misses: list[str] | None  # the status of each value; None if all are "ok"
 
 
 class ExchangeRows(NamedTuple):
@@ -119,7 +120,7 @@ def _numbers(column: Any, kind: str) -> list[Any]:
 
 
 def _changes(first: Any, second: Any) -> list[int]:
-    """Return the rows in which either column differs from the row before; 0 is the first."""
+    """Return the numbers of the rows in which either column differs from the row before, and of row 0."""
     changed = [pc.not_equal(column[1:], column[:-1]) for column in (first, second)]
     either = pc.or_(*changed)
     return [0, *(at + 1 for at in pc.indices_nonzero(either).to_pylist())]
@@ -128,7 +129,7 @@ def _changes(first: Any, second: Any) -> list[int]:
 def copied(
     found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[RegisterSet, int]
 ) -> Iterator[bytes]:
-    """Yield pieces of a COPY of the columns that `PostgresSink` names."""
+    """Yield the data of a COPY in pieces; its columns are those of `COPY`."""
     piece = [HEAD]
     size = 0
     for one in found:
@@ -180,7 +181,7 @@ def _array(kind: int, elements: list[bytes], *, has_nulls: bool) -> bytes:
     return _ARRAY.pack(20 + len(body), 1, int(has_nulls), kind, len(elements), 1) + body
 
 
-ANSWER_S = 10  # to connect
+ANSWER_S = 10  # time limit for connecting
 TABLES = """
 create schema if not exists multidrop;
 create table if not exists multidrop.hub (

@@ -36,7 +36,7 @@ BY_SERVER = "Nats-Stream"  # a header of each message that a server returns from
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
 ANSWER_S = 5.0  # for an answer; an election takes 4 to 9 s, so requests are retried
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
-SENTENCES = {  # for other codes
+SENTENCES = {  # error messages by code
     NO_STREAM: f"there is no stream {STREAM!r}: create it with `multidrop fleet init`",
     **dict.fromkeys(
         (10005, 10047),
@@ -51,7 +51,7 @@ class StreamError(OSError):
 
 
 class StreamAbout(NamedTuple):
-    """A stream's identity and extent: a new stream counts from 1 again."""
+    """A stream's identity (when it was created), and its first and last positions."""
 
     created: str
     first: int
@@ -61,7 +61,8 @@ class StreamAbout(NamedTuple):
 class LastMessage(NamedTuple):
     """The newest message of a subject: its position in the stream, its number in the log, its digest.
 
-    The number is 0 if it is not a gateway's message but a server's answer that someone directed there.
+    The number is 0 if the message is not a gateway's, but a server's answer that was directed to this
+    subject.
     """
 
     place: int
@@ -78,7 +79,10 @@ def digest_of(data: bytes) -> str:
 
 
 def end_if_cancelled() -> None:
-    """Raise CancelledError again: `asyncio.wait_for` of Python 3.11 swallows one that meets an answer."""
+    """Raise CancelledError again if `asyncio.wait_for` has swallowed it.
+
+    In Python 3.11, it does so if the cancellation coincides with an answer.
+    """
     task = asyncio.current_task()
     if task and task.cancelling():
         raise asyncio.CancelledError
@@ -126,8 +130,8 @@ async def _ignore(_: Exception) -> None:
 async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> int:
     """Create the stream if it is missing, and return its size limit in bytes; -1 for none.
 
-    The oldest messages are removed above `most_bytes`. That much is reserved: a stream without a limit fills
-    the servers, and then no lease can be renewed. An existing stream stays as it is.
+    The oldest messages are removed above `most_bytes`, which the servers reserve: a stream without a limit
+    fills their disks, and then no lease can be renewed. An existing stream stays as it is.
     """
     config = {
         "name": STREAM,
@@ -173,7 +177,7 @@ async def last_of(client: Client, subject: str) -> LastMessage | None:
 async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
     """Store a message, and return its position; None if the subject's last message is not the expected one.
 
-    Raises StreamError; then it may be stored or not.
+    After a StreamError, the message may have been stored or not.
     """
     try:
         answer = await client.request(subject, data, timeout=ANSWER_S, headers=headers)
@@ -196,7 +200,7 @@ def number_of(text: str | None) -> int:
 
 
 async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int) -> Any:
-    """Return the answer of JetStream's API; None for these errors."""
+    """Return the answer of JetStream's API; None for an error whose code is in `none`."""
     try:
         answer = await client.request(f"$JS.API.{subject}", json.dumps(what).encode(), timeout=ANSWER_S)
     except NoRespondersError as failure:
@@ -234,7 +238,7 @@ def _as_wanted() -> Iterator[None]:
 
 
 def silent(client: Client, failure: Exception) -> StreamError:
-    """Return the reason for a missing answer: a server reports missing rights separately."""
+    """Return the error for a missing answer; a server reports missing rights in a separate message."""
     last = client.last_error
     if last and "permissions violation" in str(last).lower():
         return StreamError(f"this connection lacks rights: {_text(last)}")
@@ -253,8 +257,8 @@ SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 class StreamMessage(NamedTuple):
     """A message as the hub reads it; `sequence` is 0 if the header is missing or invalid.
 
-    It is also 0 for an answer of a server: anyone who may read a stored message may have it sent anywhere,
-    and so into the stream as another gateway's.
+    It is also 0 for a message that a server returned from a stream. A client that may read stored messages
+    can have the server send one to any subject, and so into the stream in another gateway's name.
     """
 
     place: int
@@ -275,27 +279,27 @@ async def read_after(client: BatchClient, place: int, messages: int, size: int) 
     try:
         await client.batch(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
     except (Error, OSError) as failure:
-        if get.found or get.has_hole:  # each is complete; the next call continues after them
+        if get.found or get.has_hole:  # each message is complete; the next call continues after the last
             return get.found
         raise _refused(get.end_line) if get.last.done() else silent(client, failure) from failure
     return get.found
 
 
 class SampleGet(DirectGet):
-    """The messages that one direct get returns, by their raw headers.
+    """The messages that one direct get returns, parsed from raw headers.
 
-    A sender may write any headers into a message. A parser that stops at a strange one would take the
-    sender's claim about its origin for the server's headers, which come last.
+    A sender may write any headers into a message, and the server's headers come last. A parser that stops at
+    an invalid header would take the sender's claim about the origin for the server's.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[StreamMessage] = []
-        self.has_hole = False  # a message was lost on its way
+        self.has_hole = False  # a message of the answer was lost on the way
         self.end_line = ""
 
     def take(self, headers: bytes, data: bytes) -> None:
-        """Keep a message, or the end of the list."""
+        """Add a message to `found`, or note the end of the answer."""
         self.count += 1
         if self.last.done():
             return

@@ -4,11 +4,12 @@
 |----------------------|------------------------------------------------------------------------|
 | `spool.json`         | fleet, gateway, and the id of the log whose messages are numbered here |
 | `NUMBER-ROWS.arrows` | a message: its sequence in the log, and its rows                       |
-| `NUMBER-ROWS.damaged`| a newest message that the disk stored only in part                     |
+| `NUMBER-ROWS.damaged`| a message that was the newest, and that the disk stored only in part   |
 | `.spool.lock`        | locked by the process that writes here                                 |
 
-A file is on the disk before it gets its name. The newest message is never removed: it holds the number that
-comes next. A log's id is created with its folder, so a new disk is a new log.
+A file is synced to the disk under a temporary name, and renamed then. The newest message is never removed,
+because the next number is one above its own. A log's id is created with its folder: a new disk starts a new
+log.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class StoredMessage(NamedTuple):
 class SpoolFolder:
     """The files of one log, owned by one process at a time.
 
-    Raises SpoolError if the folder holds something else, is another gateway's or fleet's, is in use by
+    Raises SpoolError if the folder holds other files, belongs to another gateway or fleet, is in use by
     another process, or cannot be written.
     """
 
@@ -113,7 +114,7 @@ class SpoolFolder:
         return str(found["log"])
 
     def _listed(self) -> dict[int, StoredMessage]:
-        """Return the messages in order, and remove unfinished files of a killed process."""
+        """Return the messages by sequence, and remove files that a killed process left unfinished."""
         found = {}
         self.newest = 0
         for path in self.path.iterdir():
@@ -121,13 +122,13 @@ class SpoolFolder:
                 path.unlink()
             elif match := _NAME.fullmatch(path.name):
                 number = int(match[1])
-                self.newest = max(self.newest, number)  # also a damaged one: its number is not reused
+                self.newest = max(self.newest, number)  # a damaged message's number is not reused either
                 if match[3] == "arrows":
                     found[number] = StoredMessage(number, int(match[2]), path.stat().st_size, path)
         return dict(sorted(found.items()))
 
     def _check_newest(self) -> None:
-        """Put an incomplete newest message aside."""
+        """Rename the newest message to `.damaged` if it is incomplete."""
         newest = self.messages.get(self.newest)
         if newest and (mistake := _mistake(newest)):
             del self.messages[self.newest]
@@ -136,14 +137,14 @@ class SpoolFolder:
             self.damage = f"{newest.path} is damaged, and was put aside with {newest.rows} rows: {mistake}"
 
     def write(self, data: bytes, rows: int) -> StoredMessage:
-        """Store the next message; it is on the disk when this returns. Raises OSError: then retry."""
+        """Write the next message and sync it to the disk. After an OSError the call may be repeated."""
         number = self.newest + 1
         path = self.path / f"{number:012d}-{rows}.arrows"
         self._store(path, data)
         return StoredMessage(number, rows, len(data), path)
 
     def add(self, stored: StoredMessage) -> None:
-        """Note a message that was written."""
+        """Add a message that was written to `messages`."""
         self.messages[stored.sequence] = stored
         self.newest = stored.sequence
 
@@ -153,7 +154,7 @@ class SpoolFolder:
         del self.messages[message.sequence]
 
     def _store(self, path: Path, data: bytes) -> None:
-        """Write a file that gets its name once it is on the disk; remove its remains if that fails."""
+        """Write and sync a temporary file, then rename it to `path`; remove it if that fails."""
         part = path.with_name(f".{path.name}.tmp")
         try:
             file = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
@@ -195,10 +196,10 @@ def _parsed(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-ENOUGH_ROWS = 1 << 14  # for a message without delay
-ENOUGH_S = 1.0  # since the first row, for a smaller message
-MOST_WAITING = 1_000_000  # rows in memory if the disk is slow or full: 38 MB
-AGAIN_S = 1.0  # between attempts after a failure of the disk
+ENOUGH_ROWS = 1 << 14  # a message is written as soon as this many rows wait
+ENOUGH_S = 1.0  # or as soon as the oldest waiting row is this old
+MOST_WAITING = 1_000_000  # limit of rows in memory while the disk is slow or full: 38 MB
+AGAIN_S = 1.0  # between attempts after a disk error
 TELLING_S = 60.0  # between log lines about lost rows
 ENDING_S = 10.0  # `close` waits this long for the disk
 
@@ -206,28 +207,28 @@ _log = logging.getLogger("multidrop.fleet.samples.spool")
 
 
 class SpoolState(NamedTuple):
-    """The state of a spool. Rows count since it was opened; bytes are those stored."""
+    """The state of a spool. Rows are counted since the spool was opened."""
 
     log: str  # id
     written: int  # rows that reached the disk
-    lost: int  # rows that did not, or were removed before they were sent
+    lost: int  # rows dropped before they reached the disk, or removed before they were sent
     waiting: int  # rows in memory
     oldest: int  # sequence of the oldest message, 0 without one
     newest: int
-    acknowledged: int | None  # the stream has all up to this sequence; None: not asked yet
-    stored: int  # bytes
-    trouble: str | None  # of the disk, now
+    acknowledged: int | None  # the stream has all messages up to this sequence; None: unknown so far
+    stored: int  # size of all stored messages in bytes
+    trouble: str | None  # the disk's present error
 
 
 class Spool:
     """Keeps rows in a folder: `poller.on_batch(spool.append)`.
 
-    Rows become a message, in a file of its own, when there are 16384 or the first is a second old. All files
-    together take `most` bytes: above that the oldest are removed, and unsent ones are counted as lost and
-    logged. A full or slow disk delays no one: a million rows wait in memory, further ones are lost and
-    counted, and writing is retried each second.
+    The waiting rows are written as one message, in its own file, when there are 16384 or the oldest is a
+    second old. If all files together exceed `most` bytes, the oldest are removed; rows that were not sent are
+    counted as lost and logged. A full or slow disk does not delay the poller: up to a million rows wait in
+    memory, further rows are lost and counted, and writing is retried each second.
 
-    Raises SpoolError, and ValueError for an invalid name.
+    Raises SpoolError as `SpoolFolder` does, and ValueError for an invalid gateway or fleet name.
     """
 
     def __init__(
@@ -248,11 +249,11 @@ class Spool:
         self._stored = sum(message.size for message in self._folder.messages.values())
         self._changing = threading.Condition()
         self._waiting: deque[RowBuffer] = deque()
-        self._packed: deque[Packed] = deque()  # only for the thread
+        self._packed: deque[Packed] = deque()  # used only by the spool's thread
         self._first_s: float | None = None  # when the oldest waiting row arrived
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
-        self._undecided: dict[int, int] = {}  # rows by sequence, removed before the stream was asked
+        self._undecided: dict[int, int] = {}  # by sequence: rows removed before `acknowledge` was called
         self._trouble: str | None = None
         self._logged_s: float | None = None
         self._wanted = 0  # rows that `sync` waits for
@@ -267,7 +268,7 @@ class Spool:
     def append(self, batch: Batch) -> None:
         """Copy the rows for the thread to write. It takes microseconds and never fails because of the disk.
 
-        Rows that cannot be copied, such as without memory, are lost and counted; later ones are taken.
+        Rows that cannot be copied, such as for lack of memory, are counted as lost.
         """
         try:
             self._append(batch)
@@ -291,7 +292,7 @@ class Spool:
                 self._changing.notify_all()
 
     def sync(self, timeout: float | None = None) -> bool:
-        """Wait until all earlier rows are on the disk; False after the timeout."""
+        """Wait until all rows appended so far are on the disk; return False after `timeout` seconds."""
         with self._changing:
             wanted = self._wanted = self._taken
             self._changing.notify_all()
@@ -320,7 +321,7 @@ class Spool:
     # ---- for the forwarder: any thread ----
 
     def following(self, sequence: int) -> StoredMessage | None:
-        """Return the first message after this sequence."""
+        """Return the first stored message after this sequence; None if there is none."""
         with self._changing:
             messages = self._folder.messages
             first = max(sequence + 1, next(iter(messages), sequence + 1))
@@ -329,12 +330,12 @@ class Spool:
             )
 
     def stored(self, sequence: int) -> StoredMessage | None:
-        """Return this message if it is still stored."""
+        """Return the message with this sequence; None if it was removed."""
         with self._changing:
             return self._folder.messages.get(sequence)
 
     def acknowledge(self, sequence: int) -> None:
-        """Note that the stream has all messages up to this one: they may be removed first."""
+        """Note that the stream has all messages up to this sequence: removing these loses no rows."""
         with self._changing:
             self._acknowledged = sequence
             for removed, rows in self._undecided.items():
@@ -354,7 +355,7 @@ class Spool:
                 time.sleep(AGAIN_S)
 
     def _write_what_is_due(self) -> bool:
-        """Wait until rows are due, and write them; True when the spool has ended."""
+        """Wait until rows are due, and write them; return True if the thread is to end."""
         with self._changing:
             if not self._is_due():
                 self._changing.wait(self._patience())
@@ -391,7 +392,7 @@ class Spool:
         return max(0.0, self._first_s + ENOUGH_S - time.monotonic())
 
     def _pause(self) -> bool:
-        """Wait before the disk is retried; True if the spool ends, and the rest is lost."""
+        """Wait before the disk is retried. If the spool is closing, count the rest as lost; return True."""
         with self._changing:
             if not self._over:
                 self._changing.wait_for(lambda: self._over, AGAIN_S)
@@ -427,7 +428,7 @@ class Spool:
             self._remove_acknowledged()
 
     def _remove_acknowledged(self) -> None:
-        """Remove a message that the stream has: the disk has no room for copies."""
+        """Remove the oldest message if the stream has it: the disk may be full."""
         oldest = self.following(0)
         if oldest and oldest.sequence <= (self._acknowledged or 0) and oldest.sequence < self._folder.newest:
             self._remove(oldest)

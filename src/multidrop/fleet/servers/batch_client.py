@@ -1,9 +1,9 @@
-"""BatchClient: a NATS client that sends many requests at once and takes their answers cheaply.
+"""BatchClient: a NATS client that sends many requests together and handles their answers cheaply.
 
 nats-py parses the headers of each message with Python's e-mail parser, passes the message through a queue,
 and has a timer for each request. A gateway of a large fleet reads tens of thousands of records and claims
-hundreds of lines at a time. Here such answers are taken as they leave the connection, and only the needed
-headers are parsed. nats-py has no public hook for that. If its internals change, the answers arrive as
+hundreds of lines at a time. Here such answers are taken directly from the connection, and only the needed
+headers are parsed. nats-py has no public hook for this. If its internals change, the answers arrive as
 ordinary messages, which costs more.
 """
 
@@ -31,7 +31,7 @@ class DirectMessage(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A message that is answered."""
+    """A message that expects an answer."""
 
     subject: str
     data: bytes
@@ -39,7 +39,7 @@ class Request(NamedTuple):
 
 
 class Gathered:
-    """Answers that arrive one by one; `last` gets the status of the final one."""
+    """Collects answers that arrive one by one; `last` gets the status of the final answer."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -65,7 +65,7 @@ class DirectGet(Gathered):
         self.messages: list[DirectMessage] = []
 
     def take(self, headers: bytes, data: bytes) -> None:
-        """Keep a message, or the end of the list."""
+        """Add a message to `messages`, or note the end of the answer."""
         self.count += 1
         message = stored_message(headers, data)
         if message is None:
@@ -75,7 +75,7 @@ class DirectGet(Gathered):
 
 
 class Replies(Gathered):
-    """The answers to a number of requests; None for a missing one."""
+    """The answers to a number of requests, in their order; None for a missing answer."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -91,11 +91,11 @@ class Replies(Gathered):
 
 
 class BatchClient(Client):
-    """A nats-py client with one more subscription for such answers."""
+    """A nats-py client with an extra subscription for the answers to batches."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # by inbox
+        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # function for the answers, by inbox
         self._inboxes = ""
         self._batch_sid = 0
         self._subscribing = asyncio.Lock()
@@ -109,7 +109,7 @@ class BatchClient(Client):
             raise OSError(f"it ended with {get.last.result() or 'no status'}")
 
     async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
-        """Send all requests in one go, and return their answers; None for each that is late."""
+        """Send all requests together, and return their answers; None for each late answer."""
         replies = Replies(len(requests))
         takers = [partial(replies.take, place) for place in range(len(requests))]
         await self._ask(requests, takers, replies, silence_s)
@@ -142,17 +142,17 @@ class BatchClient(Client):
 
     @property
     def is_reading(self) -> bool:
-        """Return True while nats-py reads: after an internal error it stops, but flushes still work."""
+        """Return True while nats-py reads. After an internal error it does not, but flushes still work."""
         return self._reading_task is not None and not self._reading_task.done()
 
     async def _process_pong(self) -> None:
-        """Accept a pong whose flush has timed out; nats-py would stop reading."""
+        """Accept a pong after its flush has timed out: nats-py would fail, and stop reading."""
         if self._pongs and self._pongs[0].done():
             self._pongs[0] = asyncio.get_running_loop().create_future()
         await super()._process_pong()
 
     async def _process_msg(self, sid: int, *rest: Any) -> None:
-        """Take an answer past nats-py's queue. `rest` is subject, reply, data and headers."""
+        """Handle an answer without nats-py's queue. `rest` is subject, reply, data and headers."""
         if sid != self._batch_sid or len(rest) != PROCESSED:
             await super()._process_msg(sid, *rest)
             return
@@ -160,7 +160,7 @@ class BatchClient(Client):
         self._take(subject, headers or b"", data)
 
     async def _take_message(self, message: Msg) -> None:
-        """Take an answer that came through nats-py's queue."""
+        """Handle an answer that came through nats-py's queue."""
         headers = message.headers or {}
         lines = "".join(f"\r\n{name}: {value}" for name, value in headers.items())
         block = f"NATS/1.0 {headers.get('Status', '')}{lines}\r\n\r\n"
@@ -172,7 +172,7 @@ class BatchClient(Client):
 
 
 def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
-    """Return the message with these headers; None for the end of the list.
+    """Return the message with these headers; None if they mark the end of an answer.
 
     The writer's own headers come first and may have any name; the server's come last.
     """

@@ -41,7 +41,7 @@ class Record(NamedTuple):
 class WriteAnswers(NamedTuple):
     """The records that were replaced, with their new revisions, and the keys of the refused ones.
 
-    Any other record may have been replaced or not: read it.
+    For any other record the outcome is unknown: read it.
     """
 
     stored: list[Record]
@@ -117,7 +117,7 @@ class ServerError(FleetError):
 
 
 class Bucket:
-    """One bucket; `path` is called for each request."""
+    """A bucket of records; `path` returns the connection for each request."""
 
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
@@ -141,7 +141,7 @@ class Bucket:
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
         """Replace records, each at its given revision.
 
-        All are sent in one go; the server decides on each separately.
+        All requests are sent together; the server decides on each separately.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
         written = WriteAnswers([], set())
@@ -182,9 +182,9 @@ class Bucket:
         return self._record(subject, _revision(found), data)
 
     async def changes(self, after: int) -> list[Record]:
-        """Return at most 1000 records with a higher revision, in order. Any server answers: some may be old.
+        """Return at most 1000 records with a revision above `after`, in order.
 
-        The server keeps no state for it.
+        Any server may answer, so some records may be out of date. The server keeps no state between calls.
         """
         wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": ">"}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
@@ -192,7 +192,7 @@ class Bucket:
         return [self._record(*message) for message in messages]
 
     async def newest(self, keys: Sequence[str]) -> list[Record]:
-        """Return the records of at most 1000 keys. Any server answers: some may be old."""
+        """Return the records of at most 1000 keys. Any server may answer: some may be out of date."""
         wanted = {"multi_last": [self._all_of(key) for key in keys]}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
         messages = await self.path().collect(subject, json.dumps(wanted).encode())
@@ -248,7 +248,7 @@ class Follower:
                 return changed
 
     async def rest(self) -> None:
-        """Wait for the next read."""
+        """Wait until the next read is due."""
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:

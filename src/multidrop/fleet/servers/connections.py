@@ -1,4 +1,4 @@
-"""Connections to NATS: three paths, each at its own server while that one lives."""
+"""Connections to NATS: three paths, each to its home server while that one answers."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectM
 from multidrop.fleet.servers.direct_gets import Spare, first_answer
 from multidrop.printable import masked
 
-OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
+OLDEST = (2, 12)  # version; 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # per request; a lease is renewed twice a second
-PONG_S = 0.7  # a slower server is left for another one
+PONG_S = 0.7  # time limit of a ping; a slower server is left for another one
 KEEP_S = 1.0  # between checks of a connection
 # With 0 attempts nats-py would retry a closed port until our own timeout.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
@@ -40,21 +40,21 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class ServerPath:
-    """One connection, at its home server while that one lives, otherwise at any other."""
+    """One connection: to its home server while that one answers, otherwise to any other."""
 
     def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
         self.urls = [masked(url) for url in urls]  # the first is home
         self._full = dict(zip(self.urls, urls, strict=True))  # with users and passwords
         self.url = ""  # of the present server
-        self.others: Sequence[ServerPath] = ()  # of the same process
-        self.spare = Spare()  # shared with them
+        self.others: Sequence[ServerPath] = ()  # the other paths of this process
+        self.spare = Spare()  # shared by all paths of this process
         self._options = options or {}
         self._client: BatchClient | None = None
         self._denials = Denials()
-        self._trouble = ""  # already logged
+        self._trouble = ""  # the failure that was logged last
         self._leaving: set[asyncio.Task[None]] = set()
-        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # by subject
-        self._standing: dict[str, Subscription] = {}  # at the present server
+        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # function to call, by subject
+        self._standing: dict[str, Subscription] = {}  # subscriptions at the present server, by subject
         self._changing = asyncio.Lock()
 
     @property
@@ -89,7 +89,7 @@ class ServerPath:
         raise refusals[0] if refusals else FleetError("; ".join(map(str, failures)))
 
     async def keep(self) -> None:
-        """Leave a server that does not answer, and return home when possible; forever."""
+        """Check the connection forever: leave a server that does not answer, and return home if possible."""
         while True:
             try:
                 await self.look_after()
@@ -103,7 +103,7 @@ class ServerPath:
             await asyncio.sleep(KEEP_S)
 
     async def look_after(self) -> None:
-        """Do once the work of `keep`."""
+        """Do one check of `keep`."""
         if not self.is_open or not await self._answers():
             self._leave()
             await self.open()
@@ -157,10 +157,10 @@ class ServerPath:
                     await self._bring(self._client, self._standing)
 
     async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
-        """Subscribe to exactly the wanted subjects there."""
+        """Subscribe a client to the wanted subjects, and end its other subscriptions in `standing`."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
-                if called := self._wanted.get(subject):  # it may have been removed
+                if called := self._wanted.get(subject):  # `unsubscribe` may have removed it
                     standing[subject] = await client.subscribe(subject, cb=called)
             for subject in standing.keys() - self._wanted.keys():
                 await standing.pop(subject).unsubscribe()
@@ -181,7 +181,7 @@ class ServerPath:
         headers: dict[str, str] | None = None,
         answer_s: float = ANSWER_S,
     ) -> Msg:
-        """Return the answer.
+        """Send a request, and return the answer.
 
         Raises Unsure if none comes in time, NoRight if the request or its answer is not allowed, NotDelivered
         if the request certainly reached no one, and NobodyThere if the server reports that.
@@ -227,7 +227,7 @@ class ServerPath:
         return self._client
 
     async def close(self) -> None:
-        """Leave the server."""
+        """Disconnect from the server."""
         self._leave()
         await asyncio.gather(*self._leaving)
 
@@ -273,7 +273,7 @@ async def _close(client: BatchClient) -> None:
 def _cut(client: BatchClient) -> None:
     """Close the socket and end the subscription tasks that nats-py may leave behind.
 
-    It leaves some if it is cancelled or the server is gone. The error of its reading task is ignored.
+    nats-py leaves some if it is cancelled or the server is gone. The error of its reading task is ignored.
     """
     for subscription in client._subs.values():
         subscription._stop_processing()

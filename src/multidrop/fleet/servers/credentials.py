@@ -1,8 +1,7 @@
 """Credentials: the identity of a connection, and the servers that it trusts.
 
-A key is an Ed25519 pair (an "nkey"). The secret half is a file for its user only; servers have the public
-half, which is no secret. A user's answers go to an inbox named after the public key, which no other user may
-read.
+A key is an Ed25519 pair (an "nkey"). The secret key is in a file that only its user has; servers have the
+public key. A user's answers go to an inbox named after the public key, which no other user may read.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ def new_seed() -> str:
 
 
 def public_key(seed: str) -> str:
-    """Return the public key of a secret one. Raises ValueError for an invalid key."""
+    """Return the public key that belongs to a secret key. Raises ValueError for an invalid key."""
     import nkeys
 
     try:

@@ -1,16 +1,17 @@
 """Direct gets: reads that any server can answer, and that continue while one server is cut off.
 
-A server passes such a read to any server that has the records, by chance: itself or one behind a route. A
-server that is cut off still gets its share of reads until the others notice, which takes seconds. So a read
-without an early answer is repeated on all paths at once. Each answer may be old: a write that builds on it
+A server passes such a read to a random server that has the records: to itself, or over a route. A server that
+is cut off still gets its share of the reads until the others notice, which takes seconds. So a read without
+an early answer is repeated on all paths together. Each answer may be out of date: a write that builds on it
 names the revision that was read.
 
-If all servers are slow, repeating reads makes them slower still. So repeats have a budget: it is empty at
-first, and each timely answer earns half a repeat. A first request that is answered late after all was not
-lost, and halves the budget.
+If all servers are slow, repeated reads make them even slower. So repeats have a budget: it is empty at first,
+and each timely answer earns half a repeat. If the first request of a read is answered late, it was not lost,
+and the budget is halved.
 
-A client that has seen slow answers also waits proportionally longer before it repeats. When many gateways
-start at once, each reads whole buckets, and repeats earned by small reads would be spent on large ones.
+A client that has seen slow answers also waits proportionally longer before a repeat. Otherwise, when many
+gateways start together and read whole buckets, the repeats that small reads have earned would be spent on
+large reads.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from multidrop.fleet.errors import NoRight, Unsure
 from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request
 from multidrop.supervisor import end_tasks
 
-AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # of silence before each repeat; then the read fails
-SLOW = 3.0  # wait this multiple of a usual answer's time before a repeat,
-MOST_SILENCE_S = 1.0  # and no longer: a path gives up after that
-FORGET = 0.97  # decay of that time with each answer
-MOST_SPARE = 300.0  # repeats: twice the need of the 3 s until servers leave a dead route
-EARNED = 0.5  # repeats per timely answer
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # silence before each repeat; after the last one the read fails
+SLOW = 3.0  # wait this multiple of the usual time of an answer before a repeat,
+MOST_SILENCE_S = 1.0  # but at most this long, because a path gives up then
+FORGET = 0.97  # decay of the usual time with each answer
+MOST_SPARE = 300.0  # limit of the budget: twice the need of the 3 s until servers leave a dead route
+EARNED = 0.5  # repeats that a timely answer earns
 
 
 class Way(Protocol):
@@ -43,10 +44,10 @@ class Spare:
 
     def __init__(self) -> None:
         self._left = 0.0
-        self._took_s = MOST_SILENCE_S / SLOW  # of recent slow answers; unknown at first
+        self._took_s = MOST_SILENCE_S / SLOW  # usual time of an answer; assumed at first
 
     def note(self, *, is_late: bool) -> None:
-        """Update the budget after the first request was answered."""
+        """Update the budget after an answer to the first request of a read."""
         self._left = self._left / 2 if is_late else min(self._left + EARNED, MOST_SPARE)
 
     def learn(self, took_s: float) -> None:
@@ -58,7 +59,7 @@ class Spare:
         return max(least_s, min(SLOW * self._took_s, MOST_SILENCE_S))
 
     def spend(self, ways: Sequence[Way]) -> Sequence[Way]:
-        """Return the paths on which the read may be repeated."""
+        """Return the paths on which the budget allows a repeat, and charge it for them."""
         asked = ways[: int(self._left)]
         self._left -= len(asked)
         return asked
@@ -67,7 +68,7 @@ class Spare:
 async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> list[DirectMessage]:
     """Return the messages of the first complete answer. Raises FleetError if there is none.
 
-    The first path is asked alone, because it usually answers at once.
+    The first path is asked alone at first, because it usually answers immediately.
     """
     loop = asyncio.get_running_loop()
     gets: dict[asyncio.Task[None], DirectGet] = {}
@@ -91,7 +92,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
                             spare.note(is_late=number > 0)
                         return get.messages
                     failure = failed
-            is_refused = isinstance(failure, NoRight)  # by each of the servers, then
+            is_refused = isinstance(failure, NoRight)  # one server speaks for all: all have the same rights
             if not gets and (number or not ways[1:] or is_refused):
                 break
         raise failure

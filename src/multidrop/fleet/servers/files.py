@@ -2,10 +2,10 @@
 
     n1.conf, n2.conf …   one server each, with its routes to the others; only for that server
     rights.conf          users by their public keys, their rights and accounts; for all servers
-    keys/NAME.key        the secret key of a user; only for its machine
+    keys/NAME.key        the secret key of a user; only for its computer
     keys/routes          the password between servers, as in the servers' files
 
-Existing keys are kept, so a new gateway changes no other's key. A user whose name is no longer given loses
+Existing keys are kept, so adding a gateway changes no other key. A user whose name is no longer given loses
 all rights.
 """
 
@@ -24,14 +24,14 @@ from multidrop.fleet.servers.rights import accounts, rights_of
 from multidrop.printable import masked
 
 CLUSTER = "multidrop"
-ROUTE_PORTS = 2000  # from a server's port to that of its routes: 4222 and 6222
+ROUTE_PORTS = 2000  # added to a server's port for the port of its routes, as in 4222 and 6222
 MOST_PORTS = 65535
 STORE = Path("/var/lib/nats")
-PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: detect a dead one after 3 s instead of 60 to 90 s
+PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: detect a dead route after 3 s instead of 60 to 90 s
 
 
 class TlsFiles(NamedTuple):
-    """Paths on a server: its certificate, its key, and the certificate that signed all servers'."""
+    """Paths on a server: its certificate, its key, and the certificate that signed those of all servers."""
 
     cert: Path
     key: Path

@@ -1,10 +1,11 @@
 """Leaders of buckets: each bucket is led by another server, so that one failed server stops only one path.
 
-A server that hears no leader asks for votes every 4 to 9 s, each time in a newer term, though the others do
-not hear it. When it returns, a leader with an older term steps down, and the bucket has no leader for 4 to 9
-s. If that happens to two of the lease buckets, no line is polled. Handing over a leadership also makes the
-term newer, and takes an instant. So while a server is silent, the others hand the lease buckets to each other
-more often than it asks. Who may poll depends only on revisions, whichever server leads.
+A server that is cut off from the others starts an election every 4 to 9 s, each time in a newer term, though
+the others do not hear it. When it returns, a leader with an older term steps down, and the bucket has no
+leader for 4 to 9 s. If that happens to two of the lease buckets, no line is polled. Handing over a leadership
+also starts a newer term, and takes an instant. So while a server is silent, leadership of the lease buckets
+is handed over more often than that server starts elections, and its term stays older. Which gateway may poll
+depends only on revisions, whichever server leads.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.record_shapes import misshapen
 from multidrop.supervisor import end_tasks
 
-SILENT_NS = 2_000_000_000  # a follower answers its leader once a second
-_CLUSTER = {"leader": str, "replicas": list}  # missing if there is none
+SILENT_NS = 2_000_000_000  # without an answer; a follower answers its leader once a second
+_CLUSTER = {"leader": str, "replicas": list}  # missing entries get defaults
 _REPLICA = {"name": str, "current": bool, "offline": bool, "active": int}
 
 
@@ -34,16 +35,16 @@ class Replica(NamedTuple):
     name: str
     is_current: bool
     is_offline: bool
-    active_ns: int  # since the leader heard from it; 0 for never
+    active_ns: int  # time since the leader heard from it; 0 for never
 
     @property
     def is_ready(self) -> bool:
-        """Return True if it could lead now."""
+        """Return True if this server could lead now."""
         return self.is_current and not self.is_offline
 
     @property
     def is_silent(self) -> bool:
-        """Return True if it was not heard for 2 s, or never; a server that lags is heard."""
+        """Return True if the leader never heard this server, or not for 2 s. A lagging server is heard."""
         return not self.is_current and not 0 < self.active_ns < SILENT_NS
 
 
@@ -95,7 +96,7 @@ def _believed(given: Any, shape: Mapping[str, type], **usual: Any) -> dict[str, 
     return dict(found)
 
 
-SOON_S = 0.4  # usually some milliseconds
+SOON_S = 0.4  # time limit for leaders' answers, which usually take some milliseconds
 
 
 async def cluster_at(path: ServerPath, bucket: str) -> Cluster | None:
@@ -116,16 +117,13 @@ async def has_leader(path: ServerPath, bucket: str) -> bool:
 
 
 async def have_leaders(path: ServerPath) -> bool:
-    """Return True if enough buckets of masters have a leader for lines to be claimed."""
+    """Return True if lines can be claimed: enough buckets of masters have a leader that answers."""
     led = await asyncio.gather(*(has_leader(path, bucket) for bucket in names.OWNERS))
     return sum(led) >= NEEDED
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
-    """Return the servers of the lease and master buckets whose leader answers soon.
-
-    A leader that is cut off delays the others by at most that time.
-    """
+    """Return the servers of those lease and master buckets whose leader answers within SOON_S."""
     buckets = (*names.LEASES, *names.OWNERS)
     looks = [asyncio.create_task(known_cluster(path, bucket)) for bucket in buckets]
     try:
@@ -140,7 +138,7 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Ask leaders that are not at home to step down in favour of their home; return how many were asked."""
+    """Ask each leader other than the home server to step down in its favour; return how many were asked."""
     moved = 0
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):
@@ -159,24 +157,24 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
 
 
-HAND_OVER_S = 3.0  # less than the shortest time between two vote requests
+HAND_OVER_S = 3.0  # time between hand-overs of a bucket: less than the shortest time between two elections
 SILENT_FOR_S = 60.0  # a server that is silent for longer is ignored
-HANDED_S = 1.0  # a hand-over takes 0.03 to 0.3 s
+HANDED_S = 1.0  # time limit of a hand-over, which takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
 
 
 class LeaseTerms:
-    """The times of hand-overs, and since when a server is silent."""
+    """Keeps the terms of the lease buckets newer than a silent server's, by hand-overs."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._silent_since: float | None = None
-        self._handed_at: dict[str, float] = {}  # by bucket
+        self._handed_at: dict[str, float] = {}  # time of the last hand-over, by bucket
 
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
-        """Hand over the buckets that are due, and return True if any was.
+        """Hand over the lease buckets that are due, and return True if any was.
 
-        They go one after the other, so at most one waits for an election because of this.
+        Stop after a hand-over that fails, so that at most one bucket waits for an election because of this.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
@@ -214,13 +212,13 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
     return False
 
 
-KEEP_S = 0.4  # leaders report a silent server after 2 s; it asks for votes after 4 s
+KEEP_S = 0.4  # leaders report a silent server after 2 s; that server starts elections after 4 s
 
 
 async def keep_leaders(
     path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
 ) -> None:
-    """Look after the buckets' leaders forever, while `is_ours()` returns True."""
+    """Manage the buckets' leaders forever, as long as `is_ours()` returns True."""
     terms = LeaseTerms(clock)
     while True:
         await asyncio.sleep(KEEP_S)

@@ -36,10 +36,10 @@ def owner_buckets(line: str) -> tuple[str, ...]:
 
 
 def is_inbox(subject: str) -> bool:
-    """Return True if a requester waits for its answer on this subject.
+    """Return True if a requester may wait for an answer on this subject, because it is an inbox.
 
-    Servers let a responder answer on any subject that the requester names, even one that the requester may
-    not use, such as a record of the plant. Answers of the servers themselves have no such subject.
+    Servers let a responder answer on any subject that the requester names, even one that the requester has no
+    right to, such as the subject of a plant's record. So answer only on inboxes.
     """
     return subject.startswith(("_INBOX.", "_INBOX_"))
 
@@ -50,7 +50,7 @@ def command_subject(line: str) -> str:
 
 
 def do_subject(gateway: str, run: str) -> str:
-    """Return the subject on which one run of a gateway's process is told to carry out its offer."""
+    """Return the subject for the tokens of offers that one run of a gateway's process has made."""
     return f"do.{gateway}.{run}"
 
 

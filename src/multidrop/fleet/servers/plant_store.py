@@ -1,7 +1,7 @@
 """Plant store: the plant's lines in the bucket `plant`, by name, with their family files.
 
-A line's record holds its table of the plant file and the text of the family files that it uses. So a gateway
-reads only the lines that it polls.
+A line's record holds its table of the plant file and the text of the family files that it uses, so a gateway
+needs only the records of the lines that it polls.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.plant import MAY_LISTS, check_listed
 from multidrop.toml_check import Key, TomlPlace
 
-AT_ONCE = 64
+AT_ONCE = 64  # concurrent writes of records
 SOCKETS = ("socket://", "tcp://")
 
 _FLEET = {"may": Key(dict, "[fleet.may], a table")}
@@ -28,9 +28,8 @@ _FLEET = {"may": Key(dict, "[fleet.may], a table")}
 def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     """Return the plant in a file, and the record of each line by name.
 
-    Raises ValueError (PlantError for mistakes in the file) if a fleet cannot poll it: a port that only one
-    machine has or that a thread serves, a line's name that cannot be part of a subject, or a family in
-    Python.
+    Raises PlantError for mistakes in the file, and ValueError for a plant that a fleet cannot poll: a port
+    that is not at a network address, a line's name that cannot be part of a subject, or a family in Python.
     """
     plant = Plant.load(path)
     document = tomllib.loads(path.read_text("utf-8"))
@@ -118,7 +117,7 @@ async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
 
 
 def line_of(record: Record, folder: Path) -> PlantLine:
-    """Return the line that a record describes; its files are written below the folder.
+    """Return the line that a record describes. Write its files into the line's own folder in `folder`.
 
     Raises ValueError for an invalid record.
     """

@@ -1,6 +1,6 @@
 """Shapes of a fleet's records: what each must contain before it is used. Pure.
 
-Anyone with write access to a bucket may write anything. Invalid records are ignored, and harm no others.
+Any user with write access to a bucket can write any bytes. Invalid records are ignored, and affect no others.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def largest(bucket: str) -> int:
 
 
 def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
-    """Return the value of a record, and why it is invalid, or "". A removed record has the value None."""
+    """Return the value of a record and "", or None and why it is invalid. A removed record is None and ""."""
     if not data:
         return None, ""
     if not names.is_name(key):
@@ -42,7 +42,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
     if len(data) > largest(bucket):
         return None, f"it has {len(data)} bytes, and {largest(bucket)} are the most"
     try:
-        value = json.loads(data.decode())  # faster: json.loads would detect the encoding of each of thousands
+        value = json.loads(data.decode())  # faster than json.loads, which detects the encoding
     except (ValueError, RecursionError):
         return None, "not JSON"
     mistake = misshapen(value, SHAPES.get(bucket, {})) or _CHECKS.get(bucket, _nothing)(key, value)
@@ -50,7 +50,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
 
 
 def misshapen(value: Any, shape: Mapping[str, type]) -> str:
-    """Return how a value differs from a shape; "" if it fits. Further entries are allowed."""
+    """Return how a value differs from a shape; "" if it fits. It may have further entries."""
     if not isinstance(value, dict):
         return "not a table"
     for name, kind in shape.items():

@@ -12,9 +12,9 @@
 No user may change, empty or remove a stream (except the test bucket of `fleet init`), create a consumer, or
 read another user's answers.
 
-NATS sends an answer to whatever subject the requester names, without checking the requester's rights there.
-So each user has an account of its own, which answers do not leave, and one account without users holds
-everything that is stored. Only these cross accounts:
+NATS sends an answer to any subject that the requester names, without checking the requester's rights there.
+So each user has its own account, which answers do not leave, and all stored data are in one account without
+users. Only these messages cross accounts:
 
 | from        | to           | what                                                            |
 |-------------|--------------|-----------------------------------------------------------------|
@@ -22,8 +22,8 @@ everything that is stored. Only these cross accounts:
 | a commander | each gateway | commands, stops and requests about the gateway, as streams      |
 | a gateway   | a commander  | answers to the commander's inbox, as a service                  |
 
-A server does not forward to importers of a stream what arrived through a service, so no answer becomes a
-stop.
+A server does not forward a message that arrived through a service to the importers of a stream, so an answer
+cannot become a stop.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class UserRights(NamedTuple):
 
     publish: Sequence[str]
     subscribe: Sequence[str] = ()
-    answers: bool = False  # to requests that reach it, on the requester's inbox
+    answers: bool = False  # may answer requests on the requester's inbox
 
 
 def _api(request: str, *buckets: str) -> list[str]:
@@ -120,7 +120,7 @@ OTHERS: Mapping[str, Callable[[str], UserRights]] = {
 def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
     """Return the rights of each user of a fleet with these gateways, by name.
 
-    Raises ValueError for a name that is invalid or taken.
+    Raises ValueError for a name that is invalid or used twice.
     """
     for name in gateways:
         names.checked_name("gateway", name)
@@ -133,12 +133,12 @@ def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
 
 
 STORE = "multidrop"
-LAST_ANSWER = "10s"  # for several answers: the server remembers the requester for this long
-ANSWER = '{ max: 1, expires: "1m" }'  # a stop of many drives takes its time
+LAST_ANSWER = "10s"  # the server forwards several answers of a request for this long
+ANSWER = '{ max: 1, expires: "1m" }'  # a stop of many drives may take long
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
-_MANY = "$JS.API.DIRECT.GET."  # several answers each
-# Without this import, a server answers every JetStream request in such an account with "not enabled".
-# No user may send it.
+_MANY = "$JS.API.DIRECT.GET."  # requests with several answers
+# Without this import, a server answers every JetStream request in a user's account with "not enabled".
+# No user has the right to send this request.
 _INFO = "$JS.API.INFO"
 
 

@@ -17,7 +17,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import Cluster, bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
-ROUNDS = 40  # 2.9.10 fails in the first few rounds
+ROUNDS = 40  # of `_contest`; nats-server 2.9.10 fails in the first few
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
@@ -60,7 +60,7 @@ async def open_all(paths: Sequence[ServerPath]) -> None:
 
 
 async def check_buckets(path: ServerPath) -> None:
-    """Raise FleetError if these servers have no fleet or no quorum. An election in progress is waited for."""
+    """Raise FleetError if these servers have no fleet or no quorum. Waits for an election in progress."""
     ends = asyncio.get_running_loop().time() + WAIT_S
     for bucket in names.BUCKETS:
         try:
@@ -94,7 +94,7 @@ async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
 
 
 def check_clock(path: ServerPath, server_time: Any) -> None:
-    """Warn if this machine's clock and the server's differ: leases do not depend on it, samples do.
+    """Warn if the clocks of this computer and the server differ: leases do not depend on them, samples do.
 
     Raises Unsure for an invalid time.
     """
@@ -135,7 +135,7 @@ async def _kept_on(path: ServerPath) -> int:
 
 
 async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
-    """Return the state of a stream, None if there is none. An election is waited for."""
+    """Return the state of a stream, None if there is none. Waits for an election in progress."""
     ends = asyncio.get_running_loop().time() + WAIT_S
     while True:
         try:
@@ -198,7 +198,7 @@ async def _wait_for_plant(path: ServerPath) -> None:
 
 
 async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
-    """Let several claimants request the same revision, again and again: only one may get it."""
+    """Let several claimants request the same revision, repeatedly. Raises FleetError if two get it."""
     settings = bucket_settings(CONTEST, replicas)
     await _create(paths[0], settings)
     try:

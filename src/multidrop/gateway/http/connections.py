@@ -174,7 +174,7 @@ class Turns:
     def __init__(self) -> None:
         self.stops: deque[asyncio.Future[None]] = deque()
         self.others: deque[asyncio.Future[None]] = deque()
-        self._is_taken = False  # in this round
+        self._is_taken = False  # a request was started in this round
 
     async def wait(self, waiting: deque[asyncio.Future[None]]) -> None:
         """Wait for a turn in this queue."""
@@ -191,7 +191,7 @@ class Turns:
         self._is_taken = False
         while not self._is_taken and (waiting := self.stops or self.others):
             turn = waiting.popleft()
-            if not turn.done():  # else its request was cancelled
+            if not turn.done():  # otherwise its request was cancelled
                 turn.set_result(None)
                 self._is_taken = True
                 asyncio.get_running_loop().call_soon(self._give)

@@ -1,7 +1,7 @@
 """Exports of the history as CSV or Parquet files.
 
-Their number is limited: each uses a thread while a piece is made, and Parquet uses space on the history's
-disk.
+The number of exports is limited: each uses a thread while a piece is made, and a Parquet file needs space on
+the disk of the history.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multidrop.gateway.http.messages import Denied
 from multidrop.supervisor import supervisor
 
 MOST_EXPORTS = 8  # concurrent exports
-PIECE_S = 600.0  # time limit of a piece: the first one of Parquet takes the whole file
+PIECE_S = 600.0  # time limit of a piece; before the first piece of Parquet the whole file is made
 R = TypeVar("R")
 MOST_NAME = 80  # characters of a series' name in a file name
 FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # in file names
@@ -43,7 +43,7 @@ class Exports:
     async def respond(
         self, part: ExportingPart, names: Sequence[str], begin: int, end: int, kind: str
     ) -> Response:
-        """Return a file of these series. Raises Denied for wrong arguments or too many exports; Hung."""
+        """Return a file of these series. Raises Denied for wrong arguments or too many exports, and Hung."""
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
         if self.under_way >= MOST_EXPORTS:

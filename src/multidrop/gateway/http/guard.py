@@ -15,7 +15,7 @@ from multidrop.gateway.http.rights import SCHEMES, Caller, May, OwnNames, Right,
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
-HEADERS = {  # of API answers: few, because each frame has them
+HEADERS = {  # of API answers; few, because each answer with a frame has them
     "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
     "cross-origin-resource-policy": "same-origin",
     "x-content-type-options": "nosniff",
@@ -31,7 +31,7 @@ PAGE_HEADERS = HEADERS | {
 ANYONE = "anyone"
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
-HAS_WRONG_TOKEN = "has_wrong_token"  # key in the scope of a stop, which is sent despite a wrong token
+HAS_WRONG_TOKEN = "has_wrong_token"  # key in a request's scope; a stop is sent despite a wrong token
 MOST_HEAD = 64 * 1024  # bytes of a request's head: a browser sends the cookies of all ports of a host
 
 
@@ -45,7 +45,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Needed(NamedTuple):
-    """The method of a path, and the right that it needs; None: no token is checked."""
+    """The method and the right that a path needs; with None, no token is checked."""
 
     method: str
     right: Right | None
@@ -126,7 +126,7 @@ class Guard:
         return self._needed[path]
 
     def _check_site(self, headers: Headers, host: str, needed: Needed, schemes: Sequence[str]) -> None:
-        """Raise Denied for a request of another site's page, which browsers mark as such."""
+        """Raise Denied if the headers of the browser say that another site's page sent the request."""
         origin = headers.get("origin")
         if origin is not None and not self._names.has_origin(origin, host, schemes):
             raise Denied(403, f"the request comes from a page of {origin[:100]!r}, not of this gateway")
@@ -142,8 +142,9 @@ class Guard:
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
         """Return the caller of a request that needs this right. Raises Denied without it.
 
-        A wrong token is refused even if the request needs none, except for a stop that needs none. After
-        several wrong tokens, an address must wait before others are checked; stops are checked always.
+        A wrong token is refused even if the request needs no token; only a stop that needs no token is
+        accepted. After several wrong tokens, requests from that address with a token are refused for a while;
+        the tokens of stops are always checked.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy
@@ -175,7 +176,7 @@ class Guard:
         )
 
     def address(self, scope: Scope, headers: Headers) -> str:
-        """Return the client's address; behind a proxy the last one in its header."""
+        """Return the client's address; behind a proxy, the last one in the X-Forwarded-For header."""
         client: Any = scope.get("client")
         peer = str(client[0]) if client else ""
         if not self._behind_proxy:

@@ -1,4 +1,4 @@
-"""The files of the web page, read into memory at the first request: no later one waits for a disk."""
+"""The files of the web page, read into memory at the first request: later requests wait for no disk."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PageFiles:
 
 
 def _read_files(folder: Path) -> dict[str, PageFile]:
-    """Return the files by their paths with slashes. Raises OSError if one cannot be read."""
+    """Return the files by relative path, with slashes. Raises OSError if one cannot be read."""
     found = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():

@@ -48,7 +48,7 @@ class Caller(NamedTuple):
 
 
 class Token(NamedTuple):
-    """One line of the token file; it has only a digest, so the file alone gives no access."""
+    """One line of the token file. It has only a digest, so the file alone gives no access."""
 
     name: str
     right: Right
@@ -100,7 +100,7 @@ class Tokens:
 
     def __init__(self, tokens: Iterable[Token] = ()) -> None:
         self._tokens = tuple(tokens)
-        self._wrong: dict[str, deque[tuple[float, str]]] = {}  # time and digest, by address
+        self._wrong: dict[str, deque[tuple[float, str]]] = {}  # times and digests of wrong tokens, by address
 
     def __len__(self) -> int:
         return len(self._tokens)
@@ -110,7 +110,7 @@ class Tokens:
         self._tokens = tuple(tokens)
 
     def find(self, secret: str) -> Token | None:
-        """Return the token of this secret or None, in constant time."""
+        """Return the token of this secret; None if it is wrong. Compares in constant time."""
         given, found = digest(secret), None
         for token in self._tokens:
             if hmac.compare_digest(token.sha256, given):
@@ -150,7 +150,7 @@ class May(NamedTuple):
     verbs: frozenset[str] = frozenset()
 
     def bounded_by(self, other: May) -> May:
-        """Return these lists, with the rights without a token limited to those of both."""
+        """Return this table with the rights of callers without a token limited to those in both tables."""
         look = "anyone" if self.look == other.look == "anyone" else "token"
         return self._replace(look=look, on_loopback=min(self.on_loopback, other.on_loopback))
 
@@ -163,7 +163,7 @@ class May(NamedTuple):
 
 @lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
-    """Return True for addresses and names that only this machine can reach."""
+    """Return True for addresses and names that only this computer can reach."""
     if host in ("localhost", ""):
         return host == "localhost"
     try:

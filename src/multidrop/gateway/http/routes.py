@@ -47,11 +47,11 @@ if TYPE_CHECKING:
 
 
 MOST_QUERIES = 2  # concurrent queries of the audit log
-AUDIT_S = 20.0  # time limit of one
+AUDIT_S = 20.0  # time limit of one such query
 COOKIE_S = 30 * 24 * 3600
 MOST_NOTE = 500  # characters of an acknowledgement's note
-HEAD_S = 0.5  # a stop's answer starts after this time; its head confirms that the stop was accepted
-UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head at once
+HEAD_S = 0.5  # the head of a stop's answer is sent after this time; it confirms that the stop was accepted
+UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head immediately
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
 NEEDED: Mapping[str, Needed] = {
@@ -311,7 +311,7 @@ class _Pages:
         return await (self._answer_stop(acting) if verb in STOPPING else acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return the check of a command against the frame that its sender has seen; stops skip it."""
+        """Return a function that checks a command against the frame its sender saw. Stops are not checked."""
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 

@@ -1,4 +1,4 @@
-"""AlarmFile: keeps alarms on disk. It writes in its own thread, so polling never waits for a disk."""
+"""AlarmFile: keeps alarms on disk. A thread reads and writes, so polling never waits for a disk."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """The alarms in a file of JSON lines; the newest line of an alarm counts.
+    """A file of alarms as JSON lines; the newest line of an alarm is valid.
 
     Only `run` waits for the disk. No method raises.
     """

@@ -24,7 +24,7 @@ UNCALLED = "the motor stopped, and no stop was called here"
 STANDS_MS = 2000  # a motor must be at rest this long: a reversing one passes 0 Hz
 MOST_ENDED = 1000  # ended alarms kept
 MOST_SHOWN = 20  # ended alarms shown
-LOST = ("port lost", "port refused its settings")  # statuses of rows of a line without its port
+LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
 
 
 class Alarm(NamedTuple):
@@ -36,7 +36,7 @@ class Alarm(NamedTuple):
     ended: int | None
     kind: str
     line: str = ""
-    is_before: bool = False  # it may have started before `time`, when it was first seen
+    is_before: bool = False  # it was first seen at `time`, but may have started earlier
     acknowledged: int | None = None
     by: str = ""  # the caller who acknowledged it
     note: str = ""
@@ -65,14 +65,14 @@ class Alarms:
         self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
         self._runs: dict[str, int] = {}  # stop count of each drive when its motor was first seen running
         self._stands: dict[str, int] = {}  # time at which a motor that ran was first seen at rest
-        self.begun = 0  # alarms so far
+        self.begun = 0  # number of alarms so far
 
     # ---- observations ----
 
     def look(self, time: int, drive: str, shown: Shown, stops: int | None = None) -> None:
         """Note a drive's state. A fault stays active while its drive is silent.
 
-        `stops` counts the commands that end a run of its motor; None: rest is no alarm at present.
+        `stops` counts the commands that end a run of its motor; None: a motor at rest raises no alarm now.
         """
         state, words = shown.state, shown.words
         if state == SILENT:
@@ -117,7 +117,7 @@ class Alarms:
             self._begin(time, line, "", PORT, lost)
 
     def note_there(self, line: str) -> None:
-        """Note that a line works: a later loss starts at its own time."""
+        """Note that a line works, so that a later loss has an exact start."""
         self._known.add((line, ""))
 
     def forget(self, name: str, time: int) -> None:
@@ -131,7 +131,7 @@ class Alarms:
     # ---- acknowledgement, and alarms of earlier runs ----
 
     def acknowledge(self, id: str, time: int, by: str, note: str = "") -> Alarm:
-        """Return the acknowledged alarm; acknowledgement also ends the alarm of a motor that stopped.
+        """Acknowledge an alarm, and return it; this also ends an alarm of kind "stopped".
 
         Raises KeyError for an unknown id.
         """

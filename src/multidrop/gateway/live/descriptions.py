@@ -38,7 +38,7 @@ def describe(
         "file": has_file,  # a reload is possible
         "fleet": has_fleet,  # /api/fleet is available
         "fleet_stop": can_stop_fleet,  # /api/fleet/stop is available
-        "mistakes": list(mistakes),  # of the file, if the newest reload was refused
+        "mistakes": list(mistakes),  # in the file, if the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),
             "write": sorted(may.write) if is_writer else [],
@@ -78,7 +78,7 @@ def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
 
 
 def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | None]:
-    """Return the register of frequency, current and setpoint; a polled one if there is one."""
+    """Return the registers of frequency, current and setpoint, preferably polled ones; None if missing."""
     wanted = {"frequency": FREQUENCIES, "current": CURRENTS, "setpoint": (drive.setpoint_name,)}
     found: dict[str, str | None] = {}
     for name, registers in wanted.items():
@@ -109,7 +109,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "note": register.note,
         "least": least,
         "most": most,
-        "at_least": register.at_least,  # registers whose values are limits
+        "at_least": register.at_least,  # register whose value is the least one allowed
         "at_most": register.at_most,
         "step": None if register.is_float else register.step,
     }
@@ -118,7 +118,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
 def _span(register: Register[Any]) -> tuple[float | None, float | None]:
     """Return the least and largest writable value: the manual's range, or else that of the number format.
 
-    None for a float without a range, and for named values.
+    Both are None for a float without a range, for named values, and if the register cannot be written.
     """
     if register.span is not None:
         return register.span

@@ -13,7 +13,7 @@ from multidrop import Bus, BusError, Drive, NoReply, Plant, WriteForbidden
 from multidrop.supervisor import supervisor
 
 PAUSE_S = 0.2  # between two reads on a line, to leave the line to polling
-SHARE = 20  # or this many times the duration of the last read, if longer
+SHARE = 20  # or, if longer, this many times the duration of the last read
 LOOKED_S = 3.0  # reading stops this long after the last request for a drive
 MOST_DRIVES = 4  # drives read concurrently
 READ_S = 30.0  # time limit of one read
@@ -41,7 +41,7 @@ class SideReads:
     ) -> None:
         self._bus = bus
         self._is_there = is_there
-        self._turns: dict[str, asyncio.Lock] = {}  # by line
+        self._turns: dict[str, asyncio.Lock] = {}  # one read at a time, by line
         self._clock = clock
         self._utc_ms = utc_ms
         self._looked: dict[str, float] = {}
@@ -49,7 +49,7 @@ class SideReads:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def look(self, plant: Plant, name: str) -> Found:
-        """Return the values read so far, and keep reading. Raises ValueError for an unknown drive."""
+        """Return the values read so far, and read further. Raises ValueError for an unknown drive."""
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()
         found = self._found.setdefault(name, {})
@@ -113,9 +113,9 @@ class SideReads:
 
 
 class Identities:
-    """Checks the identity of each drive once while its port is open, so that its first stop is sent at once.
+    """Checks each drive's identity once while its port is open, so that its first stop need not do so.
 
-    `fail` is called inside the handler of an unexpected exception.
+    `fail` is called in the `except` block of an unexpected exception, so it can log the exception.
     """
 
     def __init__(
@@ -129,10 +129,10 @@ class Identities:
         self._bus = bus
         self._is_there = is_there
         self._fail = fail
-        self._refused: dict[str, str] = {}  # by drive, as it was logged
+        self._refused: dict[str, str] = {}  # the refusal that was logged last, by drive
 
     async def run(self) -> None:
-        """Repeat without end: a drive may answer again, and a port may be reopened."""
+        """Check forever, because a drive may answer again, and a port may be reopened."""
         while True:
             drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
             for line, drive in drives:

@@ -1,8 +1,8 @@
 """Frames: the state of the plant for all viewers, made at most five times a second.
 
 A viewer requests the next frame after the last one, so no queue builds up for a slow viewer. The request
-names the viewer's frame, and the answer has the changes since it, or the whole frame if that one is
-forgotten.
+names the viewer's frame, and the answer has the changes since that frame, or a whole frame if that one is no
+longer remembered.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def frame_of(
 
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
-    """Return a drive's part of the frame. A fresh value comes as a pair: value, index of its time."""
+    """Return a drive's part of the frame. A fresh value is a pair: value, index of its age in `ages_ms`."""
     shown = hub.seen(name)
     seen, answered_ns = hub.seen_at(name), hub.answered_ns(name)
     now = time_ns, hub.now_ns()
@@ -95,12 +95,12 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
 
 
 def _age_ms(now: Times, asked: Times) -> int:
-    """Return the larger age in ms of two clocks: UTC may be set back, and the other one stops in a sleep."""
+    """Return the larger age in ms by both clocks: UTC may be set back, CLOCK_MONOTONIC stops in a sleep."""
     return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
 
 
 class Places(dict[Times, int]):
-    """Indexes of times in a list without duplicates: all values of one request have the same time."""
+    """Numbers times from 0 on, without duplicates: all values of one request have the same time."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = place = len(self)
@@ -110,7 +110,7 @@ class Places(dict[Times, int]):
 def _unknown(
     hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, now: Times
 ) -> tuple[Any, ...]:
-    """Return None, index of its time, and status of a missing value; then the last value and its time."""
+    """Return None, the index of the age, and the status; then the last good value and its index, if any."""
     if newest is None:
         return None, places[now], "not asked yet"
     last = () if good is None else (_finite(good[2]), places[good[:2]])
@@ -166,7 +166,7 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
-        self._encoded: dict[int, Encoded] = {}  # the newest frame, by the frame it is relative to
+        self._encoded: dict[int, Encoded] = {}  # the newest frame; keys: the frame it is relative to
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
@@ -200,8 +200,8 @@ class Frames:
     async def after(self, n: int) -> Encoded | None:
         """Return a frame other than the n-th as soon as there is one; None after WAIT_S without one.
 
-        It has only the changes if the n-th is still remembered. Raises OverflowError if too many viewers
-        wait.
+        It has only the changes since the n-th if that one is still remembered. Raises OverflowError if too
+        many viewers wait.
         """
         if self._has_news and self._clock() >= self._due:
             self._build()
@@ -266,7 +266,7 @@ class SeenFrames:
 
     A write, or a verb that may move a motor, names the newest frame that its sender has seen. It is sent
     once, within MOST_AGE_S of that frame, and only if no stop and no reload came after it. Clocks of other
-    machines play no role.
+    computers play no role.
 
     `clock` returns ns and includes sleep. `stopped_ns` returns when a drive's latest stop was called, by that
     clock; None without one.
@@ -276,7 +276,7 @@ class SeenFrames:
         self.clock = clock
         self._stopped_ns = stopped_ns
         self._made: dict[int, int] = {}  # time of each frame by number
-        self._came: dict[int, set[object]] = {}  # commands by the frame that they named
+        self._came: dict[int, set[object]] = {}  # commands admitted, by the frame that they named
         self._newest = -1
         self._newest_before = -1  # the last frame before the latest reload
 
@@ -295,7 +295,7 @@ class SeenFrames:
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
         """Return the time in ns until which a command may be sent if its sender has seen this frame.
 
-        Raises WriteForbidden if it is too late or a repetition.
+        Raises WriteForbidden if it is too late or a repetition, or if a stop or reload came after the frame.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS

@@ -1,7 +1,7 @@
 """Hub: the newest row of every register of every drive, and each drive's state from these rows.
 
-Pure: takes rows and times. Rows have times of CLOCK_MONOTONIC, which stops while the machine sleeps: rows
-from before a sleep are old afterwards.
+Pure: takes rows and times. Rows have times of CLOCK_MONOTONIC, which stops while the computer sleeps: after a
+sleep, all earlier rows are stale.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ STALE_PERIODS = 3  # and at least this many periods
 KeptRow = tuple[int, int, float, int]  # time, monotonic time, value (meaningless in a miss), status
 Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good row, is it fresh
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
-UNNAMED = "it shows a fault"  # with an unknown code
-NOT_ASKED = "not asked recently"  # words of an unknown state: no fresh value at all,
-INCOMPLETE = "not all of it is known"  # or only some: there may be a fault nevertheless
+UNNAMED = "it shows a fault"  # words of a fault without a text
+NOT_ASKED = "not asked recently"  # words of state UNKNOWN, without any fresh value
+INCOMPLETE = "not all of it is known"  # words of state UNKNOWN if some are missing: a fault is possible
 _STATES = {
     Condition.STOPPED: STANDS,
     Condition.RUNNING: RUNS,
@@ -33,7 +33,7 @@ LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between reading
 FAULT_REGISTER = "fault"
 RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
 _TURNING = ("output_frequency", "motor_speed")  # the motor turns if one is not 0
-_ANSWERED = ("exception ", "no valid value")  # prefixes of statuses of misses with a reply
+_ANSWERED = ("exception ", "no valid value")  # prefixes of the status of a miss if the drive did reply
 
 
 class RegisterRows:
@@ -50,14 +50,15 @@ class RegisterRows:
 
     @property
     def holds_ns(self) -> int:
-        """The time for which a value stays current.
+        """How long a value stays current, in ns.
 
-        The line may be slower than planned. One long interval is only a pause: the shorter of two counts.
+        The line may be slower than planned, so measured intervals count too. One long interval may be only a
+        pause, so the shorter of the latest two is used.
         """
         return max(STALE_NS, STALE_PERIODS * max(self.least_ns, min(self.intervals_ns)))
 
     def is_fresh(self, now_ns: int, woke_ns: int) -> bool:
-        """Return True if the newest value is current and newer than the machine's last sleep."""
+        """Return True if the newest value is current and was requested after the computer's last sleep."""
         if self.good is None or self.good[1] < woke_ns:
             return False
         age = now_ns - self.good[1]
@@ -94,7 +95,7 @@ class FreshValues(Mapping[str, float]):
 class Newest(NamedTuple):
     """The newest row of one register of one drive."""
 
-    time: int  # UTC ns: the request was sent
+    time: int  # when the request was sent, UTC in ns
     monotonic_ns: int
     value: float | None  # None: this row is a miss
     status: str  # "ok", or the reason
@@ -119,7 +120,7 @@ class Shown(NamedTuple):
 
 
 class _Trip(NamedTuple):
-    """A fault that only a changed fault record shows."""
+    """A fault known only from a change of the drive's fault record."""
 
     words: str
     at_ns: int
@@ -130,7 +131,7 @@ class _Watched:
 
     def __init__(self, polled: PolledDrive, cycle_ns: int, since_ns: int) -> None:
         self.polled = polled
-        self.since_ns = since_ns  # first request for this drive
+        self.since_ns = since_ns  # rows requested earlier belong to another drive of the same name
         self.names = tuple(poll.register.name for poll in polled.polls)
         self.cycle_ns = cycle_ns  # planned cycle of its line
         self.reader = StateReader(polled.drive)
@@ -150,7 +151,7 @@ class _Watched:
 class Hub:
     """The newest rows of a plant; `take` receives every batch.
 
-    `clock` returns CLOCK_MONOTONIC and the total sleep of the machine, both in ns.
+    `clock` returns CLOCK_MONOTONIC and the computer's total time asleep, both in ns.
     """
 
     def __init__(self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0)) -> None:
@@ -159,7 +160,7 @@ class Hub:
         _, self._slept_ns = clock()
         self._woke_ns = 0  # monotonic time at which a sleep was noticed
         self.time = 0  # time of the newest row, UTC in ns
-        self.taken = 0  # batches
+        self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
         self._cells: dict[int, RegisterRows | None] = {}  # by drive and register code; None: not in the plant
         self._statuses: tuple[str, ...] = ("ok",)
@@ -169,7 +170,7 @@ class Hub:
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
         """Use another plant, and keep the rows of unchanged drives.
 
-        Later rows of earlier requests count only for these, because a name may mean another drive now. Pass
+        For other drives, rows requested before this call are ignored: a name may mean another drive now. Pass
         `plant.metadata()["planned"]` as `planned` if you have it: it takes seconds for hundreds of lines.
         """
         before = self._watched
@@ -231,9 +232,9 @@ class Hub:
         return self._times()[0]
 
     def woke_ns(self) -> int:
-        """Return when the machine's latest sleep was noticed (CLOCK_MONOTONIC); 0 without one.
+        """Return when the computer's latest sleep was noticed (CLOCK_MONOTONIC, ns); 0 without one.
 
-        Values requested before are stale.
+        Values requested before that time are stale.
         """
         return self._times()[1]
 
@@ -276,7 +277,7 @@ class Hub:
         return iter(self._watched)
 
     def known(self, drive: str) -> Iterator[Known]:
-        """Yield the rows of each polled register of a drive, in the plant file's order."""
+        """Yield each polled register of a drive with its rows (see `Known`), in the plant file's order."""
         watched = self._watched.get(drive)
         if watched is None:
             return
@@ -294,13 +295,13 @@ class Hub:
         return self._statuses[code]
 
     def answered_ns(self, drive: str) -> int | None:
-        """Return the monotonic time of the request of a drive's newest value; None if it never answered."""
+        """Return when a drive's newest value was requested (monotonic, ns); None if it never answered."""
         watched = self._watched.get(drive)
         cells = watched.cells.values() if watched else ()
         return max([cell.good[1] for cell in cells if cell.good], default=None)
 
     def seen_at(self, drive: str) -> int | None:
-        """Return the UTC time in ns of the request of a drive's newest value; None if it never answered."""
+        """Return when a drive's newest value was requested (UTC, ns); None if it never answered."""
         watched = self._watched.get(drive)
         cells = watched.cells.values() if watched else ()
         return max([cell.good[0] for cell in cells if cell.good], default=None)
@@ -323,7 +324,7 @@ class Hub:
         return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
 
     def note_reset(self, drive: str) -> None:
-        """Forget a fault known from the drive's fault record: it was reset."""
+        """Forget a fault that the drive's fault record has shown, because it was reset."""
         watched = self._watched.get(drive)
         if watched is not None:
             _forget_trip(watched)

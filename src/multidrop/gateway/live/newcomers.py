@@ -1,4 +1,4 @@
-"""Newcomers: rows amid a reload that the plant which comes describes, and that wait until it is in effect."""
+"""Newcomers: hold back rows of drives that a reload has changed, until the new plant is in effect."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Protocol
 
 from multidrop import Batch, Plant, PolledDrive
 
-MOST_WAITING = 250_000  # rows: 12 MB; what comes beyond waits in the core
+MOST_WAITING = 250_000  # limit of rows held back: 12 MB; further rows wait in the core
 
 
 class ChangingPlant(Protocol):
-    """The part of a poller that is needed here."""
+    """The properties of a poller that this module uses."""
 
     @property
     def plant(self) -> Plant: ...
@@ -20,9 +20,9 @@ class ChangingPlant(Protocol):
 
 
 class Newcomers:
-    """The rows of drives that an adoption has changed already: to the plant of before they are unknown.
+    """The rows of drives that the reload has changed already: the previous plant does not describe them.
 
-    What has a drive's name may be of another family now, with other units. All other rows pass.
+    A changed drive may keep its name, but have another family, with other units. All other rows pass.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Newcomers:
         return self._rows < MOST_WAITING
 
     def keep(self, batch: Batch, before: Plant, poller: ChangingPlant) -> Batch:
-        """Keep the rows that are not of the plant of before; return the others."""
+        """Hold back the rows that the plant `before` does not describe; return the others."""
         since_ns = _changed_since(before, poller)
         if not since_ns:
             return batch
@@ -52,14 +52,14 @@ class Newcomers:
         return batch.at([at for at, is_kept in enumerate(is_new) if not is_kept])
 
     def release(self, feed: Callable[[Batch], object]) -> None:
-        """Give out what waits: the plant that came is in effect."""
+        """Pass the rows held back to `feed`: the new plant is in effect."""
         waiting, self._waiting, self._rows = self._waiting, [], 0
         for batch in waiting:
             feed(batch)
 
 
 def _changed_since(before: Plant, poller: ChangingPlant) -> dict[str, int]:
-    """Return the drives that are polled in another way than before, and since when."""
+    """Return the drives that are polled differently than before, with the time of the change (ns)."""
     known = _drives(before)
     since_ns = poller.polled_since
     return {
@@ -74,7 +74,7 @@ def _drives(plant: Plant) -> dict[str, PolledDrive]:
 
 
 def _is_as_before(known: PolledDrive | None, polled: PolledDrive) -> bool:
-    """Return True where the same registers are read at the same place: what they say is described alike."""
+    """Return True if family, address and polled registers are the same, so that rows mean the same."""
     if known is None or type(known.drive) is not type(polled.drive):
         return False
     return known.drive.address == polled.drive.address and known.polls == polled.polls

@@ -23,9 +23,9 @@ class RecentStatistics:
     def __init__(self, plant: Plant) -> None:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
-        self._minute: dict[str, LineStatistics | None] = {}  # of each line over the last minute
-        self._due = 0.0  # when they are refreshed
-        self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
+        self._minute: dict[str, LineStatistics | None] = {}  # by line: statistics over the last minute
+        self._due = 0.0  # when the figures of the last minute are refreshed
+        self._drives: dict[str, dict[str, Any]] = {}  # by drive: figures of the last minute
         self._figures: dict[str, dict[str, Any]] = {}  # by line, from the newest reading
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # few, because a reading is large
         self._hours: dict[str, deque[dict[str, Any]]] = {}  # figures of whole minutes by line
@@ -33,7 +33,7 @@ class RecentStatistics:
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Use the plan of another plant, and forget readings of lines whose counters start again."""
+        """Use another plant, and forget the readings of lines whose counters start again."""
         before, self._lines = self._lines, {line.name: line for line in plant.lines}
         goes_on = {
             name for name, line in self._lines.items() if name in before and _counts_on(before[name], line)
@@ -70,7 +70,7 @@ class RecentStatistics:
         self._figures = {line: self._line_figures(line, minute) for line, minute in self._minute.items()}
 
     def line(self, name: str) -> dict[str, Any]:
-        """Return a line's measured and planned use, its rate, and the last minute's misses."""
+        """Return a line's measured and planned use, its rate, and the last minute's delay and misses."""
         return self._figures.get(name) or self._line_figures(name, None)
 
     def _line_figures(self, name: str, minute: LineStatistics | None) -> dict[str, Any]:
@@ -98,7 +98,7 @@ class RecentStatistics:
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:
-        """Return a line's statistics over one to two minutes."""
+        """Return a line's statistics over the last one to two minutes; None without an earlier reading."""
         earlier = self._minutes[max(-2, -len(self._minutes))][1] if self._minutes else {}
         return self._since(earlier, line)
 
@@ -114,7 +114,7 @@ class RecentStatistics:
         return found.drives.get(name) if found else None
 
     def hour(self, line: str) -> list[dict[str, Any]]:
-        """Return the requested values, and misses by reason, of each of the last 60 minutes, oldest first."""
+        """Return how many values were requested and missed in each of the last 60 minutes, oldest first."""
         return [*self._hours.get(line, ()), *self._this_minute(line)][-MINUTES:]
 
     def _this_minute(self, line: str) -> list[dict[str, Any]]:

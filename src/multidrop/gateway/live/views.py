@@ -153,7 +153,7 @@ def failing_lines_of(gateway: Gateway) -> dict[str, str]:
 
 
 def audit_trouble_of(gateway: Gateway) -> str:
-    """Return why the newest write of a line is not in the audit log; "" if it is."""
+    """Return why the audit log lacks the newest write of some line; "" if it lacks none."""
     if gateway.unaudited:
         return gateway.unaudited
     poller = gateway.poller

@@ -23,23 +23,23 @@ from multidrop.gateway.modbus_server.protocol import (
 )
 from multidrop.supervisor import supervisor
 
-SLICE = 64  # requests of a client answered before others have their turn,
-SLICE_S = 0.002  # or this time,
-ROUND_S = 0.004  # or its share of this time among busy clients: a stop waits for one round
+SLICE = 64  # one client's turn ends after this many requests,
+SLICE_S = 0.002  # or after this time,
+ROUND_S = 0.004  # or after its share of this time among busy clients: a stop waits for one round
 MOST_CLIENTS = 64  # per TCP port
 MOST_BEHIND = 1 << 18  # bytes of pending requests of one client
 MOST_UNTAKEN = 1 << 18  # bytes of answers that a client has not read
 MOST_UNDER_WAY = 16  # requests of one client waiting for lines
 IDLE_S = 300.0  # idle clients are closed after this time,
-FORGETTABLE_S = 10.0  # or after this, if a new client needs the place
+FORGETTABLE_S = 10.0  # or after this time if a new client needs the place
 STALLED_S = 10.0  # a client that reads none of its answers for this long is cut
 SWEEP_S = 1.0  # interval of checking all clients
 
 _log = logging.getLogger("multidrop.gateway")
 
 
-# The frame of the answer, at once or later; None closes the connection. A later answer is cancelled when the
-# client disconnects: shield work that must be finished.
+# The frame of the answer, or an awaitable of it; None closes the connection. A later answer is cancelled when
+# the client disconnects: shield work that must be finished.
 Answer = bytes | Awaitable[bytes] | None
 
 
@@ -55,7 +55,7 @@ class ModbusClient(asyncio.Protocol):
         self._waiting = bytearray()  # frames waiting for their turn
         self._under_way: set[asyncio.Future[bytes]] = set()
         self._is_draining = False
-        self._is_refused = False  # a request of it closes the connection
+        self._is_refused = False  # it sent a forbidden or invalid request: the connection closes
         self._has_ended = False  # the client has closed its sending side, and may still read
         self._has_lost_answers = False
         self._stalled_since: float | None = None
@@ -88,7 +88,7 @@ class ModbusClient(asyncio.Protocol):
         self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
-            asyncio.get_running_loop().call_soon(task.cancel)  # after each has started
+            asyncio.get_running_loop().call_soon(task.cancel)  # later, so that each task has started
 
     def data_received(self, data: bytes) -> None:
         if self._is_refused:
@@ -177,7 +177,7 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._waiting) and self._stalled_since is None
 
     def _answered(self, request: MbapRequest) -> bytes:
-        """Return the answer to a request if it is known at once; b"" otherwise."""
+        """Return the answer to a request if it is known immediately; b"" otherwise."""
         answer = self._port.serve(request, self)
         if isinstance(answer, bytes):
             return answer
@@ -223,12 +223,12 @@ class ModbusClient(asyncio.Protocol):
             self.transport.close()
 
     def abort(self) -> None:
-        """Close this connection at once."""
+        """Close this connection immediately."""
         if self.transport is not None:
             self.transport.abort()
 
     def stalled_for(self, now: float) -> float:
-        """Return for how many seconds it has read none of its answers."""
+        """Return for how many seconds this client has read none of its answers."""
         return 0.0 if self._stalled_since is None else now - self._stalled_since
 
 
@@ -318,7 +318,7 @@ class ModbusPort:
                 client.close()
 
     def close(self) -> None:
-        """Stop listening, and close all connections at once."""
+        """Stop listening, and close all connections immediately."""
         if self._server is not None:
             self._server.close()
         for client in list(self.clients):

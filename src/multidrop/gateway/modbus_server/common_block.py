@@ -32,7 +32,7 @@ class CommonSource(Protocol):
 
 
 class CommonBlock:
-    """The block of one drive; its words are made on request."""
+    """The common block of one drive; its words are computed on request."""
 
     def __init__(self, polled: PolledDrive) -> None:
         self._name = polled.drive.name
@@ -63,7 +63,7 @@ class CommonBlock:
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: CommonSource, now_ns: int, woke_ns: int, state: str) -> int:
-        """Return the drive's own number of its present fault."""
+        """Return the number that the drive's family gives the present fault, or a constant from above."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
@@ -72,11 +72,11 @@ class CommonBlock:
         return int(value)
 
     def _age(self, hub: CommonSource, now_ns: int, woke_ns: int) -> int:
-        """Return the ms since the request of the drive's newest value."""
+        """Return the time since the drive's newest value was requested, in ms."""
         newest = hub.answered_ns(self._name)
         if newest is None:
             return NEVER
-        if newest < woke_ns:  # the time asleep is unknown here
+        if newest < woke_ns:  # requested before a sleep of unknown length
             return LONGEST_AGE
         return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
 

@@ -1,7 +1,7 @@
 """LineShare: the share of a line's time that clients of the Modbus server may use.
 
-Reads that the cache lacks are sent to the drive one at a time, ahead of polling, for a fifth of the line's
-time at most. The time is measured, so a silent drive uses up its clients' share.
+Reads that polled rows cannot answer are sent to the drive one at a time, before polls, for a fifth of the
+line's time at most. The time is measured, so a silent drive uses up its clients' share.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # of a line's time
-BURST_S = 0.2  # line time available at once after a pause
+BURST_S = 0.2  # line time available without waiting after a pause
 MOST_WAITING = 8  # waiting requests per line
 EXPIRY_S = 1.0  # a waiting request is dropped after this time
 
 
 class PassingBusy(Exception):
-    """A dropped request: the queue is full, or its turn did not come in time."""
+    """A request was dropped: the queue was full, or the line was not free in time."""
 
 
 @dataclass(eq=False)
@@ -34,24 +34,24 @@ class _WaitingAsk:
 
 
 class LineShare:
-    """The requests of all clients to one line: one at a time, in order, within a share of its time."""
+    """Sends all clients' requests on one line: one at a time, in order, within a share of the line's time."""
 
     def __init__(self, share: float = SHARE) -> None:
         self._loop = asyncio.get_running_loop()
         self._share = share
         self._waiting: list[_WaitingAsk] = []
         self._running: asyncio.Task[None] | None = None
-        self._left_s = BURST_S  # available line time; negative after a long request
+        self._left_s = BURST_S  # line time available now; negative after a long request
         self._filled = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self.used_s = 0.0  # line time so far
         self.asked = 0
 
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:
-        """Queue work, which receives the seconds until its expiry; the future has its result.
+        """Queue work, and return a future of its result; `work` is called with the seconds until its expiry.
 
-        Raises PassingBusy, directly or in the future, if its turn does not come. If the queue is full, the
-        client with the most waiting requests loses its last one to a client with fewer.
+        Raises PassingBusy, directly or in the future, if the work is dropped. If the queue is full, the last
+        request of the client with the most waiting requests is dropped for a client with fewer.
         """
         if len(self._waiting) >= MOST_WAITING:
             self._make_place(client)
@@ -111,7 +111,7 @@ class LineShare:
         self._filled = now
 
     async def _run(self, asked: _WaitingAsk) -> None:
-        """Carry a request out, also if its client disconnects: the line is in use until its end."""
+        """Carry out a request, even if its client disconnects: the line is in use until the request ends."""
         begun = self._loop.time()
         try:
             result = await asked.work(asked.expires - begun)

@@ -37,7 +37,7 @@ _FUNCTION = _HEADER.size  # offset of the function code
 
 
 class Garbage(ValueError):
-    """Bytes that cannot be a header of Modbus TCP."""
+    """Received bytes that are not a valid header of Modbus TCP."""
 
 
 class MbapRequest(NamedTuple):
@@ -88,7 +88,7 @@ def request_of(frame: bytes) -> MbapRequest:
 
 
 def take_request(buffer: bytearray) -> MbapRequest | None:
-    """Remove the first request from the buffer and return it; None if it is incomplete. Raises Garbage."""
+    """Remove the first request from the buffer and return it; None if incomplete. Raises as `take_frame`."""
     frame = take_frame(buffer)
     return None if frame is None else request_of(frame)
 
@@ -107,14 +107,14 @@ class ModbusCode(IntEnum):
 
 
 class Declined(Exception):
-    """A request to be answered with an exception code."""
+    """Raised for a request that must be answered with this exception code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code:02X}H")
         self.code = code
 
 
-# The first matching type decides the code.
+# Exception codes by type of the error; the first matching type decides.
 _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (PassingBusy, ModbusCode.BUSY),
     (Expired, ModbusCode.BUSY),
@@ -129,7 +129,7 @@ _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (NotVerified, ModbusCode.DEVICE_FAILURE),
     (ValueError, ModbusCode.ILLEGAL_VALUE),
 )
-# Codes of refusals, by rule.
+# Exception codes of a WriteForbidden, by its rule.
 _RULES: Mapping[str, ModbusCode] = {
     NOT_ALLOWED: ModbusCode.ILLEGAL_FUNCTION,
     NOT_LISTED: ModbusCode.ILLEGAL_ADDRESS,
@@ -148,8 +148,8 @@ def code_of(error: BaseException | None) -> int:
     return next((code for kind, code in _CODES if isinstance(error, kind)), ModbusCode.DEVICE_FAILURE)
 
 
-MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}  # in one request: 6.1 to 6.4
-MOST_WRITTEN = {0x0F: 1968, 0x10: 123}  # the same: 6.11 and 6.12
+MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}  # limit of one request, by function: sections 6.1 to 6.4
+MOST_WRITTEN = {0x0F: 1968, 0x10: 123}  # limit of one request, by function: sections 6.11 and 6.12
 ADDRESSES = 0x10000
 
 

@@ -149,7 +149,7 @@ class ModbusServer:
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
-        """Answer a request, at once or later; None for a broadcast, which is forbidden."""
+        """Return the answer to a request, or an awaitable of it; None for a broadcast, which is forbidden."""
         if request.unit == 0:
             self.answered["broadcast"] += 1
             return None
@@ -167,7 +167,7 @@ class ModbusServer:
         return request.exception(code)
 
     async def _later(self, request: MbapRequest, task: asyncio.Task[int], wait_s: float | None) -> bytes:
-        """Return the answer to a command, which continues even if its client disconnects."""
+        """Return the answer to a command, or "acknowledge" after `wait_s`; the command continues anyway."""
         done, _ = await asyncio.wait([task], timeout=wait_s)
         code = task.result() if done else ModbusCode.ACKNOWLEDGE  # still in progress
         return self._exception(request, code) if code else request.reply(request.data[:4])
@@ -210,7 +210,7 @@ class ModbusServer:
         if passing == "declared" and not unit.is_declared(request.function, addresses):
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "off" or self._hub.state(unit.drive.name) == "silent":
-            raise Declined(ModbusCode.NO_RESPONSE)  # polling notices when it answers again
+            raise Declined(ModbusCode.NO_RESPONSE)  # polling notices when the drive answers again
         if client.is_full:
             raise Declined(ModbusCode.BUSY)
         share = self._shares.get(unit.line)
@@ -277,7 +277,7 @@ class ModbusServer:
         return self._later(request, self._begin_stop(unit, client), STOP_WAIT_S)
 
     def _begin_stop(self, unit: Unit, client: ModbusClient) -> asyncio.Task[int]:
-        """Start a stop at once. Raises Declined if MOST_STOPS of this drive are in progress."""
+        """Start a stop immediately. Raises Declined if MOST_STOPS of this drive are in progress."""
         self.answered["stop"] += 1
         name = unit.drive.name
         under_way = self._stops.setdefault(name, set())

@@ -20,11 +20,11 @@ class ModbusSettings:
     """The settings of the Modbus server. Raises ValueError with a line for each mistake."""
 
     listen: str = "127.0.0.1:1502"
-    passing: str = "declared"  # reads passed on to a drive if the cache lacks them
+    passing: str = "declared"  # which reads go to the drive if polled rows cannot answer them
     units: Mapping[str, int] = field(default_factory=dict)  # unit ids by drive; default: its address
-    ports: Mapping[str, int] = field(default_factory=dict)  # TCP ports by line; default: that of `listen`
+    ports: Mapping[str, int] = field(default_factory=dict)  # TCP ports by line; default: the port of `listen`
     may: str = "look"  # the role of all clients, because Modbus has no tokens
-    clients: Sequence[str] = ()  # allowed addresses and networks; empty: this machine only
+    clients: Sequence[str] = ()  # allowed addresses and networks; empty: only this computer
     common: int = 0xF000  # address of the common block
 
     def __post_init__(self) -> None:
@@ -33,7 +33,7 @@ class ModbusSettings:
             raise ValueError("\n".join(wrong))
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each mistake regarding this plant."""
+        """Return a sentence for each mistake that the plant shows, such as two drives with one unit id."""
         try:
             Units(plant, self)
         except ValueError as mistakes:

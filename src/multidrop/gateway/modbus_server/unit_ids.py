@@ -36,7 +36,7 @@ class Unit:
         self.words = DriveWords(polled)
         self.common = CommonBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
-        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # by function; 0: by none
+        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # by function; 0: unreadable
         self._gaps: list[tuple[int, range]] = []
         self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
         for register in self.drive.registers.values():
@@ -69,7 +69,7 @@ class Unit:
         return self._writable.get((carrier, address))
 
     def has_stop_in(self, written: WriteRequest, common_stop: int) -> bool:
-        """Return True if a request writes a stop: one of the drive's, or that of the common block."""
+        """Return True if a request writes a stop: to a register of the drive, or in the common block."""
         carrier, start, size, data = written
         for at in range(size):
             if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
@@ -82,7 +82,7 @@ class Unit:
         return False
 
     def holding_addresses(self) -> set[int]:
-        """Return the addresses of all words of the family."""
+        """Return the addresses of all words that the drive's registers and texts use."""
         written = {
             at
             for register in self.drive.registers.values()
@@ -95,8 +95,8 @@ class Unit:
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
     """Yield the first write of each stop verb of the family.
 
-    Other counts that the register declares harmless are included, such as YD1000's 8000H, but not 0, which
-    may be no command.
+    Also yield other counts that the register declares harmless, such as YD1000's 8000H. Omit 0, which may
+    mean that there is no command.
     """
     for name in _STOPS:
         try:
@@ -107,12 +107,12 @@ def _stop_writes(drive: Any) -> Iterator[StopWrite]:
             if isinstance(register, Register) and value is not None:
                 counts = {register.encode(value), *filter(None, register.harmless or ())}
                 yield from (StopWrite(register.name, raw) for raw in counts)
-        except Exception:  # a family without this verb, or one whose script needs a bus
+        except Exception:  # the family has no such verb, or its script needs a bus
             continue
 
 
 class UnitSettings(Protocol):
-    """The settings that units use."""
+    """The settings that `Units` uses."""
 
     @property
     def units(self) -> Mapping[str, int]: ...
@@ -125,8 +125,8 @@ class UnitSettings(Protocol):
 class Units:
     """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
 
-    A line with its own port is reached only there. Raises ValueError with a line for each mistake: unit ids
-    of two drives, or unknown names in the settings.
+    A line with its own port is reached only there. Raises ValueError with a sentence per line for each
+    mistake, such as a unit id of two drives, or an unknown name in the settings.
     """
 
     def __init__(self, plant: Plant, settings: UnitSettings) -> None:
@@ -162,7 +162,7 @@ def _by_port(plant: Plant, settings: UnitSettings) -> Mapping[str, Mapping[int, 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
     """Yield a sentence for each duplicate or invalid unit id, and one with the free ids."""
     where = "" if port == MAIN else f" on the port of line {port}"
-    wrong: list[str] = []  # drives
+    wrong: list[str] = []  # names of drives
     for number, found in sorted(units.items()):
         names = " and ".join(f"{unit.drive.name} (line {unit.line})" for unit in found)
         if not 1 <= number <= LAST_UNIT:

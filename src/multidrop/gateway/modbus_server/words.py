@@ -1,9 +1,10 @@
 """DriveWords: the words that a drive sent, computed from polled values.
 
-Rows have values in units and Modbus clients expect the drive's raw words. Batches have no raw words: they
-would cost every row 8 bytes. A word is computed only if it is certain: packing the value's count and decoding
-it again must give the value, and the neighbouring counts must not. Uncertain are parts of a word, registers
-with a scale register, `I8` and `U32_EITHER`, which leave bits open, and a float's zero, which has two signs.
+Rows have values in units, but Modbus clients expect the drive's raw words. Batches have no raw words, because
+these would cost 8 bytes per row. A word is computed only if it is certain: packing the value's count and
+decoding it again must give the value, and the neighbouring counts must give other values. Uncertain are
+registers that are part of a word or have a scale register, `I8` and `U32_EITHER`, which leave bits open, and
+a float's zero, which has two signs.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ _FLOATS = {
     NumberFormat.F64: (">d", ">Q"),
 }
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
-MOST_KNOWN = 8192  # cached values: drives of a family share their registers
-_MOST_EXACT = 1 << 53  # a float64 holds every whole number up to here
+MOST_KNOWN = 8192  # cached values; drives of a family share their registers
+_MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 
 
@@ -48,7 +49,7 @@ class NewestRow(Protocol):
 
 
 class Lack(Enum):
-    """The reason why a range is not in the cache."""
+    """The reason why a range cannot be answered from polled rows."""
 
     UNPOLLED = "not polled, or the words are uncertain"
     STALE = "polled, but the newest row is a miss or old"
@@ -81,7 +82,7 @@ def exact_data(register: Register[Any], value: float) -> bytes | None:
         near = _neighbours(raw, coding.number_format)
         if any(float(coding.value_of(other)) == value for other in near):
             return None
-    except (ArithmeticError, ValueError, struct.error):  # no count has this value
+    except (ArithmeticError, ValueError, struct.error):  # this value has no count
         return None
     return data
 
@@ -184,7 +185,7 @@ class DriveWords:
 
 
 def _newest_word(found: list[tuple[NewestRow | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
-    """Return the word of the newest row; several registers may share an address."""
+    """Return the word from the newest of the rows of registers that share an address."""
     lack = Lack.STALE
     for row, place, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
         word = place.word(row, at, now_ns, since_ns)

@@ -16,7 +16,7 @@ from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
 MOST_UNDER_WAY = 64  # unacknowledged messages: enough for the drives of two lines
-MOST_WAITING = 4096  # topics, more than any plant has
+MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant has so many
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 PORTS = {"mqtt": 1883, "mqtts": 8883}
@@ -66,7 +66,7 @@ class Outbox:
             topic = next(iter(self._waiting))
             try:
                 number = self._send(self._waiting[topic])
-            except Exception as failure:  # no broker takes this one; all others are sent
+            except Exception as failure:  # drop this message, which no broker accepts, and send the others
                 del self._waiting[topic]
                 self.dropped += 1
                 _log.warning("the message on %.100r cannot be sent: %r", topic, failure)
@@ -129,7 +129,7 @@ class Login(NamedTuple):
 
 
 class Speaker(Protocol):
-    """The user of a connection, which sends and receives its messages. Called in the loop."""
+    """A format of messages, such as JsonTopics, on one connection. Its methods are called in the loop."""
 
     def will(self) -> Publication:
         """Return the message that the broker publishes when this connection breaks."""
@@ -141,7 +141,7 @@ class Speaker(Protocol):
         """Send the first messages of a new connection."""
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
-        """Take a message."""
+        """Handle a received message."""
 
     def publish(self) -> None:
         """Send new values."""
@@ -200,7 +200,7 @@ class Broker:
             await asyncio.sleep(0.01)
         self._loop = None
         self._client.disconnect()
-        with suppress(Hung):  # its daemon thread may wait for a name server
+        with suppress(Hung):  # paho's daemon thread may wait for a name server
             await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
         self.is_connected = False
         self._client = None  # frees the sockets by which paho wakes its thread
@@ -300,7 +300,7 @@ class Broker:
 
     def _on_publish(self, _client: Any, _data: Any, number: int, *_more: Any) -> None:
         self._arrived.append(number)
-        if len(self._arrived) == 1:  # else the loop has been woken: they arrive in bursts
+        if len(self._arrived) == 1:  # otherwise the loop was woken already: acknowledgements arrive in bursts
             self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:

@@ -1,7 +1,8 @@
 """BrokerCommands: check commands from a broker, which may delay, keep and duplicate them.
 
 A write or a verb is carried out only if it was sent within the last seconds, after the latest stop of its
-drive and the latest reload of the plant, and did not come before. A verb that stops is always carried out.
+drive and the latest reload of the plant, and is not a copy. A verb that stops the motor is always carried
+out.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
-MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a suspended broker delivers all of them at its end
-MOST_AHEAD_MS = 2_000  # tolerance for a fast clock of the sender
-MOST_UNDER_WAY = 16  # without stops
-REMEMBERED = 1_000
+MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that was suspended delivers all delayed messages together
+MOST_AHEAD_MS = 2_000  # tolerance for a sender's clock that is ahead
+MOST_UNDER_WAY = 16  # concurrent commands; stops are not counted
+REMEMBERED = 1_000  # newest commands, to recognise copies
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 Report = Callable[[str, str, CommandResult], None]  # the drive, the command's text, and its result
@@ -46,7 +47,7 @@ class BrokerCommands:
         self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
 
     def write(self, drive: str, register: str, value: float, time_ms: int) -> None:
-        """Write a register if the command is fresh."""
+        """Write a register if the command is recent enough (see above); else report why not."""
         what = f"{register} = {value!r}"
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, stopped_ns):
@@ -54,7 +55,7 @@ class BrokerCommands:
             self._begin(self._counted(self._do(drive, what, work)))
 
     def act(self, drive: str, verb: str, options: Mapping[str, object], time_ms: int) -> None:
-        """Carry out a verb if the command is fresh."""
+        """Carry out a verb if the command is recent enough (see above); else report why not."""
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, stopped_ns):
             work = self._commands.act(drive, verb, options, self._caller)
@@ -67,7 +68,7 @@ class BrokerCommands:
 
     @staticmethod
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
-        """Return True if a command may be older than that time, as the sender's clock may be fast."""
+        """Return True if a command may have been sent before this time: the sender's clock may be ahead."""
         if at_ns is None:
             return False
         return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
@@ -87,7 +88,7 @@ class BrokerCommands:
             self.refuse(drive, what, f"{MOST_UNDER_WAY} others are under way")
         else:
             self._came.append(command)
-            self._under_way += 1  # before its task runs, as a broker may deliver many at once
+            self._under_way += 1  # now, not in its task: a broker may deliver many together
             return True
         return False
 

@@ -1,6 +1,6 @@
-"""Home Assistant's discovery messages (homeassistant/device/ID/config), one for each drive. Pure.
+"""Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive. Pure.
 
-Each component has its own state topic: one for the device would apply to its numbers and buttons too.
+Each component names its state topic: one of the device would apply to its numbers and buttons too.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from multidrop.gateway.live.descriptions import digits_of
 from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN
 
 DISCOVERY = "homeassistant"
-CLASSES = {  # device_class of a unit
+CLASSES = {  # Home Assistant's device_class by unit
     "Hz": "frequency",
     "A": "current",
     "V": "voltage",
@@ -29,9 +29,9 @@ CLASSES = {  # device_class of a unit
     "s": "duration",
 }
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
-OWN = ("problem", "running", "set", "value")  # suffixes of ids with another meaning than a register
-MOST = 1e12  # limit of a number whose register has no range
-LEAST_STEP = 0.001  # the smallest that Home Assistant accepts
+OWN = ("problem", "running", "set", "value")  # suffixes of ids that do not mean a register
+MOST = 1e12  # limit of the range of a number
+LEAST_STEP = 0.001  # smallest step of a number that Home Assistant accepts
 STALE_PERIODS = 3  # a sensor is unavailable after this many periods
 # Commands carry the time of Home Assistant's clock: the gateway refuses delayed ones.
 COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | int }}}}}}'
@@ -73,7 +73,7 @@ def discovery(
     name = object_id(prefix, drive.name)
     polled = list(polled)
     from_state = {"state_topic": topics["state"]}
-    fresh = from_state | {"expire_after": max(2, round(STALE_PERIODS * every_s))}  # s; then unavailable
+    fresh = from_state | {"expire_after": max(2, round(STALE_PERIODS * every_s))}  # s
     parts: dict[str, Any] = {"state": _state(name) | fresh}
     parts |= {end: _binary(name, end, truth) | fresh for end, truth in BINARY.items()}
     for register in polled:
@@ -108,7 +108,7 @@ def discovery(
     ).encode()
 
 
-# The value of each binary sensor by state; unknown in all other states.
+# The value of each binary sensor by the drive's state; unknown in all other states.
 BINARY = {
     "problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"},
     "running": {RUNS: "ON", STANDS: "OFF"},
@@ -199,7 +199,7 @@ def _value_template(register: Register[Any]) -> str:
 
 
 def _span(register: Register[Any]) -> tuple[float, float]:
-    """Return the range of a register; without one Home Assistant assumes 1 to 100."""
+    """Return the range of a register; if a message has none, Home Assistant assumes 1 to 100."""
     if register.span is not None:
         return register.span
     coding = register.coding

@@ -1,4 +1,4 @@
-"""JSON topics: PREFIX/DRIVE has a drive's newest values, null for one that is not fresh.
+"""JSON topics: PREFIX/DRIVE has a drive's newest values, null for each that is not fresh.
 
 PREFIX/DRIVE/available and PREFIX/gateway have "online" or "offline"; PREFIX/DRIVE/told has results of
 commands.
@@ -45,8 +45,8 @@ class KeptTopic(NamedTuple):
 class RetainedTopics:
     """Finds retained messages of removed drives.
 
-    They remain after a gateway was killed, if its plant file has lost a drive since. Only topics of the own
-    prefix are returned, and only a limited number, whatever the broker sends.
+    Such messages remain if a gateway is killed, and a drive is removed from its plant file before the next
+    start. Only topics of the own prefix are returned, and only a limited number, whatever the broker sends.
     """
 
     def __init__(self, prefix: str, *, home_assistant: bool) -> None:
@@ -66,7 +66,7 @@ class RetainedTopics:
         return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
 
     def hear(self, topic: str, payload: bytes, there: Collection[str]) -> list[str]:
-        """Take a retained message; return the topics to delete now. `there` are the present drives."""
+        """Process a retained message; return the topics to delete now. `there` holds the plant's drives."""
         if topic == f"{self._prefix}/gateway":
             self._is_alone = payload == OFFLINE
         elif self._looked_at < MOST_KEPT:
@@ -77,7 +77,7 @@ class RetainedTopics:
         return [one.topic for one in found if one.drive not in there]
 
     def _topics_of(self, topic: str, payload: bytes, there: Collection[str]) -> list[KeptTopic]:
-        """Return the topics of a removed drive that a message shows."""
+        """Return the topics to delete if this message belongs to a removed drive."""
         if payload in (ONLINE, OFFLINE):
             drive = self._drive_in(topic.removesuffix("/available"))
             if drive is None or drive in there or topic != f"{self._prefix}/{drive}/available":
@@ -125,7 +125,7 @@ class JsonTopics:
         self._plant = context.plant
         self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
-        self._left: set[str] = set()  # removed drives, whose retained messages are to be deleted
+        self._left: set[str] = set()  # removed drives whose retained messages must be deleted
         self._retained_topics = RetainedTopics(settings.prefix, home_assistant=settings.home_assistant)
 
     def _topic(self, *levels: str) -> str:
@@ -136,7 +136,7 @@ class JsonTopics:
         """Return a retained message."""
         return Publication(topic, lambda: payload, is_retained=True)
 
-    # ---- a speaker ----
+    # ---- the methods of Speaker ----
 
     def will(self) -> Publication:
         return self._kept(self._topic("gateway"), OFFLINE)
@@ -152,7 +152,7 @@ class JsonTopics:
         self._available.clear()
         self._retained_topics.begin()
         self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
-        self._take_back()  # the previous connection may have broken before
+        self._take_back()  # the previous connection may have broken before the broker got these deletions
         if self._settings.home_assistant:
             for drive in self._hub.drives:
                 self._discover(drive)
@@ -190,7 +190,7 @@ class JsonTopics:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
                     self._orders.stop_by(one, given["verb"], {})  # wrong options must not prevent a stop
-            elif is_retained:  # it would arrive on every connection
+            elif is_retained:  # it would be carried out again on every connection
                 kept = "it was retained; publish it without retain"
                 self._orders.refuse(drive, "/".join(what), kept)
             elif what[0] == "set":

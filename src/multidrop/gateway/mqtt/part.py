@@ -1,4 +1,4 @@
-"""The part `mqtt`: publishes values to a broker, and takes commands from it if the plant file allows."""
+"""The part `mqtt`: publishes values to a broker, and accepts its commands if the plant file allows them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def build(settings: MqttSettings, context: PartContext) -> Mqtt:
 
 
 class Mqtt:
-    """The speakers of MQTT, each with its own connection because a connection has only one will."""
+    """The formats (`Speaker`), each with its own connection because a connection has only one will."""
 
     def __init__(self, settings: MqttSettings, context: PartContext, speakers: list[Any]) -> None:
         address, login = parse_broker(settings.broker), settings.login(context.plant)

@@ -27,7 +27,7 @@ class MqttSettings:
 
     broker: str = "mqtt://localhost:1883"
     prefix: str = "multidrop"
-    every: str = "1 s"  # between two messages of a drive
+    every: str = "1 s"  # time between two messages of a drive
     user: str = ""
     password: str = ""  # path of a file
     authorities: str = ""  # path of a file of certificates that verify a broker of mqtts://
@@ -92,7 +92,7 @@ class MqttSettings:
                 for name in names
                 if not LEVEL.fullmatch(name)
             ]
-            + [mistake for mistake in map(_reserved, names) if mistake]  # unchecked if the plant has no file
+            + [mistake for mistake in map(_reserved, names) if mistake]  # unchecked in a plant without a file
             + [
                 f'the plant file\'s name {plant.path.stem!r} cannot be an edge node; add node = "hall-1"'
                 for _ in self.sparkplug[:1]
@@ -129,7 +129,7 @@ def _beside(plant: Plant, name: str) -> Path:
 
 
 def shown(register: Register[Any], value: float) -> float | str:
-    """Return a number, or the name of a choice."""
+    """Return a register's value as published: a number, or the name of a choice."""
     return value if register.values is None else register.format(register.decode(value))
 
 

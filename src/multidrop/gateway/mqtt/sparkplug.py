@@ -1,6 +1,6 @@
 """Sparkplug B: payloads of an edge node and its devices, in Protocol Buffers' wire format.
 
-Eclipse Sparkplug specification 3.0.0, sections 6.4 (payloads) and 5 (birth, death, rebirth). Pure: bytes.
+Source: Eclipse Sparkplug specification 3.0.0, sections 6.4 (payloads) and 5 (birth, death, rebirth). Pure.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ REBIRTH = "Node Control/Rebirth"
 BIRTH_DEATH = "bdSeq"
 SEQUENCES = 256  # seq and bdSeq count from 0 to 255 and start again
 
-# Payload's and Metric's fields (section 6.4.1)
+# Field numbers of Payload and Metric (section 6.4.1).
 _TIMESTAMP, _METRICS, _SEQ = 1, 2, 3
 _NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_NULL, _PROPERTIES = 1, 2, 3, 4, 7, 9
 _INT, _LONG, _FLOAT, _DOUBLE, _BOOLEAN, _STRING = 10, 11, 12, 13, 14, 15
 
-# PropertySet's and PropertyValue's fields
+# Field numbers of PropertySet and PropertyValue.
 _KEYS, _VALUES = 1, 2
 _TYPE, _TEXT = 1, 8
 ENGINEERING_UNIT = "engUnit"  # the property that hosts show as a metric's unit
@@ -48,7 +48,7 @@ class Metric(NamedTuple):
     time_ms: int
     name: str = ""
     alias: int | None = None
-    unit: str = ""  # in a birth
+    unit: str = ""  # only in a birth
 
 
 class Given(NamedTuple):

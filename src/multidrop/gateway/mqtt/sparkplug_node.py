@@ -48,14 +48,14 @@ class SparkplugNode:
         self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
         self._birth = -1  # bdSeq
         self._seq = 0
-        self._said: dict[str, dict[str, Value]] = {}  # last values by born drive
+        self._said: dict[str, dict[str, Value]] = {}  # last values of drives whose birth was sent
         self._changed: dict[str, dict[str, Value]] = {}
         self._aliases: dict[tuple[str, str], int] = {}
 
     def _topic(self, kind: str, *device: str) -> str:
         return "/".join((NAMESPACE, self._settings.sparkplug, kind, self._node, *device))
 
-    # ---- a speaker ----
+    # ---- the methods of Speaker ----
 
     def will(self) -> Publication:
         self._birth = (self._birth + 1) % SEQUENCES
