@@ -97,8 +97,8 @@ class Commands:
         self._jogging: Counter[str] = Counter()  # by drive: jogs under way
         self._lines = lines
         self.called = 0  # commands that passed all rights, so far
-        self._under_way: Counter[str] = Counter()  # by line: writes
-        self.stops: Counter[str] = Counter()  # by drive: stops called
+        self._under_way: Counter[str] = Counter()  # by line: writes in progress
+        self.stops: Counter[str] = Counter()  # by drive: number of stops called
         self._stopped_ns: dict[str, int] = {}  # by drive: when the latest stop was called
         self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
@@ -138,7 +138,8 @@ class Commands:
         """Stop these drives, or all with None; return the result of each.
 
         The stops of all lines and drives run side by side, and one failure does not end the others. Only the
-        caller's role is checked. If a reload changes a drive meanwhile, its new configuration is stopped too.
+        caller's role is checked. If a reload changes a drive during its stop, the
+        drive is stopped again under its new configuration.
         """
         if caller.role < Right.STOP:
             wanted = drives_of(self._lines.plant) if drives is None else drives

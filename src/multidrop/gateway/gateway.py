@@ -79,7 +79,7 @@ class Gateway:
         self._looked = 0.0
         self._has_news = False  # a frame is due
         self.ledger = ledger or Ledger()
-        self.poller: Poller | None = None  # while polling
+        self.poller: Poller | None = None  # None before polling starts
         self._made: Poller | None = None  # the same object, set before it polls
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)

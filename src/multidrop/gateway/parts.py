@@ -196,7 +196,7 @@ class LiveParts:
         return built
 
     async def _start_when_built(self, name: str, building: Building) -> None:
-        """Start a part when its files have answered, unless it was dropped meanwhile."""
+        """Start a part when its files have answered, unless it was dropped before."""
         await asyncio.wait([building.part])
         if self.pending.get(name) is not building:
             return

@@ -56,7 +56,7 @@ class CommandDesk:
         self.offers = Offers(clock)
         self._lines = lines
         self._log = log
-        self._under_way: dict[str, int] = {}  # by line
+        self._under_way: dict[str, int] = {}  # number of commands in progress, by line
 
     # ---- offering a command ----
 

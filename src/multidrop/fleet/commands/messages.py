@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from multidrop.control import CommandOutcome as CommandOutcome
 from multidrop.control import CommandResult, with_name
 
-MOST_BYTES = 64 * 1024  # of a request
-MOST_CHARACTERS = 200  # of a name, an id or a value's text
+MOST_BYTES = 64 * 1024  # limit of a message
+MOST_CHARACTERS = 200  # limit of a name, an id or a value's text
 UNNAMED = "somebody"  # sender of a stop without a name
 
 

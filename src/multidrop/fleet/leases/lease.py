@@ -72,7 +72,7 @@ class Lease:
         self.session = 0  # number of the present session; 0: none
         self.until = 0
         self.trouble = ""  # why the session cannot start
-        self.began_ms = 0  # UTC
+        self.began_ms = 0  # start of the session, UTC in ms
         self.held: list[Held | None] = [None] * len(buckets)
         self._buckets = buckets
         self._mastership = mastership

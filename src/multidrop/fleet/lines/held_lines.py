@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from multidrop import Bus, Drive
 
-LISTS = ("write", "verbs")  # of [fleet.may]
+LISTS = ("write", "verbs")  # keys of [fleet.may]
 
 
 class PolledBuses(Protocol):

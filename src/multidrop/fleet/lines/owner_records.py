@@ -30,7 +30,7 @@ from multidrop.fleet.servers.buckets import Record, WriteAnswers
 from multidrop.supervisor import end_tasks
 
 WRITERS = 2  # concurrent batches in each bucket
-LAG_NS = SECOND  # two renewals
+LAG_NS = SECOND  # two renewals; if our lease on a path lags by more, a bucket may have no leader
 SPARE_S = 0.15  # wait after the first bucket's answer before the spare one is used
 
 

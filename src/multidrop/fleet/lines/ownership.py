@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 NOBODY = ""
-NEEDED = 2  # votes
+NEEDED = 2  # votes of a master
 
 Owner = tuple[str, int]  # a gateway and its session
 LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: not read
@@ -41,7 +41,7 @@ class Claim(NamedTuple):
 class Step(NamedTuple):
     """The lines that a gateway should claim, and those that it should release."""
 
-    claims: dict[str, Claim]  # by line
+    claims: dict[str, Claim]  # the records to write, by line
     releases: set[str]
 
 

@@ -41,7 +41,7 @@ class FleetRecords:
             bucket: self._owner_follower(Bucket(bucket, path), partial(self._note_owner, bucket))
             for bucket in names.OWNERS
         }
-        self._of: dict[str, dict[str, Record | None]] = {}  # by line
+        self._of: dict[str, dict[str, Record | None]] = {}  # records of masters by line and bucket
         self._owned: dict[Owner, set[str]] = {}  # by session: lines with at least one record that names it
         self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the number of its turn
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
@@ -143,7 +143,7 @@ class FleetRecords:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
-ASKED_AT_ONCE = 500  # lines; servers allow 1024
+ASKED_AT_ONCE = 500  # lines in one read; servers allow 1024
 DOUBT_S = 30.0  # longer than an election, after which an unanswered write may still be stored
 
 

@@ -30,10 +30,10 @@ class SourceCheck:
     """Checks that no message of a log is missing or repeated; alarms are logged as errors and counted."""
 
     def __init__(self, last: Mapping[str, int]) -> None:
-        self.last = dict(last)  # by "gateway.log id"
+        self.last = dict(last)  # sequence of the last message, by "gateway.log id"
         self.alarms = 0
-        self.missing = 0  # messages
-        self.doubled = 0  # repeated messages, ignored
+        self.missing = 0  # number of missing messages
+        self.doubled = 0  # number of repeated messages, which are ignored
         self._lost: dict[str, int] = {}  # rows that each gateway has lost, as it reports
 
     def take(self, message: StreamMessage) -> bool:
@@ -64,10 +64,10 @@ class SourceCheck:
 
 MOST_READ = 64  # messages in one answer
 MOST_READ_BYTES = 8 << 20
-MOST_ROWS = 1_000_000  # of one commit: 50 MB
-MOST_BYTES = 256 << 20  # of one commit: messages and rows; one answer may exceed it
+MOST_ROWS = 1_000_000  # limit of one commit: 50 MB
+MOST_BYTES = 256 << 20  # limit of one commit, messages and rows; one answer may exceed it
 LOOKING_S = 0.2  # between reads without a new message
-AGAIN_S = 1.0  # after a failure
+AGAIN_S = 1.0  # pause after a failure
 BEHIND_S = 5.0  # how long to wait for a server that lacks messages of its leader
 
 T = TypeVar("T")
@@ -92,7 +92,7 @@ class Commit(NamedTuple):
     """Rows to store together with their position, or not at all."""
 
     stream: str  # identity of the stream
-    first: int  # positions in the stream
+    first: int  # position of the first message in the stream
     last: int
     sources: Mapping[str, int]
     tables: Sequence[Any]  # pyarrow.Table of message.ROWS; may be empty
@@ -125,12 +125,12 @@ async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
 class HubState(NamedTuple):
     """Positions in the stream, counts since the start, and the present problem or None."""
 
-    place: int  # of the last stored message
+    place: int  # position of the last stored message
     behind: int  # messages in the stream that are not stored
     rows: int
     alarms: int
-    missing: int  # messages
-    doubled: int  # repeated messages, ignored
+    missing: int  # number of missing messages
+    doubled: int  # number of repeated messages, which are ignored
     trouble: str | None
 
 

@@ -44,7 +44,7 @@ from multidrop.polling import BatchColumns
 
 LATEST = 4  # MetadataVersion.V5: older versions mark compressed buffers differently
 MOST_MESSAGES = 100  # Arrow messages in a stream: the schema, dictionaries and rows
-_DICTIONARY, _RECORD_BATCH = 2, 3  # MessageHeader
+_DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of messages: MessageHeader in Message.fbs
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # offset in the body, and length
 _NOT_COMPRESSED = -1  # marks a buffer that compression would not shrink

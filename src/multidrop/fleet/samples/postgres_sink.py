@@ -36,7 +36,7 @@ from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkErro
 HEAD = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 END = b"\xff\xff"
 EPOCH_US = 946_684_800_000_000  # 2000-01-01, the epoch of PostgreSQL
-FLOAT8, TEXT = 701, 25  # oids
+FLOAT8, TEXT = 701, 25  # oids of these types in PostgreSQL
 NULL = b"\xff\xff\xff\xff"
 PIECE = 1 << 18  # approximate bytes of a piece of a COPY
 _FIRST = Struct(">hiqiq")  # number of columns; then time and time_ns, each after its length

@@ -48,7 +48,7 @@ class StoredMessage(NamedTuple):
 
     sequence: int
     rows: int
-    size: int  # bytes
+    size: int  # in bytes
     path: Path
 
 
@@ -209,7 +209,7 @@ _log = logging.getLogger("multidrop.fleet.samples.spool")
 class SpoolState(NamedTuple):
     """The state of a spool. Rows are counted since the spool was opened."""
 
-    log: str  # id
+    log: str  # id of the log
     written: int  # rows that reached the disk
     lost: int  # rows dropped before they reached the disk, or removed before they were sent
     waiting: int  # rows in memory

@@ -43,9 +43,9 @@ class ServerPath:
     """One connection: to its home server while that one answers, otherwise to any other."""
 
     def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
-        self.urls = [masked(url) for url in urls]  # the first is home
-        self._full = dict(zip(self.urls, urls, strict=True))  # with users and passwords
-        self.url = ""  # of the present server
+        self.urls = [masked(url) for url in urls]  # the first is the home server
+        self._full = dict(zip(self.urls, urls, strict=True))  # the same URLs with users and passwords
+        self.url = ""  # URL of the present server
         self.others: Sequence[ServerPath] = ()  # the other paths of this process
         self.spare = Spare()  # shared by all paths of this process
         self._options = options or {}

@@ -173,7 +173,7 @@ async def _try(
     except ServerError:
         if asyncio.get_running_loop().time() > ends:
             raise
-        await asyncio.sleep(0.2)  # no leader yet, or in progress
+        await asyncio.sleep(0.2)  # there is no leader yet, or the change is in progress
     except NoRight:
         raise
     except FleetError as failure:

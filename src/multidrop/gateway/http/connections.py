@@ -32,7 +32,7 @@ ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
 STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may be a stop too
-BACKLOG = 64  # pending connections: all are accepted at once, before MOST_OPEN applies
+BACKLOG = 64  # pending connections; all are accepted together, before MOST_OPEN applies
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
     errno.EACCES: "this user has no permission",

@@ -144,8 +144,8 @@ class Tokens:
 class May(NamedTuple):
     """The table [serve.may]: the right of callers without a token, and which writes and verbs are allowed."""
 
-    look: str = "anyone"  # or "token"
-    on_loopback: Right = Right.LOOK  # without a token
+    look: str = "anyone"  # who may look: "anyone", or "token" for callers with a token
+    on_loopback: Right = Right.LOOK  # right of callers on this computer without a token
     write: frozenset[str] = frozenset()
     verbs: frozenset[str] = frozenset()
 

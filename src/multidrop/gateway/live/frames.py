@@ -275,7 +275,7 @@ class SeenFrames:
     def __init__(self, clock: Callable[[], int], stopped_ns: Callable[[str], int | None]) -> None:
         self.clock = clock
         self._stopped_ns = stopped_ns
-        self._made: dict[int, int] = {}  # time of each frame by number
+        self._made: dict[int, int] = {}  # when each frame was made (ns), by its number
         self._came: dict[int, set[object]] = {}  # commands admitted, by the frame that they named
         self._newest = -1
         self._newest_before = -1  # the last frame before the latest reload

@@ -27,7 +27,7 @@ from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
 OWN = (STATE, FAULT)  # metrics of every drive, as text
-REGISTERS = "registers/"  # prefix of registers with one of these names
+REGISTERS = "registers/"  # prefix of metrics of registers whose names are in OWN
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 Value = float | str | None
 
