@@ -41,7 +41,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
     port->must_take = must_take;
     port->turn.line.transactions = (uint8_t)transactions;
     port->is_watched = 1;
-    /* Make it raw before the first read: at VMIN 0 a terminal seems to have hung up. */
+    /* Make the port raw before the first read: with VMIN 0 a read returns 0, as after a hang-up. */
     struct md_settings settings;
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
         md_port_set(fd, &settings);
@@ -104,7 +104,7 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership)
     md_engine_enter(port->engine);
     __atomic_store_n(&mastership->engine, port->engine, __ATOMIC_SEQ_CST);
     port->mastership = mastership;
-    port->heard_term = 0; /* it may be another mastership's */
+    port->heard_term = 0; /* the stored term may belong to another mastership */
     md_engine_leave(port->engine);
 }
 
@@ -172,8 +172,8 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->turn.progress;
 }
 
-/* Return 1 if the thread serves the port by itself before the next request can leave, so that the client
- * need not wake it. While listening it must, because a stop does not wait for that. */
+/* Return 1 if the thread will serve the port before the next request can leave, so that the client need not
+ * wake the thread. Return 0 while the port listens, because a stop does not wait for the end of listening. */
 static int is_attended(const struct md_port *port)
 {
     if (port->turn.line.listened_ns)
@@ -215,5 +215,5 @@ void md_mastership_end(struct md_mastership *mastership)
         md_engine_enter(engine);
         md_engine_leave(engine);
     }
-    md_mastership_extend(mastership, 0, 0); /* call the timer off */
+    md_mastership_extend(mastership, 0, 0); /* disarm the timer */
 }

@@ -1,5 +1,5 @@
-/* Bodies of frames: the content of requests and replies in any framing, and whether a reply confirms its
- * request.
+/* Bodies of frames: read and write the content of requests and replies in any framing, and check whether a
+ * reply confirms its request.
  *
  * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is A
  * K P1 P0 D3 D2 D1 D0. */
@@ -18,8 +18,8 @@ enum layout {
 };
 
 static const struct fields {
-    uint8_t start, count, byte_count; /* 1: there is one */
-    uint8_t data_len;                 /* without a byte count */
+    uint8_t start, count, byte_count; /* 1: the layout has this field */
+    uint8_t data_len;                 /* data bytes of a layout without a byte count */
 } fields_of[] = {
     [RANGE] = {.start = 1, .count = 1},
     [DATA] = {.byte_count = 1},
@@ -37,7 +37,7 @@ static const struct function {
     uint8_t request, reply; /* enum layout */
     uint8_t unit_bits;      /* BIT or WORD: the unit of count */
     uint16_t most;          /* the largest count */
-    uint8_t may_be;         /* BROADCAST, or not */
+    uint8_t may_be;         /* BROADCAST or NO_BROADCAST */
 } functions[] = {
     [0x01] = {RANGE, DATA, BIT, 2000, NO_BROADCAST},
     [0x02] = {RANGE, DATA, BIT, 2000, NO_BROADCAST},
@@ -57,7 +57,7 @@ enum {
     DELIXI_BODY = 8
 };
 
-/* Delixi's K that only a drive sends (part 3). */
+/* Delixi's function codes K that only a drive sends (part 3). */
 enum { CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
 
 static const struct function *find_function(int framing, uint8_t code)
@@ -86,7 +86,7 @@ static size_t data_bytes(const struct function *function, unsigned count)
 
 /* ---- lengths and fields ---- */
 
-/* Return the length of a body but for the data that a byte count announces. */
+/* Return the length of a body, not counting the data that a byte count announces. */
 static int head_length(int layout)
 {
     const struct fields *fields = &fields_of[layout];
@@ -164,7 +164,7 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
     const struct function *function = find_function(framing, request->function);
     if (have >= 1 && (body[0] != request->address || !is_answered(framing, request->address)))
         return MD_BAD_ADDRESS;
-    if (request->function & MD_EXCEPTION_BIT) /* no request has it */
+    if (request->function & MD_EXCEPTION_BIT) /* invalid: no request sets this bit */
         return MD_BAD_FUNCTION;
     if (have < 2)
         return MD_INCOMPLETE;
@@ -266,7 +266,7 @@ static int confirms(int framing, const uint8_t *body, const struct md_message *r
         return start == request->start && md_get16(body + 4) == request->count;
     case ECHO:
         return start == request->start && memcmp(body + 4, request->data, 2) == 0;
-    case LONG: /* state 0 does not exist: it would be the query itself */
+    case LONG: /* state 0 does not exist: such a reply would equal the query */
         return (request->function == MD_DELIXI_STATE_QUERY ? start != 0 : start == request->start) &&
                (request->function == MD_DELIXI_PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
     default:
@@ -321,7 +321,7 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
         reply->start = request->start;
         reply->count = request->count;
     }
-    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* as all others have it */
+    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* copy the value to data */
         md_put16(reply->data + 2, reply->start);
     return 1;
 }

@@ -10,8 +10,8 @@
 
 /* ---- packets of capture files ---- */
 
-/* Read the packets of pcap and pcapng files. The caller reads the rare blocks that describe a pcapng file's
- * interfaces. */
+/* This section reads the packets of pcap and pcapng files. The caller reads the rare blocks that describe a
+ * pcapng file's interfaces. */
 
 enum {
     RECORD_HEAD = 16, /* of pcap */
@@ -38,8 +38,8 @@ static uint32_t number(const struct md_capture *capture, const uint8_t *at)
     return value;
 }
 
-/* Return the length of the link type's header before a frame. Its tags give the sender, and mark Modbus
- * TCP. */
+/* Return the length of the link type's header before a frame. Set `side` to the sender that its tags state,
+ * and mark the channel if they name Modbus TCP. */
 static size_t skip_header(struct md_channel *channel, const uint8_t *packet, size_t len, uint8_t *side)
 {
     uint32_t link = channel->link;
@@ -153,14 +153,14 @@ static int is_start(int framing, uint8_t first)
     return framing == MD_RTU ? first <= MD_MOST_ADDRESS : first == ':';
 }
 
-/* Return 1 if a good reply to such a request is its copy, or looks like one. */
+/* Return 1 if a good reply to such a request is a copy of the request, or looks like one. */
 static int is_echoed(int framing, uint8_t function)
 {
     int is_write = function == MD_WRITE_COIL || function == MD_WRITE_ONE;
     return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
-/* Delixi requests look like replies, but the value in a query is 0. */
+/* Return 1 for a Delixi request. It looks like a reply, but the value in a query is 0. */
 static int is_delixi_request(const struct md_message *message)
 {
     static const uint8_t zeros[4];
@@ -283,7 +283,7 @@ static int look_at(const struct md_splitter *splitter, const struct md_stream *s
                    struct md_span *span)
 {
     const struct md_piece *piece = &stream->pieces[splitter->piece];
-    /* A frame that starts inside junk ends at the pause at the latest: a good frame may follow it. */
+    /* A frame that starts inside junk must end before the next pause, because a good frame may follow. */
     int is_due = (at == splitter->at && splitter->junk == 0) || (piece->at == at && piece->is_after_pause);
     size_t limit = is_due ? stream->len : end;
     int least = limit < stream->len || stream->is_all ? 1 : MD_INCOMPLETE;
@@ -356,7 +356,7 @@ void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
     memmove(stream->pieces, stream->pieces + first, stream->count * sizeof *stream->pieces);
     for (size_t i = 0; i < stream->count; i++) {
         struct md_piece *piece = &stream->pieces[i];
-        if (piece->at < gone) /* its pause was before the discarded bytes */
+        if (piece->at < gone) /* the pause was before the discarded bytes */
             piece->is_after_pause = 0;
         piece->at = piece->at < gone ? 0 : piece->at - gone;
     }
@@ -429,7 +429,7 @@ static int add_rows(struct md_decoder *decoder, int result, struct md_columns *c
     return 1;
 }
 
-/* Add the rows of the request before this one, then look up the fields of its own reply. */
+/* Add the rows of the previous request, then look up the fields in the reply to the new one. */
 static int take_request(struct md_decoder *decoder, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
@@ -445,7 +445,7 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* Find the failure that the bytes instead of a reply show. */
+/* Set the failure that follows from the bytes received instead of a reply. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -466,7 +466,7 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
     case MD_REQUEST:
     case MD_EITHER:
         if (!decoder->is_sure)
-            decoder->block = NULL; /* maybe a confirmation, which needs no reply */
+            decoder->block = NULL; /* the frame may be a confirmation, which needs no reply */
         int undone = take_request(decoder, columns);
         if (undone)
             return undone;

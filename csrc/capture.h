@@ -7,7 +7,7 @@
 /* cdef: start */
 /* ---- tap.c: return a length in bytes ---- */
 
-/* The sender of bytes. The capturing master marked the last two as not being frames. */
+/* The sender of bytes. A capturing master uses the last two values for bytes that are not frames. */
 enum md_side {
     MD_EITHER_SIDE, /* unknown */
     MD_ASKING,
@@ -21,8 +21,8 @@ enum md_side {
 struct md_tap {
     uint8_t *ring;
     uint32_t room;       /* bytes, a power of two */
-    uint32_t put, taken; /* each has one writer, only grows, and wraps around */
-    uint64_t lost;       /* bytes without room */
+    uint32_t put, taken; /* bytes written and read so far, modulo 2^32; one writer each */
+    uint64_t lost;       /* bytes dropped because the ring was full */
     int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC of the next bytes; 0: use the reader's */
 };
 
@@ -35,7 +35,7 @@ struct md_wrapping {
 /* Write whole pcapng packets to `out` while there is room. */
 size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
                    int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room);
-/* Return the length of a packet of `len` bytes, the first of which is `first`. */
+/* Return the length in the file of a packet that holds `len` bytes, of which `first` is the first. */
 size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len);
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
@@ -47,7 +47,7 @@ struct md_piece {
     size_t at;
     int64_t time_ns;
     uint8_t side;           /* enum md_side */
-    uint8_t is_after_pause; /* the line was silent before them: a hint */
+    uint8_t is_after_pause; /* probably the line was silent before these bytes */
 };
 
 /* A buffer of sniffed bytes. */
@@ -62,7 +62,7 @@ struct md_stream {
 enum md_kind {
     MD_JUNK,    /* not a frame */
     MD_REQUEST,
-    MD_EITHER,  /* a request, or its confirming copy: the bytes before it were not understood */
+    MD_EITHER,  /* a request, or the reply that repeats it; the bytes before were not a frame */
     MD_REPLY,   /* to the previous request */
     MD_STRAY    /* a reply without its request */
 };
@@ -76,12 +76,12 @@ struct md_span {
     struct md_message message;
 };
 
-/* The position in a stream; all zero: its start. */
+/* The splitter's position in a stream; all zero: the start. */
 struct md_splitter {
     size_t at, piece;          /* the next byte, and its piece */
     size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* the last bytes were a frame: requests and their copies alternate */
-    int awaited, framing;      /* the reply to `request` is due, in this framing */
+    int is_in_step;            /* the last bytes were a frame: a request and its copy are distinguishable */
+    int awaited, framing;      /* `awaited`: the reply to `request` is due, in this framing */
     struct md_message request; /* the last one */
 };
 
@@ -109,7 +109,7 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* of the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* it was certainly a request; its result if no reply comes */
+    int is_sure, failure;         /* the last frame was certainly a request; its result without a reply */
     int is_due;                   /* `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;
@@ -121,10 +121,10 @@ enum md_decoded {
     MD_UNKNOWN      /* unknown request in `span`: call md_know() and repeat */
 };
 
-/* Set the fields of replies to this request; NULL: no rows. Return 0 if the table is full. */
+/* Set the fields in replies to this request (`block` NULL: no rows). Return 0 if the table is full. */
 int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
             const struct md_block *block);
-/* Add the rows of all sniffed exchanges, including requests without a reply. */
+/* Add rows to `columns` for all sniffed exchanges, including requests without a reply. */
 int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
 
 /* ---- capture.c: return an enum md_unpacked ---- */
@@ -134,7 +134,7 @@ enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* link types with a header
 /* An interface of a capture: one line. */
 struct md_channel {
     uint32_t link;
-    int has_sides;        /* the packets' directions can be trusted */
+    int has_sides;        /* the packets state their direction reliably */
     uint64_t ticks_per_s; /* of the packets' time stamps */
     int64_t offset_ns;
     struct md_stream stream;

@@ -3,7 +3,7 @@
 
 enum {
     WRONG_NS = 100000, /* replace the stored offset if it is off by more */
-    MOST_TRIES = 4     /* to read two clocks at once */
+    MOST_TRIES = 4     /* attempts to read both clocks without an interruption in between */
 };
 
 static int64_t read_clock(clockid_t clock)
@@ -33,7 +33,7 @@ int64_t md_utc_ahead_ns(int64_t now_ns)
     }
     if (known && is_interrupted)
         return known;
-    /* If two threads replace it at once, both return the first one's value. */
+    /* If two threads replace the offset at the same time, both return the value of the first one. */
     return atomic_compare_exchange_strong(&kept, &known, found) ? found : known;
 }
 

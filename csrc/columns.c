@@ -87,7 +87,7 @@ static double number_of(uint64_t bits, int format)
     case MD_I16: return (int16_t)bits;
     case MD_I32: return (int32_t)bits;
     case MD_I64: return (double)(int64_t)bits;
-    case MD_U32_EITHER: return (double)((bits >> 16 | bits) & 0xFFFF); /* order not stated; one word is 0 */
+    case MD_U32_EITHER: return (double)((bits >> 16 | bits) & 0xFFFF); /* any word order: one word is 0 */
     case MD_F32: return of_float((uint32_t)bits);
     case MD_F64: return of_double(bits);
     case MD_F16: return of_half((uint32_t)bits);
@@ -108,7 +108,7 @@ static uint32_t get32(const uint8_t *at, int low_word_first)
     return low_word_first ? second << 16 | first : first << 16 | second;
 }
 
-/* Read a number. The usual formats have a fast path without a loop, in half the time. */
+/* Read a number. The usual formats have a fast path without a loop, which takes half the time. */
 static inline double number_at(const uint8_t *data, size_t at, int format)
 {
     const uint8_t *first = data + 2 * at;
@@ -139,7 +139,7 @@ static int is_any(uint64_t bits, const struct md_invalid *invalid, int count)
     return 0;
 }
 
-/* Return the bits of a part; in a signed format the part has its own sign. */
+/* Return the number in a part of the bits; in a signed format the part has its own sign bit. */
 static double part_of(uint64_t bits, int format, const struct md_extra *extra)
 {
     uint64_t mask = extra->bits < 64 ? (UINT64_C(1) << extra->bits) - 1 : UINT64_MAX;

@@ -1,5 +1,5 @@
-/* The thread that runs every line of the process. It never takes the interpreter lock: polling needs no other
- * thread. */
+/* The thread that runs every line of the process. It never takes Python's interpreter lock, so polling
+ * continues whatever Python's threads do. */
 #define _GNU_SOURCE
 #include "engine.h"
 
@@ -83,7 +83,8 @@ static void bring_rest(const struct md_port *port)
         bring((*next_name(port))->drive, offsetof(struct md_drive, counters));
 }
 
-/* Each step uses memory that the one after it has fetched: the last one is for the port farthest ahead. */
+/* Each step reads memory that the step below has prefetched earlier: the last step runs for the port farthest
+ * ahead. */
 static void (*const steps[STEPS_AHEAD])(const struct md_port *port) = {
     bring_rest, bring_drives, bring_exchanges, bring_port,
 };
@@ -121,7 +122,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
     if (n > 0)
         return n;
     int64_t late = md_now_ns() - until_ns;
-    if (left > 0 && late >= 0) { /* otherwise it did not sleep */
+    if (left > 0 && late >= 0) { /* otherwise the thread did not sleep */
         late = sooner(late, MD_MOST_LATENESS);
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
     }
@@ -148,7 +149,7 @@ static int grow(struct md_engine *engine)
     return 1;
 }
 
-/* Open the ports whose clients wait for it. Only this thread may touch the waiter. */
+/* Open the arriving ports; their clients wait until then. Only this thread may use the waiter. */
 static void open_ports(struct md_engine *engine)
 {
     for (struct md_port *port = engine->arriving; port; port = port->next) {
@@ -165,7 +166,7 @@ static void open_ports(struct md_engine *engine)
     engine->arriving = NULL;
 }
 
-/* Close the ports whose clients wait for it. */
+/* Close the closing ports; their clients wait until then. */
 static void close_ports(struct md_engine *engine)
 {
     for (unsigned i = engine->count; i-- > 0;) {
@@ -202,14 +203,14 @@ static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
     return now_ns;
 }
 
-/* Return 1 if a client that woke the thread may have given this port an exchange that can start: the port is
- * idle, or only listens, which a stop ignores. */
+/* Return 1 if the port can start an exchange from the client that woke the thread: the port is idle, or it
+ * only listens and the exchange may be a stop. */
 static int may_have_news(const struct md_port *port)
 {
     return port->turn.whose == MD_NOBODYS || port->turn.line.listened_ns;
 }
 
-/* Block SIGPIPE: a closed far end is a lost port, and must not end the process. */
+/* Block SIGPIPE: writing to a port whose far end is closed must not end the process. */
 static void bear_broken_pipes(void)
 {
 #ifndef _WIN32
@@ -235,7 +236,7 @@ static void *run(void *argument)
         int has_news = engine->has_news;
         engine->has_news = 0;
         pthread_mutex_unlock(&engine->mutex);
-        if (has_news) /* after unlocking, so that they get the mutex at once */
+        if (has_news) /* after unlocking: the waiting clients get the mutex immediately */
             pthread_cond_broadcast(&engine->changed);
         while (atomic_load(&engine->callers)) /* yield: otherwise this thread would always win the mutex */
             sched_yield();

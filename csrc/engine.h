@@ -15,9 +15,9 @@ struct md_rs485 {
     int mode;        /* enum md_rs485_mode */
     int tells_end;   /* the driver reports when the last bit has left */
     int is_sending;  /* RTS makes the transceiver send */
-    int64_t sent_ns; /* the last bit leaves then, if the UART started at once */
-    int64_t look_ns; /* next check whether it has left */
-    int64_t empty_ns; /* the driver's queue was empty; 0: not yet */
+    int64_t sent_ns; /* when the last bit leaves if the UART started immediately */
+    int64_t look_ns; /* time of the next check whether the last bit has left */
+    int64_t empty_ns; /* when the driver's queue was found empty; 0: not yet */
     int64_t character_ns;
 };
 
@@ -27,7 +27,7 @@ struct md_port {
     unsigned index;    /* among the engine's ports */
     int is_blind;      /* no useful bytes come before the port's wake time */
     int is_watched;    /* the waiter reports when it is readable */
-    int is_empty;      /* it has just been read empty */
+    int is_empty;      /* the last read left no bytes */
     int is_closing;
     struct md_settings settings; /* in force; baudrate 0: not yet set */
     struct md_engine *engine;
@@ -44,7 +44,7 @@ struct md_engine {
     pthread_t thread;
     pthread_mutex_t mutex;  /* the thread releases it only while it waits; guards all below, and the ports */
     atomic_int callers;     /* clients that want the mutex */
-    pthread_cond_t changed; /* an urgent request is done, a port opened or closed */
+    pthread_cond_t changed; /* signals: an urgent request is done, a port opened or closed */
     int has_news;           /* `changed` must be signalled */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
@@ -52,14 +52,14 @@ struct md_engine {
     struct md_port **ports;
     int64_t *wakes; /* latest wake time for each port */
     unsigned count, room;
-    int64_t lateness_ns; /* the thread's usual lateness after a sleep */
+    int64_t lateness_ns; /* how late the thread usually wakes from a sleep */
 };
 
-/* The right to send, which ends at a deadline. */
+/* This process's right to send on its lines, which ends at a deadline. */
 struct md_mastership {
-    int64_t until_ns;         /* of CLOCK_BOOTTIME; read and written atomically; 0: it does not hold */
+    int64_t until_ns;         /* deadline, of CLOCK_BOOTTIME; accessed atomically; 0: no right to send */
     int64_t guard_ns;         /* least time between two masters */
-    uint32_t term;            /* terms so far; another process may have been master between two */
+    uint32_t term;            /* terms so far; another process may be master between two terms */
     struct md_engine *engine; /* the engine that checks it; NULL: none yet */
 #ifdef __linux__
     timer_t timer;
@@ -68,7 +68,7 @@ struct md_mastership {
 
 /* The longest expected lateness of a wake-up, in ns. */
 #ifdef _WIN32
-enum { MD_MOST_LATENESS = 1500000 }; /* its best timers keep time to half a millisecond, or one */
+enum { MD_MOST_LATENESS = 1500000 }; /* Windows' best timers are 0.5 to 1 ms late */
 #else
 enum { MD_MOST_LATENESS = 80000 };
 #endif
@@ -83,15 +83,15 @@ void md_engine_await(struct md_engine *engine, const int *is_done); /* with the 
 /* ---- port.c: on the engine's thread ---- */
 
 int64_t md_port_receive(struct md_port *port); /* read the port; return the time of the read */
-/* Do all that is due on a port; return the time afterwards. */
+/* Carry out all actions that are due on a port; return the time afterwards. */
 int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 
 /* ---- rs485.c ---- */
 
 int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
-/* Write, and let the transceiver send from now on. */
+/* Switch the transceiver to sending, then write; return as write(2). */
 ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
-/* Let the transceiver receive once the last bit has left; 0, or -errno: give up the port. */
+/* Switch the transceiver to receiving once the last bit has left; 0, or -errno if the port is lost. */
 int md_rs485_look(struct md_port *port, int64_t now_ns);
 
 

@@ -116,7 +116,7 @@ static int open_rtu(const uint8_t *bytes, size_t len, const struct md_message *r
 
 int md_tcp_length(const uint8_t *bytes, size_t len)
 {
-    if (len >= 4 && md_get16(bytes + 2) != 0) /* the protocol */
+    if (len >= 4 && md_get16(bytes + 2) != 0) /* the protocol id is always 0 */
         return MD_NO_START;
     if (len < MD_TCP_HEAD)
         return MD_INCOMPLETE;
@@ -254,8 +254,8 @@ int md_reply_length(int framing, const struct md_message *request)
 
 /* ---- why a request has no reply ---- */
 
-/* Rank reasons by how specific they are. The most specific one is reported, the first of equals: a frame
- * from another address may contain the awaited one. */
+/* Rank reasons by how specific they are. The most specific one is reported, of equal ones the first. The
+ * search goes on inside a frame from another address, because the expected frame may start there. */
 static int weight(int reason)
 {
     static const uint8_t weights[] = {
@@ -271,7 +271,8 @@ static int weight(int reason)
     return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
 }
 
-/* Return the offset of the next frame. After a damaged header it is unknown. */
+/* Return the offset at which the next frame may start: the next byte, or with Modbus TCP the end of this
+ * frame. After a damaged Modbus TCP header the offset is unknown; then return `len`. */
 static size_t next_at(int framing, const uint8_t *bytes, size_t len)
 {
     int whole = framing == MD_TCP ? md_tcp_length(bytes, len) : 1;

@@ -14,10 +14,10 @@
 
 /* Count an exchange that ended. */
 void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion);
-/* Count a reply: its delay, and the line time that its exchange needed. */
+/* Count a reply with its delay and the least line time of its exchange. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 uint64_t md_replies(const struct md_drive *drive);
-const uint64_t *md_usual_delays(const struct md_drive *drive); /* the counter of the usual delay */
+const uint64_t *md_usual_delays(const struct md_drive *drive); /* the bucket of the smoothed delay */
 
 /* ---- clock.c ---- */
 
@@ -34,7 +34,7 @@ uint64_t md_count_lacking(const struct md_block *block, const struct md_message 
 /* Keep the queue until it is released, even if its client frees it. */
 void md_row_queue_hold(struct md_row_queue *row_queue);
 void md_row_queue_release(struct md_row_queue *row_queue);
-/* Append to the newest chunk; block NULL: no rows. */
+/* Append the exchange's rows to the newest chunk; `block` NULL: none. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);
 /* cdef: end */
@@ -88,17 +88,18 @@ void md_copy_message(struct md_message *to, const struct md_message *from);
 int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1: not digits */
 /* Return the length in a Modbus TCP header, or an enum md_frame_fault. */
 int md_tcp_length(const uint8_t *bytes, size_t len);
-/* Return 1 if the bytes start an exception to this request. Its length is fixed; some devices announce
- * another one. */
+/* Return 1 if the bytes start an exception to this request. An exception's length is fixed, although some
+ * devices put another length into the header. */
 int md_tcp_is_exception(const uint8_t *bytes, size_t len, const struct md_message *request);
-/* Return 1 if a gateway reports that it has no path to the drive, or no reply: the drive itself is silent. */
+/* Return 1 if a gateway reports that the drive is unreachable or silent. */
 int md_is_gateways(int framing, const struct md_message *reply);
 /* Return why these bytes are not the reply: an enum md_frame_fault, MD_CUT_SHORT or MD_NO_REPLY. */
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
 
 /* ---- stats.c: delays and timeouts ---- */
 
-/* Return the time after a request, without the reply's own time, at which to read the port. */
+/* Return the delay from the end of a request to the read of the port, without the reply's time on the
+ * wire. */
 int64_t md_look_ns(const struct md_exchange *exchange);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
 /* Return the time after a request by which its reply starts, with a margin; 0 if the drive is not steady,
@@ -107,11 +108,13 @@ int64_t md_reply_due_ns(const struct md_exchange *exchange);
 /* Learn from a reply's delay (an upper bound if the first read found the reply whole); return the best
  * estimate of the delay. */
 int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole);
-/* Wait longer from now on: a late reply came `delay_ns` after its request, or after the last of several. */
+/* Use a longer timeout, because a late reply came `delay_ns` after its request. If the request was sent
+ * several times, `delay_ns` counts from the last one and `is_exact` is 0. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
-/* Halve that longer wait after a timeout. */
+/* After a timeout, halve the longer timeout that md_learn_lateness() set. */
 void md_learn_silence(struct md_drive *drive);
-int64_t md_window_ns(const struct md_exchange *exchange); /* in which late replies come in any order */
+/* Return how long after an exchange's timeout late replies may come in any order. */
+int64_t md_window_ns(const struct md_exchange *exchange);
 
 /* Set the drive's count of failures, which clients read at any time. */
 static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
@@ -139,7 +142,7 @@ struct md_waiter *md_waiter_new(void); /* NULL: see errno */
 void md_waiter_free(struct md_waiter *waiter);
 /* Report `whose` whenever the descriptor is readable; -1: see errno. */
 int md_waiter_add(struct md_waiter *waiter, int fd, void *whose);
-/* Stop watching a descriptor for a while, or watch it again. */
+/* Set whether a descriptor is watched. */
 void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched);
 void md_waiter_remove(struct md_waiter *waiter, int fd);
 /* Wait at most `timeout_ns`, forever if it is negative; write the owners of readable descriptors, and return
@@ -148,12 +151,12 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
 
 /* ---- termios.c ---- */
 
-int md_port_keep_rts(int fd); /* leave RTS as it is when the port is closed; 0, -errno */
+int md_port_keep_rts(int fd); /* let closing the port leave RTS unchanged; 0, -errno */
 
 /* ---- wakeup.c ---- */
 
 struct md_wakeup {
-    int fd, ringer; /* `fd` is readable while it rings */
+    int fd, ringer; /* `fd` is readable after a ring until md_wakeup_silence() */
     atomic_int is_rung;
 };
 
@@ -167,7 +170,7 @@ void md_wakeup_silence(struct md_wakeup *wakeup);
 #define MD_NEVER INT64_MAX
 #define MD_SECOND_NS INT64_C(1000000000)
 
-/* Its fields are 32 bits wide on some systems. */
+/* The fields of a timespec are 32 bits wide on some systems. */
 static inline struct timespec timespec_of(int64_t ns)
 {
     return (struct timespec){.tv_sec = (time_t)(ns / MD_SECOND_NS), .tv_nsec = (long)(ns % MD_SECOND_NS)};

@@ -56,8 +56,9 @@ int md_is_read(int framing, uint8_t function)
     return function <= LAST_READ;
 }
 
-/* Return 1 if a reply to the one could be mistaken for a reply to the other. An exception does not name the
- * write that it refuses; a start wrongly reported as refused is a running motor reported as stopped. */
+/* Return 1 if a reply to the outstanding request could be mistaken for the exchange's. That includes
+ * exceptions: they do not name the write that they refuse. A start wrongly reported as refused would be a
+ * running motor reported as stopped. */
 static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -121,12 +122,12 @@ static void drop_time(struct md_owed *owed)
 /* A drive's proofs. Some may not work: a device may be silent to registers that it lacks, and a document
  * may be wrong about a register's range. */
 
-/* A proof that was never answered is dropped after MOST_VAIN failures. A silence counts as one only if other
- * replies came before it. */
+/* A proof that was never answered is dropped after MOST_VAIN failures. No reply counts as a failure only
+ * if the drive has replied to another request since the last failure. */
 enum { MOST_VAIN = 2, ANSWERED = 0xFF };
 
-/* Return the index of this proof in the drive's list, or proof_count. Most exchanges are not proofs: for
- * those the list, elsewhere in memory, is not read. */
+/* Return the index of this exchange in the drive's list of proofs, or proof_count if it is not a proof. Then
+ * the list is not read, because it is elsewhere in memory and most exchanges are not proofs. */
 static uint32_t proof_at(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
@@ -141,7 +142,7 @@ int md_proof_is(const struct md_exchange *exchange)
     return proof_at(exchange) < exchange->drive->proof_count;
 }
 
-/* Remove a proof. A single one is useless against its own late replies. */
+/* Remove a proof. If only one is left, remove it too: it cannot be distinguished from its own late reply. */
 static void drop_proof(struct md_drive *drive, uint32_t at)
 {
     drive->proof_count--;
@@ -163,7 +164,7 @@ void md_proof_end(const struct md_exchange *exchange, int result)
     int is_silent_to_it = result == MD_NO_REPLY && replies != drive->vain_at;
     if (result > 0)
         drive->vain[at] = ANSWERED;
-    if (!is_silent_to_it && result != MD_BAD_ECHO) /* a value out of its documented range */
+    if (!is_silent_to_it && result != MD_BAD_ECHO) /* MD_BAD_ECHO: the value is out of its documented range */
         return;
     drive->vain_at = replies;
     if (++drive->vain[at] == MOST_VAIN)
@@ -179,7 +180,7 @@ static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
 
 /* ---- late replies ---- */
 
-static const int64_t FORGET_NS = INT64_C(120000000000); /* no path delays bytes for so long */
+static const int64_t FORGET_NS = INT64_C(120000000000); /* no path delays bytes for two minutes */
 
 /* ---- outstanding requests of a drive ---- */
 
@@ -220,8 +221,8 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
 
 /* ---- requests that may be sent ---- */
 
-/* Return 1 if an outstanding reply could be mistaken for the exchange's; `own`: also one to the same
- * request. */
+/* Return 1 if an outstanding reply could be mistaken for the exchange's reply. Outstanding replies to the
+ * same request count only with `own`. */
 static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
@@ -235,8 +236,8 @@ static int has_mistakable(const struct md_exchange *exchange, int own)
     return 0;
 }
 
-/* Return 1 if an exception in the window could be mistaken: it names the function at most, with Delixi not
- * even that. */
+/* Return 1 if a late exception within the window could be mistaken for the exchange's: an exception names
+ * only the function, with Delixi not even that. */
 static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
@@ -280,14 +281,14 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     return !md_proof_is(exchange) && has_mistakable(exchange, 0);
 }
 
-/* The last proof is reserved for a drive that answers again. It is not outstanding from the silence
- * before, so its second reply at the latest settles all requests. */
+/* The last proof is reserved for a drive that answers again after a silence. During the silence this proof
+ * was not sent, so its second reply at the latest settles all outstanding requests. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
 }
 
-/* Return 1 if a silent drive's request needs no proof: any reply shows that it is back. */
+/* Return 1 if a request to a silent drive needs no proof, because any reply shows that the drive is back. */
 static int is_sent_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
@@ -306,7 +307,7 @@ static int is_free(const struct md_drive *drive, const struct md_exchange *proof
     return 1;
 }
 
-/* Return the time of its last sending; 0: it is not outstanding. */
+/* Return the time at which the proof was last sent; 0: it is not outstanding. */
 static int64_t sent_last_ns(struct md_drive *drive, const struct md_exchange *proof)
 {
     const struct md_owed *owed = find_same(drive, proof);
@@ -329,7 +330,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
         const struct md_exchange *proof = drive->proofs[n];
         if (is_free(drive, proof))
             return proof;
-        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* settles most */
+        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* the latest settles most */
             latest = proof;
     }
     return is_answering ? last_proof(drive) : latest;

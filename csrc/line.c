@@ -27,17 +27,18 @@ const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
 
 /* ---- listening for another master ---- */
 
-/* Listening before the first request: a line has one master, and a new one checks that it is alone. Unasked
- * bytes are another master's requests or the replies to them. Each restarts the wait, so the first request
- * leaves after a silence that is long enough.
- * The wait lasts for the guard at least: in that time the kernel's timer ends a suspended former master. A
- * Modbus TCP connection shows no other master; there only the guard counts.
+/* Listening before the first request: a line has one master, and a new one checks that no other master sends.
+ * Unexpected bytes are another master's requests or the replies to them. They restart the wait, so the first
+ * request leaves after a silence that is long enough. The wait lasts at least for the guard time: in that
+ * time the kernel's timer ends a suspended former master. A Modbus TCP connection shows no other master;
+ * there only the guard counts.
  *
  * A stop does not wait: the motor must stop, even beside another master. */
 
 enum { LONGEST_RTU = 256 }; /* serial-line guide V1.02, 2.5.1 */
 
-/* Accept one burst: it may be the last reply to a master that has just gone. */
+/* The deadline allows one restart of the wait: one burst may be the last reply to a master that has just
+ * gone. */
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -60,7 +61,7 @@ void md_listen_put_back(struct md_line *line)
 
 void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
 {
-    if (line->transactions) /* a late reply to this process */
+    if (line->transactions) /* on a network these bytes are a late reply to this process */
         return;
     line->listened_ns = later(line->listened_ns, now_ns + line->listen_ns);
     line->foreign += (uint32_t)len;
@@ -106,7 +107,7 @@ static void count_reply(struct md_block *block, uint8_t exception)
     if (exception) {
         block->refusals++;
         block->refusal = exception;
-    } else if (block->refusals || !block->is_answered) { /* usually no write */
+    } else if (block->refusals || !block->is_answered) { /* usually nothing changes: avoid the memory write */
         block->refusals = 0;
         block->is_answered = 1;
     }
@@ -120,7 +121,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
     md_proof_end(exchange, completion->result);
-    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* out of range */
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* value out of range */
     if (is_failure(completion->result)) {
         md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
@@ -206,7 +207,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
     if (line->state == MD_IDLE)
         return;
     if (line->state >= MD_AWAITING && line->transactions != MD_MATCHED)
-        md_late_expect(line, md_window_ns(line->exchange)); /* it may come after a reopening */
+        md_late_expect(line, md_window_ns(line->exchange)); /* it may come after a reopening of the port */
     line->completion->error = error;
     fail(line, result);
 }
@@ -218,12 +219,13 @@ void md_line_init(struct md_line *line, int64_t now_ns)
     *line = (struct md_line){.state = MD_IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
 }
 
-/* Set tx to the request's bytes: the exchange stores short ones. Return 0, or an enum md_frame_fault. */
+/* Set tx to the request's bytes, which the exchange stores if they are few. Return 0, or an enum
+ * md_frame_fault. */
 static int load(struct md_line *line, const struct md_exchange *exchange)
 {
     int is_tcp = exchange->framing == MD_TCP;
     if (is_tcp != (line->transactions != MD_NO_TRANSACTIONS))
-        return MD_BAD_REQUEST; /* the port would read it as another frame */
+        return MD_BAD_REQUEST; /* the framing does not fit the port */
     line->tx = exchange->frame;
     line->tx_len = exchange->frame_len;
     if (line->tx_len && !is_tcp)
@@ -241,7 +243,7 @@ static int load(struct md_line *line, const struct md_exchange *exchange)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns)
 {
-    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the rest has lengths */
+    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the rest has length fields */
     completion->begun_ns = now_ns;
     completion->stale = line->rx_len;
     line->exchange = exchange;
@@ -252,7 +254,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     md_line_go(line, MD_BEGUN);
     if (md_listen_is_held(line))
         line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
-    if (exchange->drive->owed_count) /* from another line, or from before a reopening */
+    if (exchange->drive->owed_count) /* requests from another line, or from before the port was reopened */
         md_late_link(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
     if (refused)
@@ -264,7 +266,7 @@ int64_t md_line_silent_ns(const struct md_line *line)
     return line->quiet_ns + line->silence_ns;
 }
 
-/* Return the time at which the exchange may leave. */
+/* Return the time from which the request may be sent. */
 static int64_t free_ns(const struct md_line *line)
 {
     int64_t silent_ns = md_line_silent_ns(line);
@@ -350,7 +352,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
 
 /* ---- received bytes ---- */
 
-/* Make room by discarding the older half. A reply that started there would be whole by now. */
+/* Make room by discarding the older half of rx. A reply that started there would be complete by now. */
 static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
@@ -414,7 +416,7 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
     }
     if (line->state < MD_AWAITING) /* after bytes that are not Modbus TCP */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
-    for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* for the error message */
+    for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* keep the bytes for the error message */
         at += keep(line, bytes + at, len - at);
     if (line->state != MD_IDLE && now_ns < line->give_up_ns)
         md_line_go(line, MD_BYTES_IN_TIME);

@@ -20,7 +20,7 @@ enum md_line_state {
 
 enum md_line_event {
     MD_BEGUN,         /* an exchange starts */
-    MD_FELL_SILENT,   /* or babbled for too long */
+    MD_FELL_SILENT,   /* the line was silent for long enough, or babbled for too long */
     MD_NOTHING_CAME,
     MD_STRAY_BYTES,   /* bytes before the request, with time left to wait for silence again */
     MD_PART_LEFT,
@@ -52,17 +52,17 @@ struct md_line {
     const uint8_t *tx;   /* the request */
     const struct md_exchange *exchange;
     struct md_completion *completion;
-    int64_t quiet_ns;    /* the line's last activity */
+    int64_t quiet_ns;    /* time of the line's last activity */
     int64_t silence_ns;  /* required silence after it */
-    int64_t listened_ns; /* end of listening; before, only stops are sent; 0: not listening */
+    int64_t listened_ns; /* end of listening, until which only stops are sent; 0: not listening */
     int64_t listen_ns;   /* required silence while listening */
     int64_t wake_ns;
     int64_t give_up_ns;  /* deadline of the wait for silence, or for the reply */
     int64_t begun_by_ns; /* deadline of the reply's first byte */
-    int64_t looked_ns;   /* the last read of the port */
-    int64_t missing_ns;  /* the last read that found less than a copy of the request; 0: none */
+    int64_t looked_ns;   /* time of the last read of the port */
+    int64_t missing_ns;  /* time of the last read with less than a copy of the request; 0: none */
     int64_t copy_by_ns;  /* an echo would be whole by then; 0: unknown */
-    int64_t ready_ns;    /* no useful bytes come before */
+    int64_t ready_ns;    /* no useful bytes come before this time */
     struct md_drive *late; /* the first drive with late replies due */
     struct md_tap *tap;  /* gets all bytes of the line; NULL: none */
     uint8_t echo;        /* enum md_echo, learnt; failures do not reset it */
@@ -79,22 +79,22 @@ struct md_line {
     uint32_t cut;        /* since the request left: bytes of late replies */
     uint32_t foreign;    /* bytes received while listening */
     uint16_t sight_at, sight; /* where the reply may start; its bytes in the first read */
-    uint16_t burst;      /* most characters that the adapter holds back; 0: maybe whole replies */
+    uint16_t burst;      /* most characters that the adapter holds back; 0: possibly whole replies */
     uint8_t rx[MD_RX_ROOM];
     uint8_t long_tx[MD_MOST_FRAME]; /* a request that its exchange does not store */
     uint16_t transaction;           /* of the last request */
-    uint16_t frame_len, frame_told; /* bytes of an incomplete Modbus TCP frame; those that the tap has */
+    uint16_t frame_len, frame_told; /* bytes of an incomplete Modbus TCP frame; how many went to the tap */
     uint8_t frame[MD_MOST_TCP];
 };
 
 void md_line_init(struct md_line *line, int64_t now_ns);
-/* Start an exchange; it ends at once if late replies bar it. No byte leaves before the line's silence is
- * over. */
+/* Start an exchange; it ends immediately if a late reply could be mistaken for its own. No byte leaves before
+ * the line's silence is over. */
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
 int64_t md_line_silent_ns(const struct md_line *line);  /* end of the line's silence */
-/* The port took bytes between these two times. */
+/* Report that the port took `len` bytes between these two times. */
 void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
 /* End the exchange in flight: the port failed, or the request must not leave. */
@@ -121,7 +121,7 @@ struct md_slot {
 /* An urgent request; it lives on the stack of its waiting caller. */
 struct md_urgent {
     const struct md_exchange *exchange;
-    int64_t not_before_ns; /* 0: at once */
+    int64_t not_before_ns; /* 0: immediately */
     int64_t expires_ns;    /* of CLOCK_BOOTTIME; 0: never */
     struct md_completion *completion;
     struct md_urgent *next;
@@ -146,7 +146,7 @@ struct md_turn {
     struct md_slot *slots; /* a ring */
     uint32_t room;         /* a power of two */
     uint32_t is_idle;      /* the next submit must wake the thread */
-    int64_t owed_ns;       /* line time that polling is owed beside urgent requests */
+    int64_t owed_ns;       /* line time that urgent requests still owe to polling */
     struct md_before before;
     struct md_row_queue *row_queue;
     uint32_t number; /* of the port, in row_queue */
@@ -184,13 +184,13 @@ static inline void md_line_go(struct md_line *line, enum md_line_event event)
 
 void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns); /* bytes came while listening */
 
-/* Return 1 if the exchange in flight waits for the end of listening, as all except stops do. */
+/* Return 1 if the exchange in flight waits for the end of listening. Stops do not wait. */
 static inline int md_listen_is_held(const struct md_line *line)
 {
     return line->listened_ns && line->state != MD_IDLE && !line->exchange->insists;
 }
 
-/* The end of an exchange: its result, and the bytes for the completion. */
+/* The end of an exchange: its result, and the place of the completion's bytes in rx. */
 struct md_ending {
     int result;
     size_t at, len;
@@ -227,7 +227,7 @@ int md_reply_parse(const struct md_line *line, size_t at, struct md_message *rep
 /* Remove bytes that belong to other exchanges. */
 void md_reply_cut_out(struct md_line *line, size_t at, size_t len);
 
-/* Return the time of a frame on the drive's own wire, which may be behind a gateway. */
+/* Return the transmission time of a frame on the drive's own wire, which may be behind a gateway. */
 static inline int64_t md_wire_ns(const struct md_exchange *exchange, int64_t len)
 {
     enum { LONGER_THAN_RTU = 4 }; /* a header of six bytes, and no CRC of two */
@@ -249,11 +249,11 @@ struct md_ending md_tcp_missed(struct md_line *line);
 
 /* ---- reply.c: adapters that echo ---- */
 
-/* Return 1 if the adapter's copy of the request may come. */
+/* Return 1 if the adapter's copy of the request may still come. */
 int md_echo_is_due(const struct md_line *line, int reply_len);
 /* Return 1 if a copy of the request is at `at`. */
 int md_echo_is_copy(const struct md_line *line, size_t at);
-/* Return 1 if an echo probe is needed first. */
+/* Return 1 if an echo probe must be sent before the exchange. */
 int md_echo_is_in_doubt(const struct md_line *line);
 /* Drop bytes that came while the request left, except the start of its echo. */
 void md_echo_keep(struct md_line *line);

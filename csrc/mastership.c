@@ -1,5 +1,5 @@
 /* The deadline until which this process may send on its lines, and the kernel's timer that kills the process
- * if it is still suspended after that. Both use CLOCK_BOOTTIME, which counts the machine's sleep.
+ * if it is still suspended after that. Both use CLOCK_BOOTTIME, which includes the computer's sleep.
  *
  * Checking the clock is not enough: the process may be suspended between the check and write(2). The timer
  * works without the process, and the kernel can kill a suspended process. */
@@ -53,7 +53,7 @@ static int set_timer(struct md_mastership *mastership, int64_t at_ns)
 
 int64_t md_boottime_ns(void)
 {
-    return md_now_ns(); /* on macOS and Windows it counts sleep, too */
+    return md_now_ns(); /* on macOS and Windows this clock includes sleep, too */
 }
 
 struct md_mastership *md_mastership_new(int64_t guard_ns)

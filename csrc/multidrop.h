@@ -20,7 +20,7 @@ enum {
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* outstanding requests of a drive */
     MD_MOST_PROOFS = 4,
-    MD_PAUSE_S = 10,          /* silence in which somebody may have replaced the drive */
+    MD_PAUSE_S = 10,          /* after such a silence another drive may be at the address */
     MD_TIMES_KEPT = 6         /* send times stored for one outstanding request */
 };
 
@@ -38,7 +38,7 @@ enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI, MD_TCP };
 enum md_frame_fault {
     MD_INCOMPLETE = 0,     /* more bytes are needed */
     MD_NO_START = -1,      /* not the start of a frame */
-    MD_BAD_CHARACTER = -2, /* something else than an upper-case hex digit, or than CR LF at the end */
+    MD_BAD_CHARACTER = -2, /* not an upper-case hex digit, or no CR LF at the end */
     MD_BAD_CHECKSUM = -3,
     MD_BAD_ADDRESS = -4,  /* of another drive */
     MD_BAD_FUNCTION = -5, /* neither the request's function nor its exception */
@@ -67,9 +67,9 @@ struct md_message {
 /* Write the frame to `out`, a buffer of `room` bytes. */
 int md_build_request(int framing, const struct md_message *message, uint8_t *out, size_t room);
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room);
-/* Parse the request to any address that `bytes` start with. */
+/* Parse the request, to any address, at the start of `bytes`. */
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message);
-/* Parse the reply to `request` that `bytes` start with; the transaction may differ. */
+/* Parse the reply to `request` at the start of `bytes`; its transaction id may differ. */
 int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                    struct md_message *reply);
 /* Return the length of the good reply to `request`; 0 after a broadcast. */
@@ -91,15 +91,15 @@ enum md_refusal {
     MD_REFUSED_STOPBITS = 8
 };
 
-/* Make the port raw with these settings; return those that it did not take when read back. */
+/* Make the port raw with these settings, read them back, and return those that the port did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
 
 /* ---- clock.c: return a time ---- */
 
 int64_t md_now_ns(void);
-/* Return UTC - CLOCK_MONOTONIC. The value stays the same while it is right to 0.1 ms, so that a moment has
- * one UTC time in all recordings. */
+/* Return UTC - CLOCK_MONOTONIC. The value changes only if it is wrong by more than 0.1 ms, so that a moment
+ * has one UTC time in all recordings. */
 int64_t md_utc_minus_monotonic_ns(void);
 
 /* ---- stats.c, late.c: a drive's statistics; return a time in ns ---- */
@@ -144,13 +144,13 @@ struct md_history {
     struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest first */
 };
 
-/* A drive. The caller sets the bounds of its timeout and its interval; the core learns the rest, which starts
- * as 0. A timeout runs from the request's last bit to the reply's first. Starting a request touches the first
- * cache line only, its end the second one too. */
+/* A drive. The caller sets the bounds of its timeout and its interval; the core learns the other fields,
+ * which start as 0. A timeout runs from the request's last bit to the reply's first. The start of a
+ * request accesses only the first cache line, its end also the second one. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
     int64_t delay_ns, deviation_ns;    /* smoothed response delay, and its mean deviation */
-    int64_t patience_ns;               /* a longer timeout, learnt from late replies */
+    int64_t patience_ns;               /* a longer timeout, learnt from late replies; 0: none */
     int64_t interval_ns;               /* least time between an exchange and the next request */
     int64_t ready_ns;                  /* earliest time of the next request */
     uint32_t failures;                 /* in a row */
@@ -160,7 +160,7 @@ struct md_drive {
     struct md_counters counters;
     int64_t answered_ns;               /* no reply to an earlier request can come */
     int64_t late_until_ns;             /* late replies may come in any order until then */
-    uint64_t vain_at;                  /* its reply count when a proof last failed */
+    uint64_t vain_at;                  /* the drive's reply count when a proof last failed */
     uint8_t vain[MD_MOST_PROOFS];      /* failures of each proof; 255: it was answered once */
     uint32_t doubtful;                 /* replies that may have answered another process */
     uint32_t unanswered_count;
@@ -171,7 +171,7 @@ struct md_drive {
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* of a read */
-int64_t md_vain_ns(const struct md_drive *drive);            /* wait of the next read for a silent drive */
+int64_t md_vain_ns(const struct md_drive *drive);            /* timeout of the next read after failures */
 int64_t md_delay_edge(int bucket); /* least delay of a bucket; its width is an eighth of that */
 /* Copy the outstanding requests of a drive that this one replaces. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
@@ -213,8 +213,8 @@ struct md_exchange {
     struct md_settings settings;
     int framing;
     int insists;          /* a stop: sent even if a late reply may be mistaken for its own */
-    uint32_t end;         /* the reply's one register is below this; 0: no range */
-    uint16_t least;       /* ... and at least this */
+    uint32_t end;         /* upper bound (exclusive) of the reply's only register; 0: no range */
+    uint16_t least;       /* lower bound of the same register */
     uint8_t is_proof;     /* one of its drive's proofs */
     uint8_t frame_len;    /* 0: build the frame at its turn */
     uint8_t frame[MD_KEPT_FRAME];
@@ -232,19 +232,19 @@ enum md_failure {
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
     MD_LATE_ANSWER_DUE = -13,  /* not sent: a late reply could be mistaken for its own */
     MD_EXPIRED = -14,          /* not sent: its time was over, or a stop came first */
-    MD_POLL_ENDED = -16,       /* the poll ended before its turn or its reply */
+    MD_POLL_ENDED = -16,       /* polling ended before this exchange's turn or reply */
     MD_MAYBE_ECHO = -17,       /* the bytes may be the reply or the adapter's echo */
     MD_NOT_MASTER = -19,       /* this process lost the right to send; part of the request may have left */
     MD_OTHER_MASTER = -20,     /* not sent: another master uses the line */
-    MD_POLLING_FAILED = -21    /* not asked: the client that queues requests failed */
+    MD_POLLING_FAILED = -21    /* not sent: the client that queues requests failed */
 };
 
 /* The result of an exchange. first_ns and last_ns are 0 if no byte came. */
 struct md_completion {
     int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
-    int64_t begun_ns;          /* its turn came; the line's silence may not have been over */
-    int64_t sent_ns;           /* the first byte of the request left; 0: never */
+    int64_t begun_ns;          /* start of its turn; the line's silence may not have been over */
+    int64_t sent_ns;           /* when the first byte of the request left; 0: never */
     int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC at sent_ns; 0: unknown */
     int64_t first_ns, last_ns; /* arrival of the first and the last byte after the request */
     int64_t late_until_ns;     /* the drive's late_until_ns at the call; of urgent exchanges only */
@@ -258,7 +258,7 @@ struct md_completion {
 /* Progress of a port. Each number only grows, and wraps around. */
 struct md_progress {
     uint32_t submitted, done;
-    uint32_t lost;        /* the descriptor failed: all later urgent exchanges are MD_LINE_LOST */
+    uint32_t lost;        /* the descriptor failed: all later urgent exchanges end as MD_LINE_LOST */
     uint32_t cut_off;     /* the polled exchange in flight was lost too, on a port that had worked */
     uint32_t repeating;   /* exchanges are repeated */
     uint32_t switches;    /* of baud rate and format */
@@ -280,9 +280,9 @@ struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as
  * two. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
-/* Send only while the mastership holds, which is checked right before each write(2). It must outlive the
- * port. Before the first request, and after any gap in the mastership, the port first listens to the line,
- * at least for the mastership's guard. Stops do not wait for that. */
+/* Send only while this process is master, which is checked right before each write(2). The mastership must
+ * outlive the port. Before the first request, and after any gap in the mastership, the port first listens to
+ * the line, at least for the mastership's guard time. Stops do not wait for the end of listening. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
 /* Set who switches the transceiver (enum md_rs485_mode), before the first request; return 0 or -errno. */
 int md_port_rs485(struct md_port *port, int mode);
@@ -300,7 +300,8 @@ void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct 
 /* Stop all exchanges and give the descriptor back. After md_port_end() a polled exchange in flight ends as
  * MD_POLL_ENDED. */
 void md_port_stop(struct md_port *port);
-/* Stop and free the port; `memory` only keeps the client's memory alive until then. */
+/* Stop and free the port. `memory` is unused; the argument keeps the client's memory alive during the
+ * call. */
 void md_port_let_go(struct md_port *port, void *memory);
 /* Set whether the adapter echoes: MD_ECHO is final, MD_NO_ECHO holds until an echo comes. */
 void md_port_tell_echo(struct md_port *port, int echo);
@@ -310,8 +311,9 @@ void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32
  * that is late by a period ends as MD_EXPIRED if the same exchange's next slot is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
-/* Repeat these exchanges in turn whenever no queued one is due, until they are replaced, the port is lost, or
- * one could not be sent. Return the index of the next one in the replaced round. */
+/* Repeat these exchanges in turn whenever no queued one is due. Repetition ends when the exchanges are
+ * replaced, the port is lost, or an exchange could not be sent. Return the index of the exchange that the
+ * replaced round would have sent next. */
 unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
 const struct md_progress *md_port_progress(struct md_port *port);
 /* Count a stop: urgent exchanges with an older count are not sent. */
@@ -332,16 +334,16 @@ int md_values(const struct md_block *block, const struct md_message *reply, doub
 /* ---- mastership.c, api.c: return NULL or -1 and set errno on failure; otherwise a time, or a flag ---- */
 
 int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, the clock of the times below */
-/* Return a mastership that does not hold yet; ENOSYS if the kernel lacks the timer. Ports listen to their
- * line for `guard_ns` at least. */
+/* Return a mastership that has not started yet; ENOSYS if the kernel lacks the timer. Ports listen to their
+ * line for at least `guard_ns` before they send. */
 struct md_mastership *md_mastership_new(int64_t guard_ns);
 void md_mastership_free(struct md_mastership *mastership); /* after all ports that use it */
-/* Hold until `until_ns`. The kernel kills this process at `kill_ns` unless the mastership is extended
- * before. */
+/* Make this process master until `until_ns`. The kernel kills the process at `kill_ns` unless the mastership
+ * is extended or ended before. */
 int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns);
-/* End the mastership: after this call no byte leaves, and the kernel kills no process. */
+/* End the mastership: when this call returns, no further byte leaves, and the kernel's timer is disarmed. */
 void md_mastership_end(struct md_mastership *mastership);
-int64_t md_mastership_until_ns(const struct md_mastership *mastership); /* 0: it does not hold */
+int64_t md_mastership_until_ns(const struct md_mastership *mastership); /* 0: this process is not master */
 int md_mastership_holds(const struct md_mastership *mastership);
 
 /* ---- rows ---- */
@@ -405,14 +407,14 @@ struct md_block {
 /* A row's status: why it has no value. Other values are -enum md_failure or -enum md_frame_fault. */
 enum md_status {
     MD_OK = 0,
-    MD_NOT_ASKED = 15, /* the poller skips the silent drive for a while */
+    MD_NOT_ASKED = 15, /* the poller temporarily skips a silent drive */
     MD_NO_VALUE = 18,  /* the reply holds the device's mark for "no value": NaN, an invalid count */
     MD_EXCEPTION = 256 /* + the exception's code */
 };
 
 /* Rows. All arrays have `room` elements. */
 struct md_columns {
-    int64_t *time, *sent;           /* of the request, UTC and monotonic; of its turn if it never left */
+    int64_t *time, *sent;           /* of the request, UTC and monotonic; if it was not sent, of its turn */
     int64_t *uncertainty;           /* ns between the request and the reply's first byte */
     uint16_t *drive, *reg, *status; /* enum md_status */
     double *value;
@@ -448,16 +450,18 @@ size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n
 
 /* ---- row_queue.c: return NULL without rows or memory; otherwise a number ---- */
 
-/* Return a queue of up to `most_chunks` chunks of rows; when all are full it drops and counts new rows. */
+/* Return a queue of up to `most_chunks` chunks of rows. While all chunks are full, new rows are dropped and
+ * counted. */
 struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
 /* Free the queue as soon as no port reports to it and all taken chunks are given back. */
 void md_row_queue_free(struct md_row_queue *row_queue);
-/* Add rows for values that were due at `due_ns` but not asked for. */
+/* Add rows for values that were due at `due_ns` but not requested. */
 void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
                        int64_t due_ns);
 struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
 void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
-size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* that hold rows; the newest is still growing */
+/* Return how many chunks hold rows, including the newest one, which still grows. */
+size_t md_row_queue_chunks(struct md_row_queue *row_queue);
 uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* dropped rows */
 void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client */
 /* Wait for a call, at most `timeout_ns`; write each called number once, and return how many. */

@@ -46,8 +46,8 @@ int64_t md_port_receive(struct md_port *port)
     return now_ns;
 }
 
-/* Check that this process may still send; 0: the request must wait or has ended. Call it right before
- * write(2); only the switching of a transceiver by RTS comes between. */
+/* Return 1 if this process may still send, 0 if the request must wait or has ended. Call this right before
+ * write(2); only the switching of a transceiver by RTS may come in between. */
 static int may_send(struct md_port *port)
 {
     struct md_line *line = &port->turn.line;
@@ -63,7 +63,7 @@ static int may_send(struct md_port *port)
     return !md_listen_begin(line, md_now_ns(), port->mastership->guard_ns);
 }
 
-/* Return 1 if the request's time is over, by a clock that counts the machine's sleep. */
+/* Return 1 if the request has expired, by a clock that includes the computer's sleep. */
 static int is_expired(const struct md_turn *turn)
 {
     if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
@@ -71,9 +71,9 @@ static int is_expired(const struct md_turn *turn)
     return turn->urgent->expires_ns && md_boottime_ns() > turn->urgent->expires_ns;
 }
 
-/* Write; 1: the port took bytes, or there is other work. The send time is the start of the write. If the
- * thread was suspended during it, the send time is its end: too early a time would make the waits for the
- * reply, and for a late one, too short. */
+/* Write the request; return 1 if the port took bytes or has other work. The send time is the start of the
+ * write. If the thread was suspended during the write, the send time is the end of the write: with too
+ * early a time, the waits for the reply and for late replies would be too short. */
 static int write_request(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;
@@ -114,7 +114,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;
     if (refused < 0 || (refused & port->must_take))
-        port->settings = (struct md_settings){0}; /* some may be in force */
+        port->settings = (struct md_settings){0}; /* unknown: the port may have taken some of them */
     if (refused < 0)
         lose(port, -refused);
     else if (refused & port->must_take)
@@ -128,10 +128,10 @@ static int is_sent(const struct md_port *port)
     return port->turn.whose != MD_NOBODYS && port->turn.line.completion->sent_ns;
 }
 
-/* A sleeping processor wakes late, by much the same time each time. Therefore the sleep before a request
- * ends early by that time, and the thread spins for the rest: with few lines some 20 us of each exchange.
- * That is not worth it for a client that waits: its own delays are longer and vary more. Reads of a reply
- * may be early, so the thread does not spin for them. */
+/* A sleeping processor always wakes late, by about the same time. Therefore the thread sleeps that much
+ * shorter before a request and spins for the rest: with few lines some 20 us of each exchange. Spinning is
+ * not worth it for a client that waits, because the client's own delays are longer and vary more. The
+ * thread does not spin before the read of a reply either, because that read may be early. */
 static int is_worth_spinning(const struct md_port *port)
 {
     return port->engine->count <= MOST_SPINNING && port->turn.whose != MD_URGENT;
@@ -142,19 +142,19 @@ static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
     int64_t most_ns = is_worth_spinning(port) ? MD_MOST_LATENESS : NO_SLEEP_NS;
     if (until_ns - *now_ns > most_ns || port->turn.progress.lost)
         return 0;
-    if (!port->is_empty) /* read now, not when the request must leave */
+    if (!port->is_empty) /* read the port before the request must leave */
         *now_ns = md_port_receive(port);
     while (*now_ns < until_ns)
         *now_ns = md_now_ns();
     return 1;
 }
 
-/* Carry out the wanted action; 1: ask for the next one. */
+/* Carry out the wanted action; return 1 if the next one can follow immediately. */
 static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns)
 {
     const struct md_exchange *exchange = port->turn.line.exchange;
     switch (want) {
-    case MD_WRITE: /* after a switch ask again, because a stop may have come */
+    case MD_WRITE: /* after a switch of settings ask again, because a stop may have come */
         if (!is_in_force(port, &exchange->settings)) {
             *now_ns = apply(port, &exchange->settings);
             return 1;
@@ -178,7 +178,7 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
 }
 
 /* Return 1 if a client that reads repeatedly will be back before the line's silence is over. The thread wakes
- * at its end, so the client need not wake it. */
+ * at the end of the silence, so the client need not wake it. */
 static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
 {
     return turn->whose == MD_NOBODYS && turn->last == MD_URGENT &&
@@ -199,7 +199,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
     int want, failure = md_rs485_look(port, now_ns);
     if (failure && !turn->progress.lost)
         lose(port, -failure);
-    if (port->is_closing) { /* it only lets its last request leave */
+    if (port->is_closing) { /* only wait until the last request has left */
         engine->wakes[port->index] = direction_ns(port);
         return now_ns;
     }

@@ -1,16 +1,18 @@
-/* The reply among the bytes since the request: when to read the port, where the reply starts, what it shows.
+/* Find the reply among the bytes since the request: when to read the port, where the reply starts, and what
+ * the reply shows about drive and adapter.
  *
- * It may start at any byte. Late replies may precede it or replace it. frame.c and body.c check it against
- * its request. */
+ * The reply may start at any byte. Late replies may precede or replace it. frame.c and body.c check the
+ * reply against its request. */
 #include "line.h"
 
 #include <string.h>
 
 /* ---- adapters that echo ---- */
 
-/* Some adapters repeat the bytes that they send. A reply that differs from its request shows whether the
- * adapter does, and so does a copy without other bytes before a timeout. While that is unknown, no copy
- * counts as the reply. body.c checks that a reply repeats the written address and value. */
+/* Some adapters echo the bytes that they send. Whether an adapter echoes is learnt from a reply that
+ * differs from its request, or from a copy of the request and no other bytes before a timeout. As long as
+ * it is unknown, no copy counts as the reply. body.c checks that a reply repeats the written address and
+ * value. */
 
 enum { MOST_LONE_COPIES = 2 }; /* copies accepted as replies before the next echo probe */
 
@@ -76,7 +78,7 @@ static void learn_echo(struct md_line *line, size_t reply_at)
 
 enum copy { IS_ECHO, MAY_BE_REPLY, IS_REPLY };
 
-/* Classify a copy without other bytes: from the adapter, or from the drive if its reply may equal the
+/* Classify a copy without other bytes: the adapter's echo, or the drive's reply if that may equal the
  * request. */
 
 static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
@@ -92,7 +94,7 @@ static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
     return IS_REPLY;
 }
 
-/* An adapter that did not echo may have started to, and the drive that seems to answer may be dead. */
+/* An adapter may have started to echo: then the drive that seems to answer may be dead. */
 int md_echo_is_in_doubt(const struct md_line *line)
 {
     return line->echo == MD_ECHO_UNKNOWN || line->lone_copies == MOST_LONE_COPIES;
@@ -116,7 +118,7 @@ void md_echo_keep(struct md_line *line)
 /* ---- replies ---- */
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
-static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; oldest such value in a row */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; age limit of such values in rows */
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {
@@ -140,7 +142,7 @@ void md_reply_await(struct md_line *line, int reply_len)
     if (line->burst > 0 && drive->failures == 0) {
         int64_t begun_ns = timeout_ns + (line->burst + 2) * exchange->character_ns;
         line->begun_by_ns = sooner(line->quiet_ns + begun_ns, line->begun_by_ns);
-        if (line->begun_by_ns + begun_ns < line->ready_ns) /* an early read costs less */
+        if (line->begun_by_ns + begun_ns < line->ready_ns) /* an early read costs less than a late one */
             line->ready_ns = line->begun_by_ns;
     }
     line->missing_ns = 0;
@@ -156,7 +158,7 @@ int md_reply_has_begun(const struct md_line *line)
     return line->rx_len > 0 && !(line->rx_len == line->tx_len && md_echo_is_copy(line, 0));
 }
 
-/* A reply comes character by character: do not read each. */
+/* A reply comes character by character: wait for several before each read. */
 void md_reply_foresee(struct md_line *line, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -192,8 +194,9 @@ static void measure(struct md_line *line, int reply_len)
     struct md_drive *drive = exchange->drive;
     int64_t request_ns = md_wire_ns(exchange, line->tx_len), reply_ns = md_wire_ns(exchange, reply_len);
     int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
-    /* The time of the last character dates the first one better than a late read does. That fails on ports
-     * that are faster than their settings, such as pseudo-terminals, where all bytes may come at once. */
+    /* Compute the first character's time from the last one's: that is more exact than the time of a late
+     * read. It fails on ports that are faster than their settings, such as pseudo-terminals, because all
+     * their bytes may come together. */
     line->is_quicker |= begun_ns < left_ns;
     if (!line->is_quicker)
         completion->first_ns =
@@ -253,13 +256,14 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
         int used = md_late_take(line, at, now_ns, NULL);
         if (used > 0) {
             at += (size_t)used - 1;
-            line->rx_from = (uint16_t)(at + 1); /* count it once only */
+            line->rx_from = (uint16_t)(at + 1); /* count this late reply only once */
         }
     }
 }
 
-/* The reply answers this request or an earlier one, and the other reply may still come. A row can hold it,
- * with an uncertainty that covers both. A client that waits needs the present value: read it again. */
+/* End with a reply that answers this request or an earlier one; the other reply may still come. A row can
+ * hold this value, with an uncertainty that covers both requests. A client that waits needs the present
+ * value: read it again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
                                      const struct md_message *reply, int64_t now_ns, int64_t since_ns)
 {
@@ -279,7 +283,8 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
     return (struct md_ending){used, at, (size_t)used};
 }
 
-/* The first reply may answer another process: ask again. It still shows whether the adapter echoes. */
+/* The first reply may answer another process's request: send the request again. The reply still shows whether
+ * the adapter echoes. */
 static struct md_ending doubt_first(struct md_line *line, size_t at, int used, int64_t now_ns)
 {
     line->completion->skipped -= (uint32_t)used;
@@ -319,8 +324,8 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
     return 0;
 }
 
-/* Find another master's read in front of a reply to a read: the reply probably answers that one. Return its
- * index; SIZE_MAX: none. */
+/* Find another master's read request before a reply to a read: the reply probably answers that request.
+ * Return the request's index; SIZE_MAX: none. */
 static size_t find_foreign_read(const struct md_line *line, size_t reply_at)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -381,7 +386,7 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
 
 /* ---- no reply ---- */
 
-/* Return 1 if the bytes start with a damaged frame of the drive: then it has answered. Foreign frames,
+/* Return 1 if the bytes start with a damaged frame of the drive: then the drive has answered. Foreign frames,
  * echo and noise do not count, and later bytes may be the inside of another frame. */
 static int is_damaged_answer(const struct md_line *line, size_t begin, int found)
 {
@@ -411,7 +416,7 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns)
         is_doubtful = copy == MAY_BE_REPLY;
     }
     int first = begin == line->rx_len ? MD_NO_REPLY : md_reply_parse(line, begin, &reply);
-    /* With other requests outstanding it may answer one of those. */
+    /* If other requests are outstanding, the damaged frame may answer one of them. */
     if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first))
         md_late_expect(line, md_window_ns(exchange));
     if (!is_doubtful)

@@ -1,4 +1,4 @@
-/* A queue of rows and calls from the engine's thread to a client.
+/* A queue of rows from the engine's thread to a client, and of calls that wake the client.
  *
  * The thread never waits for a client: rows collect in a bounded number of chunks. The thread holds the
  * lock while it adds one exchange's rows, a client while it removes a chunk. */
@@ -19,10 +19,10 @@ struct md_row_queue {
     size_t first, count;        /* of the chunks that hold rows */
     struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
     size_t spares;
-    size_t lent;                /* chunks in a client's hands, and ports that report to it */
+    size_t lent;                /* chunks that clients hold, plus ports that report to the queue */
     int is_done;                /* its client has freed it */
     uint64_t dropped;
-    uint64_t called[WORDS];     /* a bit for each number */
+    uint64_t called[WORDS];     /* a bit for each called number */
     uint32_t calls;             /* bits that are set */
 };
 

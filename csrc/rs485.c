@@ -2,8 +2,9 @@
  * around each request.
  *
  * RTS must fall after the last stop bit, and before a drive answers, 3.5 characters later. No function
- * waits: the thread checks when the last bit must have left. If the UART reports its end (TIOCSERGETLSR),
- * that decides. Otherwise the driver's queue must be empty, plus the time of one character. */
+ * waits: the thread checks at the time when the last bit should have left. If the UART can report that its
+ * last bit has left (TIOCSERGETLSR), that report decides. Otherwise the last bit counts as sent one
+ * character after the driver's queue was empty. */
 #define _GNU_SOURCE
 #include "engine.h"
 
@@ -34,7 +35,7 @@ static int is_out(struct md_port *port, int64_t now_ns)
     }
     if (!rs485->empty_ns)
         rs485->empty_ns = now_ns;
-    rs485->look_ns = rs485->empty_ns + rs485->character_ns; /* for the character in its shift register */
+    rs485->look_ns = rs485->empty_ns + rs485->character_ns; /* one character is still in the shift register */
     return now_ns >= rs485->look_ns;
 }
 
@@ -47,7 +48,7 @@ int md_rs485_begin(struct md_port *port, int mode)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.tells_end = md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = steer(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* else the closed port sends forever */
+        if (!failure && mode == MD_RS485_RTS_DOWN) /* otherwise the closed port would send forever */
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)
@@ -68,7 +69,7 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
     ssize_t written = md_descriptor_write(port->fd, bytes, len);
     int error = errno;
     if (written > 0) {
-        rs485->character_ns = port->turn.line.exchange->character_ns; /* it may end first */
+        rs485->character_ns = port->turn.line.exchange->character_ns; /* the exchange may end first */
         rs485->sent_ns = later(rs485->sent_ns, md_now_ns()) + written * rs485->character_ns;
         rs485->look_ns = rs485->sent_ns;
         rs485->empty_ns = 0;

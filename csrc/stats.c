@@ -1,10 +1,11 @@
-/* A drive's response delays: when to read the port, how long to wait; and its counters. */
+/* A drive's statistics: from its response delays, when to read the port and how long to wait; and its
+ * counters. */
 #include "internal.h"
 
 /* ---- when to read the port ---- */
 
-/* Prefer to read early: that costs one wake-up, and a late read delays the next request. A read timed to
- * the exact end of replies saved one sleep of three, but lost 1/300 of the line's time, because sleeps end
+/* Read early: an early read costs one wake-up, but a late read delays the next request. Reads timed to the
+ * exact end of replies saved one sleep of three, but lost 1/300 of the line's time, because sleeps end
  * late. */
 static int64_t early_look_ns(const struct md_exchange *exchange)
 {
@@ -12,9 +13,9 @@ static int64_t early_look_ns(const struct md_exchange *exchange)
     return later(0, drive->delay_ns - drive->deviation_ns - exchange->character_ns / 2);
 }
 
-/* A client that waits for values comes back later than a steady drive's delays vary, and each wake-up
- * costs it much: caches are cold. Therefore all but one in SURE of its reads come when the reply must be
- * whole. The one early read shows whether replies have become faster. */
+/* For a client that waits for values each wake-up is expensive, because caches are cold, and its own
+ * delays are longer than the variation of a steady drive's delays. Therefore the port is read when the
+ * reply must be complete. Only one read in SURE is early, to detect that replies have become faster. */
 enum { SURE = 8 };
 
 static int is_sure(const struct md_exchange *exchange)
@@ -52,10 +53,11 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
     return sooner(usual_ns, drive->most_timeout_ns);
 }
 
-/* After a failure a request gets the whole time that the document allows: the drive may have become
- * slower. While it stays silent that is rare, because the other drives lose that time. A stop must be
- * repeated sooner. Its time doubles after each failure except the first, which is the identity check's. If
- * replies are known to be late, it may wait as long as its sender allows. */
+/* The first request after a failure gets the longest timeout that the document allows, because the drive
+ * may have become slower. While the drive stays silent, only one request in RARELY gets it, because the
+ * other drives lose that time. A stop must be repeated sooner: its timeout doubles after each failure
+ * except the first, which is the identity check's. If replies are known to be late, a stop may wait as
+ * long as its sender allows. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
@@ -103,7 +105,8 @@ static void smooth(struct md_drive *drive, int64_t delay_ns)
     learn(&drive->delay_ns, later(drive->delay_ns + off_ns / 8, 1));
 }
 
-/* Only used to take a copy of the request for its reply; a stop's reads do without that. */
+/* md_reply_due_ns() serves only to accept a copy of the request as the reply; a stop's reads do not need
+ * it. */
 enum { WELL_KNOWN = 8 }; /* replies */
 
 int64_t md_reply_due_ns(const struct md_exchange *exchange)
@@ -140,8 +143,8 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
     return delay_ns;
 }
 
-/* Add half, because delays vary. If the request was sent several times, it is unknown which one is
- * answered. */
+/* Add half of the delay, because delays vary. If the request was sent several times, it is unknown which one
+ * the reply answers. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact)
 {
     int64_t patience_ns = sooner(delay_ns + delay_ns / 2, MOST_PATIENCE);
@@ -187,7 +190,7 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
     struct md_counters *counters = &drive->counters;
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
     if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
-        values = 0; /* the client reads them again */
+        values = 0; /* not counted: the client reads them again */
     uint8_t exception = completion->reply.exception;
     counters->exchanges++;
     counters->sent += completion->sent_ns != 0;

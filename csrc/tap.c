@@ -1,7 +1,7 @@
 /* A ring of all bytes on a line, read as packets of a pcapng file.
  *
- * The line's thread writes, one other thread reads, and neither waits for the other: bytes that do not fit
- * are counted. */
+ * The line's thread writes, one other thread reads, and neither waits for the other. Bytes that do not fit
+ * are dropped and counted. */
 #include "internal.h"
 
 #include <string.h>
@@ -24,7 +24,7 @@ static void set(uint32_t *counter, uint32_t value)
     __atomic_store_n(counter, value, __ATOMIC_RELEASE);
 }
 
-/* Return the address of a ring position; set `first` to the bytes of `len` before the ring's end. */
+/* Return the address of a ring position; set `first` to how many of `len` bytes fit before the ring's end. */
 static uint8_t *place(const struct md_tap *tap, uint32_t at, size_t len, size_t *first)
 {
     uint32_t offset = at & (tap->room - 1);
@@ -71,7 +71,7 @@ static uint8_t *put32(uint8_t *at, uint32_t value)
     return at;
 }
 
-/* Write a packet without its bytes; return the address for them. */
+/* Write a packet's header and trailer; return the address for its bytes. */
 static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int64_t time_ns, uint32_t len,
                      uint8_t *out)
 {

@@ -1,8 +1,8 @@
 /* Modbus TCP (messaging guide V1.0b): frames from a stream, and the matching of replies.
  *
  * A reply repeats its request's transaction id. One with another id is late or foreign, and is skipped, so no
- * late reply can be mistaken for another's. If a gateway replies with its own ids, the rules of late.c apply
- * instead.
+ * late reply can be mistaken for the reply to another request. If a gateway replies with its own ids, the
+ * rules of late.c apply instead.
  *
  * Only the header gives a frame's length. If a device sends more or fewer bytes, the header of the awaited
  * reply is found by its id, unit and function. If the first bytes on a port are not a header, the far end
@@ -42,8 +42,8 @@ static int may_be_awaited(const struct md_line *line, const uint8_t *bytes, size
     return 1;
 }
 
-/* Return the length of the current frame, as md_tcp_length(). In the awaited reply an exception has a fixed
- * length, and an impossible length counts as that of the header. */
+/* Return the length of the current frame, as md_tcp_length(). If the frame is the awaited reply, an exception
+ * has its fixed length, and an impossible length counts as that of the header alone. */
 static int frame_length(const struct md_line *line)
 {
     int whole = md_tcp_length(line->frame, line->frame_len);
@@ -71,7 +71,7 @@ static void cut_off(struct md_line *line, size_t len)
     memmove(line->frame, line->frame + len, line->frame_len);
 }
 
-/* Drop all bytes except a start of the awaited reply. */
+/* Drop all bytes before a possible start of the awaited reply. */
 static void realign(struct md_line *line, int64_t now_ns)
 {
     cut_off(line, line->frame_told);
@@ -119,7 +119,7 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
 {
     size_t enough = line->transactions == MD_IGNORED ? KNOWN_HEAD : MD_TCP_HEAD;
     if (line->is_adrift && line->frame_told && len >= enough && may_be_awaited(line, bytes, len))
-        drop(line, now_ns); /* its rest is missing */
+        drop(line, now_ns); /* the rest of the frame is missing */
     if (line->is_adrift && !line->frame_told)
         return seek(line, bytes, len, now_ns);
     int whole = frame_length(line);
@@ -139,7 +139,7 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
 /* Append the current frame to rx and return its index. Do not report a byte twice. */
 static size_t keep(struct md_line *line)
 {
-    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* endless unrelated frames */
+    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* too many unrelated frames */
         md_tap_put(line->tap, MD_NOISE, line->completion->last_ns, line->rx, line->rx_len);
         line->rx_len = 0;
     }
@@ -177,7 +177,7 @@ static void expect(struct md_line *line)
         remember(line);
 }
 
-/* Drop this request and all earlier ones: they are answered, or never will be. */
+/* Drop this request and all earlier ones: no further reply to them will come. */
 static void forget_up_to(struct md_drive *drive, uint32_t last)
 {
     struct md_unanswered *unanswered = drive->history->unanswered;
@@ -196,7 +196,7 @@ static int is_reply_to(const struct md_line *line, const struct md_unanswered *u
            !md_is_gateways(MD_TCP, &reply);
 }
 
-/* Learn how late a drive is, if the frame is its late reply. */
+/* If the frame is a drive's late reply, learn how late it is. */
 static void learn_late(struct md_line *line, int64_t now_ns)
 {
     for (struct md_drive **link = &line->late; *link;) {

@@ -64,7 +64,7 @@ static uint32_t speed(const attributes *now)
 }
 #endif
 
-#ifndef CRTSCTS /* POSIX knows no flow control by wires */
+#ifndef CRTSCTS /* POSIX does not define hardware flow control */
 #define CRTSCTS 0
 #endif
 
@@ -78,7 +78,8 @@ static struct md_settings describe(const attributes *now)
     };
 }
 
-/* Adapters report the speed that their divisor gives. Receivers tolerate 2 %, the kernel's limit too. */
+/* Adapters report the speed that their divisor yields. A deviation of 2 % is tolerated by receivers, and
+ * is also the kernel's limit. */
 static int is_near(uint32_t baudrate, uint32_t wanted)
 {
     uint32_t off = baudrate > wanted ? baudrate - wanted : wanted - baudrate;

@@ -9,8 +9,8 @@
 
 enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */
 
-/* Return a request to send before the exchange: a proof, so that no late reply is mistaken for its own, or an
- * echo probe. NULL: send the exchange itself. */
+/* Return the request to send before the exchange: an echo probe, or a proof, which prevents that a late
+ * reply is mistaken for the exchange's. NULL: send the exchange itself. */
 
 static const struct md_exchange *find_before(struct md_before *before, const struct md_exchange *exchange,
                                              int is_echo_in_doubt, int64_t now_ns)
@@ -31,8 +31,8 @@ static const struct md_exchange *find_before(struct md_before *before, const str
     return exchange->echo_probe;
 }
 
-/* Return 1 to send the exchange again, because its reply may have been an earlier one's. Never repeat a
- * write: it may have started a motor. */
+/* Return 1 if the exchange must be sent again, because its reply may belong to an earlier request. A write is
+ * never repeated: it may have started a motor. */
 static int is_again(struct md_before *before, const struct md_exchange *exchange,
                     const struct md_completion *completion)
 {
@@ -81,7 +81,7 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
     if (*at && turn->whose == MD_URGENT) /* the first one is in flight */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* first come, first served */
+        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* otherwise in order of arrival */
             at = &(*waiting)->next;
     urgent->next = *at;
     *at = urgent;
@@ -137,7 +137,7 @@ void md_count_stop(uint32_t *stops)
 
 enum {
     POLLED = 20,            /* polling gets 1/20 of a line that urgent requests keep busy */
-    MOST_OWED_NS = 50000000 /* bound of that debt, if no poll was due for a while */
+    MOST_OWED_NS = 50000000 /* limit of the line time owed to polling */
 };
 
 static uint32_t pending(const struct md_turn *turn)
@@ -162,13 +162,13 @@ static int is_time(int64_t from_ns, int64_t *wake_ns, int64_t now_ns)
 
 /* ---- the start of an exchange ---- */
 
-/* Return the time from which its drive may be asked. A broadcast waits for no drive. */
+/* Return the earliest time for a request to the exchange's drive. A broadcast waits for no drive. */
 static int64_t ready_ns(const struct md_exchange *exchange)
 {
     return exchange->request.address ? exchange->drive->ready_ns : 0;
 }
 
-/* Start the exchange and return 1, or start a request that must precede it and return 0. */
+/* Start the exchange and return 1; or, if another request must precede it, start that one and return 0. */
 static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
@@ -183,7 +183,7 @@ static int begin(struct md_turn *turn, int whose, const struct md_exchange *exch
 
 /* ---- urgent requests ---- */
 
-/* Return 1 if a stop came after the urgent request in flight, of which no byte has left. */
+/* Return 1 if a stop came after the urgent request in flight and no byte of the request has left. */
 static int is_overtaken(const struct md_turn *turn)
 {
     if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
@@ -213,7 +213,7 @@ static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t
 
 /* ---- polling ---- */
 
-/* Return 1 if the same exchange's next slot is already due: then skip this one. */
+/* Return 1 if the slot must be skipped, because the same exchange's next slot is already due. */
 static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64_t now_ns)
 {
     int64_t period_ns = slot->exchange->period_ns;
@@ -286,8 +286,8 @@ static int is_stop_waiting(const struct md_turn *turn)
     return 0;
 }
 
-/* Return 1 if one polled exchange goes ahead of urgent requests: never two in a row, and never before a
- * stop. */
+/* Return 1 if it is a polled exchange's turn before the urgent requests: never twice in a row, and never
+ * before a stop. */
 static int is_polls_turn(const struct md_turn *turn)
 {
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
@@ -363,11 +363,11 @@ static void finish(struct md_turn *turn)
         if (left == turn->room / 4 || left == 0)
             call(turn);
     } else if (turn->completion.result < 0 && !turn->completion.sent_ns) {
-        stop_repeating(turn); /* otherwise it would fail again and again */
+        stop_repeating(turn); /* otherwise the exchange would fail repeatedly */
     }
 }
 
-/* Put back an exchange that only listens so far, because a stop must not wait for it. */
+/* If the exchange in flight only listens so far, put it back, because a stop must not wait for it. */
 static void give_way(struct md_turn *turn)
 {
     int whose = turn->whose;
@@ -419,8 +419,8 @@ void md_turn_lose(struct md_turn *turn, int error)
     stop_repeating(turn);
 }
 
-/* Waiting clients get a completion that shows whether their request left. An ended poll still gets its
- * rows. */
+/* Waiting clients get a completion that shows whether their request left. A polled exchange that is ended
+ * here still gets its rows. */
 void md_turn_close(struct md_turn *turn)
 {
     int is_told = turn->whose == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;

@@ -1,4 +1,4 @@
-/* Waits for many descriptors at once, by epoll. */
+/* Waits for many descriptors together, with epoll. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -12,7 +12,7 @@
 #define SYS_epoll_pwait2 (-1) /* headers older than Linux 5.11 lack it; no kernel has a call -1 */
 #endif
 
-enum { EVENTS = 256 }; /* taken at a time */
+enum { EVENTS = 256 }; /* fetched per system call */
 
 typedef int wait_function(int epoll, struct epoll_event *events, int most, int64_t timeout_ns);
 
@@ -21,8 +21,8 @@ struct md_waiter {
     wait_function *wait;
 };
 
-/* Calls epoll_pwait2() by its number, because musl and glibc before 2.35 have no function for it. Its two
- * times are 64 bits wide on all systems. */
+/* Calls epoll_pwait2() by its number, because musl and glibc before 2.35 have no function for it. The two
+ * fields of its timeout are 64 bits wide on all systems. */
 static int wait_at_once(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
     const int64_t span[] = {timeout_ns / MD_SECOND_NS, timeout_ns % MD_SECOND_NS};

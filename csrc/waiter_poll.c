@@ -1,4 +1,4 @@
-/* Waits for many descriptors at once, by poll(), which every POSIX system has. */
+/* Waits for many descriptors together, with poll(), which every POSIX system has. */
 #ifdef __linux__
 #define _GNU_SOURCE
 #endif
@@ -9,7 +9,7 @@
 #include <stdlib.h>
 
 struct md_waiter {
-    struct pollfd *fds; /* unwatched ones are stored as their complement, which poll() ignores */
+    struct pollfd *fds; /* an unwatched descriptor is stored as ~fd, which poll() ignores */
     void **whose;
     int count, room;
 };
@@ -84,7 +84,7 @@ void md_waiter_remove(struct md_waiter *waiter, int fd)
     waiter->whose[at] = waiter->whose[waiter->count];
 }
 
-/* Without ppoll() the wait ends on a whole millisecond, and the caller waits for the rest. */
+/* Without ppoll() the wait lasts whole milliseconds, and the caller waits for the rest. */
 static int wait_for_any(struct md_waiter *waiter, int64_t timeout_ns)
 {
 #ifdef __linux__

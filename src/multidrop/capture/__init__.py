@@ -2,8 +2,8 @@
 
 `CaptureWriter` writes pcapng with link type 252 (Wireshark's "exported PDU"), one packet a frame, with
 ns time stamps, direction, and the line's name as the interface's. Wireshark decodes RTU frames as
-Modbus RTU at once; with the preference `mbrtu.tcp.port` set to 502 it also tells requests from replies
-where both look alike (functions 05, 06 and 08):
+Modbus RTU without configuration. With the preference `mbrtu.tcp.port` set to 502 it also distinguishes
+requests from replies if both look alike (functions 05, 06 and 08):
 
     tshark -r line.pcapng -o mbrtu.tcp.port:502
 

@@ -1,7 +1,7 @@
 """Captures as columns: a row for every register that was read or written, and for every miss.
 
-Rows are those of a poll: `time` is the request's time stamp, and the value was taken between it and the
-reply's. A capture has one clock only: `monotonic_ns` equals `time`.
+Rows are like those of a poll: `time` is the request's time stamp, and the value was taken between the time
+stamps of request and reply. A capture has only one clock, so `monotonic_ns` equals `time`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from multidrop.iso_time import format_time
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
-ROWS = 1 << 16  # of a batch, at most
+ROWS = 1 << 16  # limit of a batch
 _MOST_NAMES = 60_000  # of registers; a column's codes end at 65535
 
 
@@ -81,7 +81,7 @@ class _LineDecoding:
                 continue
             yield Batch(self._columns, self._drives, self._registers)
             self._columns = Columns(ROWS)
-            if done is Decoded.UNKNOWN:  # the decoder knows too many requests
+            if done is Decoded.UNKNOWN:  # the decoder's table of requests is full
                 self.decoder.forget()
                 self._begin()
 
@@ -122,14 +122,14 @@ _TABLES = {
     0x10: "holding_register",
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
-_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # in a reply, whatever the request asks for
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # limit for a reply, whatever its request says
 _WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # by function
 _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
 
 
 @dataclass(frozen=True)
 class RegisterPlace:
-    """A register, None for an unknown one, and its offset in an exchange's data, in words or bits."""
+    """A register (None: unknown) and its offset in an exchange's data, in words or bits."""
 
     name: str
     at: int
@@ -184,7 +184,7 @@ def _known(
 
 
 def _offset(register: Register[Any], request: Message) -> int | None:
-    """Return the register's offset in the data; None unless the request covers all that its value needs."""
+    """Return the register's offset in the data; None if the request does not cover the whole register."""
     if register.table.carrier is Carrier.NUMBER:
         return 0
     end, reach = request.start + max(request.count, 1), register.reach
@@ -208,7 +208,7 @@ _MOST_BYTES = 32
 
 
 class ExchangeFormatter:
-    """Format the exchanges of one line, in engineering units if the plant is known."""
+    """Formats the exchanges of one line, in engineering units if the plant is known."""
 
     def __init__(self, lookup: RegisterLookup) -> None:
         self._lookup = lookup
@@ -307,7 +307,7 @@ def _number(place: RegisterPlace, data: bytes) -> float | int | None:
         number = place.register.number_in(data, place.at)
         return number if number is None or place.register.values is None else int(number)
     raw = raw_value(data, place.at, place.number_format)
-    return int(raw) if raw == raw else None  # NaN: the data ends before it
+    return int(raw) if raw == raw else None  # NaN: the data ends before this register
 
 
 def _shown(place: RegisterPlace, data: bytes) -> str:

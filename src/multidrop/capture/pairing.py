@@ -18,9 +18,9 @@ def _is_broadcast(framing: Framing, request: Message) -> bool:
 
 @dataclass(frozen=True)
 class SniffedExchange:
-    """A request and its reply; one of the two is None if it was not sniffed or never sent.
+    """A request and its reply. One of the two is None if it was not sniffed or never sent.
 
-    `is_sure` is False if the request may be the copy that confirms an earlier one.
+    `is_sure` is False if the request may actually be the reply that confirms an earlier request.
     """
 
     framing: Framing
@@ -48,7 +48,7 @@ Sniffed = SniffedExchange | Junk
 
 
 class Pairing:
-    """Pair the frames of one line, and count them."""
+    """Pairs the requests and replies of one line, and counts them."""
 
     def __init__(self) -> None:
         self._counts = dict.fromkeys(_COUNTED, 0)
@@ -56,7 +56,7 @@ class Pairing:
         self._junk: list[FrameSpan] = []
 
     def pair(self, spans: Iterable[FrameSpan]) -> Iterator[Sniffed]:
-        """Yield the spans' exchanges; a request waits for its reply or the next request."""
+        """Yield the exchanges in the spans. A request is kept until its reply or the next request comes."""
         for span in spans:
             if span.kind is Kind.JUNK:
                 yield from self._add_junk(span)

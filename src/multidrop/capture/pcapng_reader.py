@@ -1,7 +1,7 @@
-"""Read captures: pcap and pcapng files, ours and others', as streams of bytes on lines.
+"""Read captures: pcap and pcapng files, from multidrop or other programs, as a stream of bytes per line.
 
-A capture is read in pieces: it may be larger than memory, and if the file is truncated while it is read,
-that is an error. A mapped file would then crash the process.
+A capture is read in pieces, because it may be larger than memory. It is not mapped into memory: if the file
+were truncated meanwhile, a mapping would crash the process, whereas reading raises an error.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from multidrop.core import Stream, Unpacked, Unpacker
 _OLD_PACKET, _SIMPLE_PACKET = 2, 3
 _IF_OFFSET = 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
-_MOST_OFFSET = 1 << 33  # s; nanoseconds since 1970 are kept in 64 bits
-_PCAP = {  # first four bytes: is it big-endian, ticks in a second
+_MOST_OFFSET = 1 << 33  # s; times in ns since 1970 must fit into 64 bits
+_PCAP = {  # by the first four bytes: whether it is big-endian, and ticks per second
     b"\xd4\xc3\xb2\xa1": (False, 10**6),
     b"\xa1\xb2\xc3\xd4": (True, 10**6),
     b"\x4d\x3c\xb2\xa1": (False, 10**9),
@@ -44,8 +44,9 @@ class CaptureError(ValueError):
 class Capture:
     """A capture file; leaving the `with` block closes it. Raises CaptureError, and OSError.
 
-    `lines` has the name of every interface met so far, and `streams` its bytes; `truncated` is the
-    number of bytes of an incomplete packet at the file's end: the writer was killed, or the disk was full.
+    `lines` has the name of every interface found so far, and `streams` its bytes. `truncated` is the number
+    of bytes of an incomplete packet at the file's end, which is left if the writer was killed or the disk was
+    full.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -78,7 +79,7 @@ class Capture:
     def _begin(self) -> None:
         if not self._file.seekable():  # a serial port, or a pipe
             raise CaptureError(f"{self.path} is not a capture: it is no file")
-        self._size = self._file.seek(0, SEEK_END)  # later additions are not read
+        self._size = self._file.seek(0, SEEK_END)  # bytes appended later are not read
         if not self._size:
             raise CaptureError(f"{self.path} is not a capture: it is empty")
         magic = self._piece(0, 4)
@@ -99,7 +100,7 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it does not begin like pcap or pcapng")
 
     def __iter__(self) -> Iterator[None]:
-        """Fill `streams`; at each step, and at the end, the caller takes frames from every stream."""
+        """Fill `streams` in steps. After each step, and at the end, the caller empties all streams."""
         unpacker = self._unpacker
         assert unpacker is not None
         seen = unpacker.at  # end of the bytes read
@@ -124,7 +125,7 @@ class Capture:
         yield
 
     def _piece(self, at: int, most: int) -> bytes:
-        """Return so many bytes of the file, or all that there are."""
+        """Return up to `most` bytes of the file from `at` on."""
         self._file.seek(at)
         piece = self._file.read(most)
         if len(piece) < min(most, self._size - at):
@@ -135,7 +136,7 @@ class Capture:
         return piece
 
     def _read_block(self, unpacker: Unpacker) -> bool:
-        """Read a block other than an enhanced packet; return False if the file is truncated."""
+        """Read a block that is no enhanced packet; return False if the file ends within it."""
         at = unpacker.at
         kind = self._read("I", at)
         if kind == SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
@@ -200,7 +201,7 @@ class Capture:
             at += 4 + size + -size % 4
 
     def _order_at(self, at: int) -> str:
-        """Return the byte order of the section at this place."""
+        """Return the byte order of the section that starts at `at`."""
         magic = self._piece(at + 8, 4)
         if magic not in (b"\x1a\x2b\x3c\x4d", b"\x4d\x3c\x2b\x1a"):
             raise self._damaged(at)

@@ -1,4 +1,4 @@
-"""Write captures: pcapng whose frames of Modbus RTU and TCP Wireshark decodes without settings."""
+"""Write captures: pcapng files in which Wireshark decodes Modbus RTU and TCP without configuration."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _TCP = 2
 class CaptureWriter:
     """A capture that is being written; leaving the `with` block closes it. Raises RecordingError.
 
-    `lines` are those whose packets are appended. Each packet is given to the system at once, so that none
-    is lost in a crash.
+    `lines` are the names of the lines whose packets will be appended. Each packet is passed to the operating
+    system immediately, so that a crash of the process loses none.
     """
 
     def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
-        from importlib.metadata import version  # slow to import, and few commands write captures
+        from importlib.metadata import version  # imported here: it is slow, and few commands write captures
 
         self.path = Path(path)
         self._lines: dict[str, int] = {}
@@ -51,13 +51,13 @@ class CaptureWriter:
             raise
 
     def write(self, raw: bytes, side: Side, time_ns: int, line: str) -> None:
-        """Append bytes that were on the line at this time (UTC, ns), such as a frame."""
+        """Append bytes, such as a frame, that were on the line at `time_ns` (UTC)."""
         if line not in self._lines:
             self._declare(line)
         self.append(WRAPPINGS.packet(self._lines[line], side, time_ns, raw))
 
     def append(self, packets: bytes) -> None:
-        """Append packets of the `lines`, whose order is that of the interfaces."""
+        """Append packets in pcapng format; interface n is the n-th of `lines`."""
         with writing(self.path):
             self._file.append(packets)
 

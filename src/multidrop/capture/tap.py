@@ -18,7 +18,7 @@ from multidrop.transport.clock import now_ns
 
 
 class Sink(Protocol):
-    """Take the packets of tapped lines, and their anomalies."""
+    """A receiver of the packets and anomalies of tapped lines."""
 
     def append(self, packets: bytes) -> None: ...
 
@@ -26,7 +26,7 @@ class Sink(Protocol):
 
 
 class Tapped:
-    """Taps on these lines, by name; call `collect` some times a second.
+    """Taps on these lines, by name. Call `collect` several times a second.
 
         poller = Poller(plant)
         with CaptureWriter("hall.pcapng", list(poller.buses)) as capture:
@@ -34,7 +34,7 @@ class Tapped:
                 for batch in poller.batches():
                     tapped.collect()
 
-    Bytes that are not collected in time are lost, and counted in `lost`.
+    Bytes that are not collected in time are dropped, and counted in `lost`.
     """
 
     def __init__(self, buses: Mapping[str, Bus], *sinks: Sink) -> None:
@@ -46,7 +46,7 @@ class Tapped:
             bus.line.tap(tap)
 
     def collect(self) -> None:
-        """Hand traffic and anomalies to the sinks. Raises RecordingError."""
+        """Pass new traffic and anomalies to the sinks. Raises RecordingError."""
         self._hand_on()
         anomalies = [anomaly for watch in self._watches for anomaly in watch.check()]
         for sink in self._sinks:
@@ -64,7 +64,7 @@ class Tapped:
         return sum(tap.lost for tap in self._taps)
 
     def close(self) -> None:
-        """Hand on the rest; a closed port is not an anomaly here."""
+        """Pass the remaining traffic to the sinks; here a closed port is not an anomaly."""
         self._hand_on()
 
     def __enter__(self) -> Self:
@@ -74,18 +74,18 @@ class Tapped:
         self.close()
 
 
-AFTER_S = 2.0  # of traffic after the anomaly are written too
-PAUSE_S = 60.0  # between two files, so that a noisy line does not fill the disk
+AFTER_S = 2.0  # a file also has this much traffic after the anomaly
+PAUSE_S = 60.0  # least time between two files, so that a noisy line does not fill the disk
 _NAME = re.compile(r"flight-\d{8}T\d{6}Z\.pcapng")
 _MOST_NAMED = 20  # anomalies in a file's comment
 
 
 class FlightRecorder:
-    """Keep the last `seconds` of the lines' traffic in memory, at most `most_bytes`.
+    """Keeps the last `seconds` of the lines' traffic in memory, at most `most_bytes`.
 
-    `AFTER_S` after an anomaly, and not before `PAUSE_S` have passed since the last file, a capture
-    `flight-<UTC>.pcapng` is written into `directory`, with the anomaly in its comment. The newest
-    The newest `most_files` are kept. `written` lists this recorder's files. Raises RecordingError.
+    `AFTER_S` after an anomaly, but at least `PAUSE_S` after the last file, it writes a capture
+    `flight-<UTC>.pcapng` into `directory`, with the anomaly in its comment. The newest `most_files` captures
+    are kept. `written` lists this recorder's files. Raises RecordingError.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class FlightRecorder:
             self.directory.mkdir(parents=True, exist_ok=True)
 
     def append(self, packets: bytes) -> None:
-        """Keep packets of the lines, and drop those that are too old or too many."""
+        """Add packets of the lines, and drop the oldest packets beyond the limits of age and size."""
         self._packets.append((now_ns(), packets))
         self._bytes += len(packets)
         while self._packets and (
@@ -123,7 +123,7 @@ class FlightRecorder:
             self._bytes -= len(self._packets.popleft()[1])
 
     def report(self, anomalies: Sequence[str]) -> None:
-        """Take note of anomalies, and write a capture if one is due."""
+        """Record anomalies, and write a capture if one is due."""
         now = now_ns()
         if anomalies and not self._anomalies:
             self._due_ns = max(now + round(AFTER_S * 1e9), self._next_ns)
@@ -132,13 +132,13 @@ class FlightRecorder:
             self._write(now)
 
     def close(self) -> None:
-        """Write the capture that is still due."""
+        """Write the capture that is still due, if any."""
         if self._anomalies and now_ns() >= self._next_ns:
             self._write(now_ns())
 
     def _write(self, now: int) -> None:
         second = (now + utc_minus_monotonic_ns()) // 10**9
-        while (path := self.directory / _name(second)).exists():  # of another recorder in this directory
+        while (path := self.directory / _name(second)).exists():  # of another recorder here
             second += 1
         with CaptureWriter(path, self._lines, "; ".join(dict.fromkeys(self._anomalies))) as capture:
             for _, packets in self._packets:
@@ -169,7 +169,7 @@ _BAD = (
 
 
 class AnomalyWatch:
-    """Find the anomalies of one line."""
+    """Finds the anomalies of one line."""
 
     def __init__(self, name: str, bus: Bus) -> None:
         self._name = name

@@ -1,4 +1,4 @@
-"""The command line: run one command, and turn a failure into a sentence and an exit status.
+"""The command line: runs one command; a failure becomes a sentence on stderr and an exit status.
 
 A command's module is imported when it runs: `multidrop --help` imports none.
 """
@@ -23,7 +23,7 @@ STOPS = (
     "stop",
     "coast",
     "emergency-stop",
-)  # sent despite SIGHUP, and despite mistakes beside the drive's name
+)  # sent despite SIGHUP, and despite mistakes in arguments other than the drive's name
 HARD_WIRED = "use the hard-wired stop"  # advice if a stop could not be sent
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
@@ -136,7 +136,7 @@ def _guarded(run: Callable[[], int]) -> int:
         status = run()
         sys.stdout.flush()
     except KeyboardInterrupt as interruption:  # its notes list the requests that were sent
-        with suppress(KeyboardInterrupt):  # a second one at once
+        with suppress(KeyboardInterrupt):  # a second Ctrl-C in quick succession
             return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
         return INTERRUPTED
     except BrokenPipeError:  # such as of `multidrop models | head`
@@ -202,7 +202,7 @@ def _run(command: str, words: list[str]) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Raises ValueError for invalid arguments, as for every other mistake of the caller."""
+    """An argument parser that raises ValueError for invalid arguments instead of exiting."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
@@ -213,7 +213,7 @@ def _parsed(
 ) -> tuple[argparse.Namespace, list[str]]:
     """Return the parsed arguments, and the words that a stop ignores. Raises ValueError for a mistake.
 
-    A stop ignores the word behind an unknown option too: it may be the option's value, so it names no drive.
+    A stop also ignores the word after an unknown option, because that may be the option's value, not a drive.
     """
     arguments, unknown = _intermixed(parser, words)
     if not unknown:

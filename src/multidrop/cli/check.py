@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _is_plant(file: Path) -> bool:
-    """Return True for a file with lines. If it cannot be read, loading it as a family reports why."""
+    """Return True for a plant file; False for an unreadable file, whose loading as a family says why."""
     try:
         return "line" in read_document(file, "file")
     except ValueError:
@@ -99,7 +99,7 @@ def _check_plant(arguments: argparse.Namespace) -> int:
 
 
 def _family(file: Path) -> type[Drive]:
-    """Return the family of a file, or a shipped one by its name. Raises ValueError for any other."""
+    """Return the family in a file, or the shipped family with this name. Raises ValueError for neither."""
     name = str(file)
     if name in MODELS:
         raise ValueError(f"{name} is built in and has no file; see `multidrop models {name}`")
@@ -136,7 +136,7 @@ _OF_A_MOTOR = {
 
 
 def unknown(family: type[Drive]) -> Iterator[Remark]:
-    """Yield the facts that the file does not state, with the key for each."""
+    """Yield each key that the file leaves out, with a sentence about the unknown fact."""
     drive = family(family.addresses[0])
     registers = family.registers.values()
     for register in registers:

@@ -65,7 +65,7 @@ def _make_room(out: Path) -> None:
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
-    """Return whether the monitor can show the demo: it writes no captures, and needs a terminal and rich."""
+    """Return whether the monitor can show the demo: no captures are wanted, and a terminal and rich exist."""
     if arguments.capture or arguments.flight_recorder:
         return False
     return not arguments.json and is_possible() and find_spec("rich") is not None

@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
-    """Yield the named line with all its drives, or the named drive, or every line without a name.
+    """Yield the named line with all its drives, or the named drive; without a name yield every line.
 
     Raises ValueError for options that belong to a port without a plant file.
     """
@@ -145,7 +145,7 @@ def _by_hand(arguments: argparse.Namespace) -> _Target:
 
 
 def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
-    """Yield the findings of a port. If there are several, one that cannot be opened is a finding too."""
+    """Yield the findings about a port. Unless it is the only one, failing to open it is also a finding."""
     try:
         yield from _findings(target)
     except LineError as failure:
@@ -167,7 +167,7 @@ def _drive(arguments: argparse.Namespace) -> Drive | None:
 
 
 def _line_settings(arguments: argparse.Namespace) -> Settings:
-    """Return the settings of the echo test if no drive is named."""
+    """Return the settings for the echo test without a drive."""
     return Settings(
         9600 if arguments.baudrate is None else arguments.baudrate,
         "8N1" if arguments.format is None else arguments.format,
@@ -217,7 +217,7 @@ def _remote(port: str) -> Iterator[Finding]:
 
 
 def _local(port: str, rs485: RS485) -> Iterator[Finding]:
-    line = Line(port, rs485=rs485).open()  # raises LineError, with the reason, when it cannot be opened
+    line = Line(port, rs485=rs485).open()  # raises LineError, with the reason, if the port cannot be opened
     try:
         yield from _opened_com(port) if sys.platform == "win32" else _opened(port, rs485)
     finally:
@@ -225,7 +225,7 @@ def _local(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _opened_com(port: str) -> Iterator[Finding]:
-    """Report the facts that Windows has about an open COM port."""
+    """Yield the facts that Windows states about an open COM port."""
     yield Finding("port", f"{port} is a serial port")
     yield Finding("set here", SETTING_UP_COM)
     yield Finding("adapter", com_description(port) or "the system lists none")
@@ -353,15 +353,15 @@ def _exception(framing: Framing, request: Message, done: Completion) -> int:
 
 
 def _is_from_gateway(drive: Drive, done: Completion) -> bool:
-    """Return True for the exception that a gateway sends if it does not reach its device."""
+    """Return True if the reply is the exception of a gateway that does not reach its device."""
     return done.reply.exception in OF_GATEWAYS and done.reply.exception not in drive.exceptions
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
     """Send up to ROUNDS requests within MOST_S; yield their outcomes.
 
-    A request that is delayed, because an earlier reply may still come, does not count. A drive that is silent
-    from the start gets UNANSWERED requests.
+    A request that was held back, because an earlier reply may still come, does not count. A drive that never
+    answers gets only UNANSWERED requests.
     """
     end = time.monotonic() + MOST_S
     count, is_silent = 0, True
@@ -378,7 +378,7 @@ def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
 # ---- the other framing ----
 
 
-TIMEOUT = 2.0  # s; a gateway waits for its drives first
+TIMEOUT = 2.0  # s; includes the time that a gateway waits for its drives
 
 
 def ask_once(port: str, request: Message, settings: Settings) -> Completion:
@@ -400,7 +400,7 @@ def ask_once(port: str, request: Message, settings: Settings) -> Completion:
 
 
 def other_way_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Report whether the far end answers in the other framing."""
+    """Return whether the far end answers in the other framing, as a finding."""
     other = other_port(port)
     way = spoken_on(other)
     try:
@@ -418,7 +418,7 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
 
 
 def unit_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Report how a Modbus TCP port answers for an unused unit id."""
+    """Return how a Modbus TCP port answers for an unused unit id, as a finding."""
     try:
         found = ask_once(port, request, settings)
     except LineError as failure:

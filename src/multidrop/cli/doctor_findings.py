@@ -19,7 +19,7 @@ from multidrop.transport.port_identity import of_name
 
 LATENCY_MS = 1  # a larger latency timer is worth changing
 ROUNDS = 20
-SLOW_S = 0.005  # a larger excess over a drive's usual response delay is reported
+SLOW_S = 0.005  # a delay that exceeds the drive's usual one by more than this is reported
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
@@ -30,11 +30,11 @@ class Finding:
     topic: str
     what: str
     advice: str = ""
-    is_failure: bool = False  # a drive does not answer, or not every time
+    is_failure: bool = False  # a drive does not answer, or not always
 
 
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
-    """Describe the adapter; `lasting` is its name by serial number, or the port's if there is none."""
+    """Describe the adapter; `lasting` is its device name by serial number, or the port if there is none."""
     product = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
     driver = f"driver {adapter.driver}" if adapter.driver else "driver unknown"
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
@@ -93,7 +93,7 @@ def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF) -> Finding:
 
 
 def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Judge the outcome of the request `sent` to an unused address."""
+    """Return whether the adapter echoes, judged by the outcome of the request `sent` to an unused address."""
     if found.result > 0:
         return _answered_finding(found, sent, settings)
     received = found.raw
@@ -109,7 +109,7 @@ def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
 
 
 def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Report a valid reply from the unused address."""
+    """Return the finding for a valid reply from the unused address."""
     reply = found.reply
     how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
     echo = "the adapter receives its own requests" if found.skipped == len(sent) else "none"
@@ -234,7 +234,7 @@ def com_description(port: str) -> str:
 
 
 def _usb_device(tty: Path) -> Path | None:
-    """Return the nearest directory above that names a USB product."""
+    """Return the nearest parent directory that names a USB product."""
     if not tty.exists():
         return None
     above = tty.resolve()

@@ -160,7 +160,7 @@ _REGISTER_KEYS = (  # in this order
 )
 
 
-INDENT = 16  # of a family's facts
+INDENT = 16  # columns before a family's facts
 
 
 def sheet(family: type[Drive]) -> str:
@@ -223,7 +223,7 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
 
 
 def gain_of(family: type[Drive]) -> ReadingGain | None:
-    """Return the time that a user's own class would save by stating gaps, at its default settings."""
+    """Return the time saved at default settings if a user's own class states which gaps may be read."""
     drive = family(family.addresses[0])
     if not is_users_own(family):
         return None
@@ -285,7 +285,7 @@ def _table_heading(table: Table, family: type[Drive]) -> str:
 
 
 def _registers(family: type[Drive], table: Table) -> Iterator[str]:
-    """Return a row per register, with remarks under it."""
+    """Yield a row for each register, with remarks below it."""
     registers = [register for register in family.registers.values() if register.table is table]
     rows = aligned([_row(register) for register in registers], "<<<<<")
     for register, row in zip(registers, rows, strict=True):

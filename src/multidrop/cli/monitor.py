@@ -58,7 +58,7 @@ def is_possible() -> bool:
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
     """Poll the plant and show it until the user quits or `seconds` have passed; return the poller's summary.
 
-    Closing the terminal ends it too. It always waits for stops in progress.
+    Closing the terminal ends the monitor too. Stops in progress are always finished first.
     """
     console = open_console()
     live = LivePlant(plant, plant.metadata()["planned"])
@@ -68,7 +68,7 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
             try:
                 monitor.show(seconds)
             finally:
-                failures = monitor.await_stops()  # before the ports close: a stop may not be sent yet
+                failures = monitor.await_stops()  # before the ports close, because a stop may still be unsent
         for sentence in failures:
             warn(sentence)
     return session.poller.summary()
@@ -86,7 +86,7 @@ class Monitor:
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # called if the question is answered with y
         self._stops: list[threading.Thread] = []  # in progress or done
-        self._stop_results: dict[str, tuple[int, int]] = {}  # drives stopped and asked, by line
+        self._stop_results: dict[str, tuple[int, int]] = {}  # by line: drives that stopped, drives in all
         self._has_left = False
         self._side_reader = SideReader(session.poller)
         self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
@@ -121,7 +121,7 @@ class Monitor:
         self._at.message = text
 
     def await_stops(self) -> list[str]:
-        """Record until no stop is in progress; return the failures that were not acknowledged."""
+        """Keep recording until no stop is in progress; return the failures that were not acknowledged."""
         if self._is_stopping:
             warn(STILL_STOPPING)
         while self._is_stopping:
@@ -135,9 +135,9 @@ class Monitor:
 
     @contextmanager
     def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:
-        """Give a function that draws a picture, and the seconds between two pictures.
+        """Yield a function that draws a picture, and the seconds between two pictures.
 
-        Without cursor control, each picture is printed below the last one.
+        Without cursor control, each picture is printed below the previous one.
         """
         if self._console.is_dumb_terminal:
             yield self._console.print, SCROLL_S
@@ -216,7 +216,7 @@ class Monitor:
             self._turn_page()
 
     def _acknowledge(self) -> None:
-        """Drop the failures that were shown; the others are shown next."""
+        """Remove the failures that were shown, so that the other ones are shown next."""
         del self._at.failures[: self._at.failures_shown]
 
     def _leave(self) -> None:
@@ -240,9 +240,9 @@ class Monitor:
         self._on_yes = self._stop_lines
 
     def _stop_lines(self) -> None:
-        """Stop all lines at the same time: none waits for another's ramps.
+        """Stop all lines in parallel, so that no line waits for the ramps of another.
 
-        If threads cannot be started, every remaining line is sent its stops before any is waited for.
+        If threads cannot be started, send the stops of every remaining line first, and only then wait.
         """
         self._stop_results = {}
         stops = {
@@ -251,18 +251,18 @@ class Monitor:
         }
         left = [line for line, stop in stops.items() if not self._begin(*stop)]
         for line in left if len(left) > 1 else ():
-            with suppress(Exception):  # reported below, when the stop is sent again
+            with suppress(Exception):  # a failure is reported below, when the stop is repeated
                 self._session.poller.bus(line).stop_all(seconds=0.0)
         for line in left:
             self._carry_out(*stops[line])
 
     def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop in a thread, or here if no thread can be started: it is always sent."""
+        """Carry out a stop in a new thread, or in this one if no thread can be started."""
         if not self._begin(what, work):
             self._carry_out(what, work)
 
     def _begin(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> bool:
-        """Start a stop in a thread, which waits until the motor has stopped; False if no thread can start."""
+        """Start a thread that sends a stop and waits for the motor; return False if no thread can start."""
         self._at.message = what
         thread = threading.Thread(target=self._carry_out, args=(what, work), daemon=True)
         try:
@@ -311,7 +311,7 @@ KEYS = {  # escape sequences and letters that terminals send
     b"\n": ENTER,
 }
 UNKNOWN = "unknown"
-# A key that is not a letter, such as F4, whose sequence ends in S: it must not stop motors. And its start.
+# Other escape sequences, and their starts: F4's ends in S, which must not stop motors.
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
 _BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
 SPLIT_S = 0.05  # how long to wait for the rest of a sequence
@@ -322,7 +322,7 @@ LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 
 @contextmanager
 def terminal_keys() -> Iterator[Callable[[float], str]]:
-    """Give a function that waits up to n seconds for a key and returns its name or letter, or "".
+    """Yield a function that waits up to n seconds for a key and returns its name or letter, or "".
 
     The function raises OSError if the terminal is closed. Raises ValueError on Windows.
     """
@@ -385,7 +385,7 @@ def _first_letter(pressed: bytes) -> tuple[str, bytes]:
 
 
 def open_console() -> Any:
-    """Return the terminal. Raises ValueError when it is too small."""
+    """Return the terminal. Raises ValueError if it is too small."""
     from rich.console import Console
 
     from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH

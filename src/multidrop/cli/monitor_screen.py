@@ -22,7 +22,7 @@ LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE = 100  # has room for more columns
 OLD_NOTE, NOT_POLLED = "old", "not polled"  # of registers
 NEVER = "never"
-LEAST_VALUE, AROUND = 12, 13  # columns of a register's value; of its age, and of blanks
+LEAST_VALUE, AROUND = 12, 13  # columns: of a register's value; of its age and the blanks together
 OLD = "?"  # before an old value
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 STOPS = "s stop   S stop all   q quit"
@@ -35,17 +35,17 @@ PAGE_HELP = (f"up/down choose   PgUp/PgDn scroll   Enter back   {STOPS}", f"PgUp
 class Position:
     """The user's place in the monitor, and pending questions and failures."""
 
-    chosen: int = 0  # of the drives
+    chosen: int = 0  # index of the chosen drive
     page: bool = False  # one drive's registers are shown, not all drives
-    scrolled: int = 0  # lines of the page
+    scrolled: int = 0  # lines above the visible part of the page
     question: str = ""
     message: str = ""
-    failures: list[str] = field(default_factory=list)  # of stops, until they are acknowledged
-    failures_shown: int = 0  # as many as had room
+    failures: list[str] = field(default_factory=list)  # unacknowledged failures of stops
+    failures_shown: int = 0  # how many had room on the screen
 
 
 def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str) -> list[Text]:
-    """Draw all drives, a line each; if they do not all fit, those around the chosen one."""
+    """Draw one line per drive; if not all fit, draw the drives around the chosen one."""
     width, height = size
     top = [_title(plant, width, now_ns), *_line_states(plant, width)]
     columns = _columns(plant, width)
@@ -83,7 +83,7 @@ def page(
     longest = max(map(len, names), default=0)
     cells = [_register(shown, name, others, now_ns) for name in names]
     notes = max((len(note) for *_, note in cells), default=0)
-    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # for values, beside whole notes
+    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # for values; notes are not cut
     values = max(LEAST_VALUE, min(room, max((cell_len(value) for value, *_ in cells), default=0)))
     rows = [
         _register_row(f"{name:<{longest}}", *cell, values, width)

@@ -20,7 +20,7 @@ from multidrop.planning.suggestions import Suggestions, duration_text, reading_g
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine, planned_on
 
-LONG_CYCLE = 1.0  # s; polling all readings for longer is probably not intended
+LONG_CYCLE = 1.0  # s; a longer cycle of all readings is probably not intended
 _NAMES = 3  # registers named in a sentence
 
 
@@ -71,7 +71,7 @@ def _warnings(plan: _PredictedLine) -> list[str]:
 
 
 def _gains(plan: _PredictedLine) -> list[str]:
-    """Return the time that users' own classes would save by stating the gaps that their manual allows."""
+    """Return sentences about the time that is saved if users' own classes state the gaps that may be read."""
     gains = {
         polled.drive.name: reading_gain(polled.drive, polled.wanted)
         for polled in plan.line.drives

@@ -35,7 +35,7 @@ from multidrop.printable import printable
 from multidrop.recording import FORMATS
 from multidrop.recording.segments import parse_age, parse_size
 
-_TAKE_S = 0.1  # between takes of new rows
+_TAKE_S = 0.1  # s between two fetches of new rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, seconds: float | None) -> None:
-    """Add what `poll` and `demo` take: duration, files and --json."""
+    """Add the arguments that `poll` and `demo` share: duration, files and --json."""
     parser.add_argument(
         "--seconds",
         metavar="S",
@@ -262,7 +262,7 @@ def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
         if drives[polled.drive.name]["exchanges_per_second"]  # a silent drive has no delay
     }
     polls = [poll for polled in line.drives for poll in polled.polls]
-    is_timed = any(poll.every is not None for poll in polls)  # then a cycle has no measured time
+    is_timed = any(poll.every is not None for poll in polls)  # then a cycle has no measured duration
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
     by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {

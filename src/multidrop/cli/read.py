@@ -55,7 +55,7 @@ def _read(drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]
         found = drive.read_many(wanted)
     except NoValue as lack:
         found = dict(lack.values)
-    except DriveException:  # read singly to find the register
+    except DriveException:  # read one by one to find the register that caused it
         return {register: _read_one(drive, register) for register in wanted}
     return {register: found.get(register.name) for register in wanted}
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from multidrop.gateway.settings import ServeSettings
 
 DEMO_PORTS = (8750, 0)  # the usual one, or any free port
-END_S = 4.7  # from the signal until the process is ended by force
+END_S = 4.7  # from the signal until the process is killed
 ROLES = ("look", "stop", "write")
 
 
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
-    """Serve a simulated plant; every user of this machine has all rights."""
+    """Serve a simulated plant; every user of this computer has all rights."""
     _require_server()
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
@@ -192,7 +192,7 @@ def _url(settings: ServeSettings, port: int) -> str:
 
 
 def _new_token(role: str | None, owner: str | None) -> int:
-    """Print a line for the file of tokens, and on stderr the token itself, which is not stored."""
+    """Print a line for the file of tokens; print the token itself, which is not stored, on stderr."""
     from multidrop.gateway.http.rights import Right, new_token
 
     if not role or not owner:

@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _has_place(port: str) -> bool:
-    """Return True for a port without --ports: the line is simulated on TCP, on this machine."""
+    """Return True for a port that needs no --ports: a TCP port of this computer."""
     return speaks_tcp(port) or _is_here(port)
 
 
@@ -77,7 +77,7 @@ def _drives(line: PlantLine) -> list[SimulatedDrive]:
 
 
 def _port(line: PlantLine, directory: Path | None) -> str:
-    """Return the port at which a line is simulated. Raises ValueError if its link cannot be made."""
+    """Return the port at which a line is simulated. Raises ValueError if the link to a pty cannot be made."""
     if speaks_tcp(line.port):
         url = urlsplit(line.port)
         return line.port if url.hostname in LOOPBACK and url.port else ANY_TCP

@@ -126,8 +126,8 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
 
 # ---- a port that is only listened to ----
 #
-# A device's descriptor is opened read-only. A port behind a URL is pyserial's, with its `write` replaced:
-# a socket gets no bytes, and an rfc2217 server gets the settings alone.
+# A device is opened read-only. A URL is opened by pyserial, with its `write` replaced: no bytes are sent to a
+# socket, and only the settings to an rfc2217 server.
 
 
 LISTEN_S = 0.05  # the longest wait for bytes
@@ -135,7 +135,7 @@ _MOST = 4096  # bytes of one read
 
 
 def _open_device(port: str, settings: Settings) -> FileIO:
-    """Open a device of this machine read-only, and lock and set it up."""
+    """Open a local device read-only, lock it, and set its baud rate and format."""
     if sys.platform == "win32":
         raise LineError(port, "serial devices cannot be sniffed on Windows: use socket://")
     import fcntl
@@ -204,7 +204,7 @@ class Listener:
         """Return the bytes received within LISTEN_S. Raises EOFError if the other end has hung up."""
         try:
             fd = self.fileno()
-        except OSError:  # no descriptor, as of loop://
+        except OSError:  # no descriptor, such as loop://
             return bytes(self._source.read(1) + self._source.read_all())
         if not select.select([fd], [], [], LISTEN_S)[0]:
             return b""

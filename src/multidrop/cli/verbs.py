@@ -43,7 +43,7 @@ from multidrop.plant.model import Plant, PlantLine
 
 _DIRECTED = ("start", "jog")
 _FURTHER = {"set-frequency": ("HZ",)}  # arguments behind the drive
-_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print how the motor reacts if the client dies
+_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print what the motor does if the client dies
 _QUESTIONS = {  # asked before the first request; a stop needs no confirmation
     "start": "Start the motor of",
     "jog": "Turn the motor of",
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _stop_time(text: str) -> float | None:
-    """Parse a number of seconds above 0; warn of an invalid one, and send the stop nevertheless."""
+    """Parse a number of seconds above 0. If it is invalid, warn and return None: the stop is sent anyway."""
     try:
         return duration(text)
     except argparse.ArgumentTypeError as mistake:
@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the named drive and the words behind it; a stop ignores these with a warning."""
+    """Return the named drive and the words after it; a stop warns of such words and ignores them."""
     command = arguments.command
     if command not in STOPS:
         target, words = target_of(arguments)
@@ -153,7 +153,7 @@ def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
-    """Return the audit log's path; None, with a warning, if a stop cannot open it: it is sent anyway."""
+    """Return the audit log's path. If it cannot be opened for a stop, warn and return None."""
     audit: str | None = getattr(arguments, "audit", None)
     if audit and arguments.command in STOPS:
         try:
@@ -185,14 +185,14 @@ def _setpoint(drive: Drive, hz: float) -> Write | None:
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Run the script's first step without a port: raise if the family lacks or forbids the verb."""
+    """Run the script's first step without a port, which raises if the family lacks or forbids the verb."""
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
 
 
 def _details(arguments: argparse.Namespace) -> str:
-    """Return a question's words for the wanted setpoint and direction."""
+    """Return the words of a question that name the requested setpoint and direction."""
     hz, direction = (getattr(arguments, name, None) for name in ("frequency", "direction"))
     at = "to" if arguments.command == "set-frequency" else "at"
     return ("" if hz is None else f" {at} {hz:g} Hz") + (f", {direction}" if direction else "")
@@ -290,7 +290,7 @@ def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
 
 
 def _start_stops(stops: Sequence[_LineStop], finished: SimpleQueue[_LineStop]) -> None:
-    """Stop each line in its own thread: no line waits for the ports and ramps of another.
+    """Stop each line in a thread of its own, so that no line waits for the ports and ramps of another.
 
     If no more threads can be started, stop the remaining lines here, one after another.
     """

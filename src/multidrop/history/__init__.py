@@ -1,4 +1,4 @@
-"""The history of a plant: months of rows in a folder, written while they are read.
+"""The history of a plant: months of rows in a folder, which may be read while it is written.
 
 | in the folder                             | contents                                                   |
 |-------------------------------------------|------------------------------------------------------------|
@@ -7,13 +7,15 @@
 | `tens/FIRST-LAST.BEGIN-END.parquet`       | the same segments, with ten seconds of a register per row  |
 | `damaged/rows.NUMBER.arrows`              | a damaged segment; `rows` has its readable part            |
 
-Numbers grow, also over restarts. By three rules each row is read exactly once:
+Numbers grow, also across restarts. `tens` are summaries of ten seconds. Three rules make a reader use each
+row exactly once:
 
-1. Rows of a segment are read from `rows/` if they are there, else from `rows.NUMBER.arrows`.
-2. Tens are read from the file with the widest range of numbers, else they are reckoned from the rows.
-3. A file in the making has a name that starts with a point. It is renamed when it is complete and on the
-   disk, `tens` before `rows`; only then are the files that it replaces removed. A reader lists the folder,
-   then `rows/`, then `tens/`, so it finds the old or the new file, and by the rules above never uses both.
+1. Rows of a segment are read from `rows/` if they are there, else from `rows.NUMBER.arrows`. 2. Tens are read
+from the file with the widest range of numbers; without such a file they are computed from the
+   rows.
+3. An incomplete file has a name that starts with a dot. It is renamed when it is complete and on the disk,
+   `tens` before `rows`. Then the files that it replaces are removed. A reader lists the folder, then `rows/`,
+   then `tens/`, so it finds the old or the new file. The rules above prevent that it uses both.
 
 BEGIN and END are UTC, such as 20261122T213700Z, and enclose the times of all rows in the file.
 """

@@ -1,4 +1,4 @@
-"""Buckets: least, mean and most of a register in each of many equal times."""
+"""Buckets: the least, mean and greatest value of a register in each of many equal intervals."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Buckets:
     A bucket starts at `begin + number * step`, in ns. Without values, `least`, `mean` and `most` are None;
     `missed` is above 0 if the register was polled, else 0.
 
-    All values are of one quantity, the newest of the range; `unit` is its unit, if recorded. `left_out` lists
-    the units of excluded rows, from when the name belonged to another register.
+    All values are of one quantity, the newest in the range; `unit` is its unit, if recorded. `left_out` lists
+    the units of excluded rows: they were recorded while the name belonged to another register.
     """
 
     begin: int  # UTC in ns
@@ -66,7 +66,7 @@ class Grid:
         return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
 
     def bucket_of(self, time: int) -> tuple[int, int, int]:
-        """Return a time's bucket as number, start and end; the number is -1 outside the grid."""
+        """Return the number, start and end of the bucket of `time`; the number is -1 outside the grid."""
         if time < self.begin:
             return -1, _BEFORE_ALL, self.begin
         if time >= self.end:
@@ -91,7 +91,7 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
     for step in _handy_steps(least):
         first = begin // step * step
         needed = -(-(end - first) // step)
-        if needed <= max(points, 2):  # a range of one bucket may lie across an edge
+        if needed <= max(points, 2):  # a range shorter than a bucket may cross an edge
             return Grid(first, step, needed)
     raise AssertionError("steps grow for ever")
 
@@ -121,9 +121,9 @@ class Accumulator:
             self._most[bucket] = max(self._most[bucket], most)
 
     def add_rows(self, times: Iterable[int], values: Iterable[float], valid: Iterable[int]) -> None:
-        """Add rows, in ns; an invalid row is a miss. Rows outside the grid are skipped.
+        """Add rows with times in ns; an invalid row is a miss. Rows outside the grid are skipped.
 
-        Successive rows are mostly of one bucket: they are summed up before they are added.
+        Successive rows are mostly in the same bucket, so they are summed before they are added.
         """
         grid, bucket, begin, end = self._grid, -1, 0, 0
         n, missed, total, least, most = _EMPTY
@@ -171,7 +171,7 @@ def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
 
 
 class UnitBuckets:
-    """The buckets of one register, by unit if the rows carry their own unit, as those of a hub do."""
+    """The buckets of one register, by unit if rows state their own unit, as a hub's rows do."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -180,14 +180,14 @@ class UnitBuckets:
         self.untold = Accumulator(grid)
 
     def told(self, unit: str | None, newest_ns: int) -> Accumulator:
-        """Return the buckets for rows of this unit; `newest_ns` is the time of its newest row."""
+        """Return the accumulator for rows with this unit; `newest_ns` is the time of the newest such row."""
         if unit is None:
             return self.untold
         self._newest_ns[unit] = max(newest_ns, self._newest_ns.get(unit, newest_ns))
         return self._told.setdefault(unit, Accumulator(self._grid))
 
     def buckets(self, unit: str | None, left_out: Sequence[str]) -> Buckets:
-        """Return the buckets of a known unit, or with None those of the newest unit in the rows."""
+        """Return the buckets of `unit`; if it is None, those of the unit of the newest row."""
         if unit is None and self._told:
             unit, *others = sorted(self._told, key=self._newest_ns.__getitem__, reverse=True)
             parts, left_out = [self._told[unit]], others

@@ -1,7 +1,7 @@
 """Compact closed segments: `python -m multidrop.history.compact FOLDER --below NUMBER`, a process of its own.
 
-It may be killed at any moment and started again: a new file gets its name when it is complete and on the
-disk, and only then are the files that it replaces removed.
+The process may be killed at any moment and started again. A new file gets its final name when it is complete
+and on the disk; the files that it replaces are removed after that.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from {} group by all order by drive, register, time
 """
 MERGED = "select * exclude filename from {} order by drive, register, time"
 MERGED_ROWS = "select * exclude filename from {} order by drive, time"
-MOST_MERGED = 200_000_000  # bytes of files of rows that become one
+MOST_MERGED = 200_000_000  # bytes of files of rows that are merged into one
 
 
 def main(words: list[str] | None = None) -> int:
-    """Compact a folder, unless another process does so already; return 0."""
+    """Compact a folder, unless another process is doing so; return 0 in both cases."""
     parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
@@ -59,9 +59,9 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
-    """Make Parquet of segments below this number, and merge the tens of each hour and day that is over.
+    """Convert segments below this number to Parquet, and merge the tens of each past hour and day.
 
-    With `merge_rows` the rows of an hour that is over become one file too, and files of rows get their tens.
+    With `merge_rows`, also merge the rows of each past hour, and make tens for files of rows that lack them.
     """
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
@@ -72,7 +72,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
                 _compact_segment(database, folder, number, path)
         if merge_rows:
             rows = widest(parquet_files(folder / "rows"))
-            # first: behind a merged file those without tens would not be found
+            # before merging: a merged file would hide which of its parts lack tens
             _make_tens(database, folder, rows[:-1])
             for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
                 _merge_rows(database, folder, part)
@@ -83,7 +83,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove the remains of a killed process: unnamed files, and files that others replace."""
+    """Remove what a killed process left: incomplete files, and files that others replace."""
     for directory in (folder / "rows", folder / "tens"):
         for path in directory.glob(".*.part"):
             path.unlink()
@@ -143,7 +143,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
 
 
 def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
-    """Yield the rows up to the first damaged one, and note the damage."""
+    """Yield the rows up to the first damaged batch, and append a description of the damage to `damage`."""
     try:
         yield from reader
     except ValueError as error:
@@ -151,7 +151,7 @@ def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
 
 
 def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | None = None) -> None:
-    """Write a Parquet file; it gets its name when it is on the disk."""
+    """Write a Parquet file, which gets its final name when it is on the disk."""
     part = path.with_name(f".{path.name}.part")
     copy_out(database, query, part, metadata)
     _on_disk(part)
@@ -161,7 +161,7 @@ def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | Non
 
 def _on_disk(path: Path) -> None:
     is_windows = sys.platform == "win32"
-    if is_windows and path.is_dir():  # Windows cannot open folders, and writes their entries itself
+    if is_windows and path.is_dir():  # Windows cannot open folders, and needs no flush of their entries
         return
     file = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)
     try:
@@ -178,9 +178,9 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
 
 
 def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
-    """Return the runs of files to merge: each hour or day that is over.
+    """Return the groups of files to merge: one for each past hour or day (`seconds`).
 
-    A run is not merged while a segment within it has no tens: the merged file would hide its number.
+    A group is not merged while a segment within it has no tens, because the merged file would hide that.
     """
     runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
     return [
@@ -200,7 +200,7 @@ def _merge(database: Database, folder: Path, run: list[HistoryFile]) -> None:
 
 
 def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
-    """Yield groups of files that may be merged: neighbours, and together below the largest size."""
+    """Yield groups of neighbouring files that may be merged: each group has at most MOST_MERGED bytes."""
     part: list[HistoryFile] = []
     size = 0
     for file in run:
@@ -228,7 +228,7 @@ def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> No
 
 
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
-    """Make the tens of files of rows that have none."""
+    """Make tens for files of rows that have none."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:
@@ -239,7 +239,8 @@ def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> Non
 def be_low() -> None:
     """Lower this process's priority, if the system allows it.
 
-    Otherwise it would inherit SCHED_RR from a recorder that uses it, and delay its polling.
+    Otherwise this process would inherit SCHED_RR from a recorder that uses it, and delay the recorder's
+    polling.
     """
     with suppress(OSError, AttributeError):  # Windows and macOS have no such call
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -1,4 +1,4 @@
-"""DuckDB, as the history uses it: bounded memory, one thread, rows that go in and come out as Arrow."""
+"""DuckDB for the history: with bounded memory, one thread, and rows passed as Arrow in both directions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
 
-MOST_INSERTED = 60_000  # rows at a time: names are spelled out for them, 70 bytes a row
+MOST_INSERTED = 60_000  # rows at a time: with names as text they take 70 bytes each
 TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
@@ -44,7 +44,7 @@ def connect(memory: str, spill: Path | None = None) -> Any:
 class Database:
     """A database in memory, opened on first use: that takes 20 ms of processor time.
 
-    Data that does not fit goes to `spill`, or else to its own temporary folder.
+    Data that does not fit into memory goes to the folder `spill`, or to a temporary folder if that is None.
     """
 
     def __init__(self, memory: str, spill: Path | None = None) -> None:
@@ -54,7 +54,7 @@ class Database:
         self._forget: Callable[[], object] = lambda: None
 
     def cursor(self) -> Any:
-        """Return a cursor, to be closed: its temporary tables end with it. Raises MissingDuckDB."""
+        """Return a cursor. The caller closes it, which drops its temporary tables. Raises MissingDuckDB."""
         if self._opened is None:
             self._opened = connect(self._memory, self._spill)
             if self._spill is None:
@@ -62,12 +62,12 @@ class Database:
         return self._opened.cursor()
 
     def _make_spill(self) -> None:
-        folder = mkdtemp(prefix="multidrop-history-")  # private to this user
+        folder = mkdtemp(prefix="multidrop-history-")  # readable by this user only
         self._forget = weakref.finalize(self, rmtree, folder, ignore_errors=True)
         self._opened.execute("set temp_directory = ?", [folder])
 
     def close(self) -> None:
-        """Close it, if it is open; the next cursor opens it again."""
+        """Close the database if it is open; the next `cursor` opens it again."""
         if self._opened is not None:
             self._opened.close()
             self._opened = None
@@ -75,7 +75,7 @@ class Database:
 
 
 class ArrowStream:
-    """Batches in the form that DuckDB reads; it asks for them again at each query."""
+    """Batches as an Arrow stream for DuckDB, which requests a new stream for each query."""
 
     def __init__(self, batches: Iterable[Rows]) -> None:
         self._arrays = [rows.arrow() for rows in batches]
@@ -87,7 +87,7 @@ class ArrowStream:
 
 
 def insert(database: Any, batches: Iterable[Rows]) -> None:
-    """Create the table `recorded`, and put rows into it."""
+    """Create the table `recorded` with these rows."""
     database.execute(TABLE)
     waiting: list[Rows] = []
     for rows in batches:
@@ -130,14 +130,14 @@ def copy_out(
 
 
 def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Rows]:
-    """Yield the rows that a query for the columns of a recording gives."""
+    """Yield the rows that result from a query for the columns of a recording."""
     import nanoarrow
 
     for array in nanoarrow.c_array_stream(database.sql(query, params=dict(values))):
         columns = [
             (
                 bytes(child.buffer(0)) if child.null_count else None,
-                *(bytes(child.buffer(number)) for number in range(1, child.n_buffers)),  # DuckDB's own go
+                *(bytes(child.buffer(number)) for number in range(1, child.n_buffers)),  # copies
             )
             for child in array.view().children
         ]
@@ -145,7 +145,7 @@ def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Ro
 
 
 def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
-    """Return the metadata that a Parquet file of a history has."""
+    """Return the metadata stored in a Parquet file of a history."""
     query = f"select decode(value) from parquet_kv_metadata({quoted(str(path))}) where decode(key) = $key"
     found = database.execute(query, {"key": METADATA_KEY}).fetchone()
     metadata: dict[str, Any] = json.loads(found[0]) if found else {}
@@ -153,7 +153,7 @@ def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
 
 
 def texts_of_metadata(database: Any, paths: Iterable[Path]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each text of metadata that these Parquet files have, and the files that have it."""
+    """Yield each distinct metadata text of these Parquet files, with the files that contain it."""
     query = f"""select decode(value), list(file_name) from parquet_kv_metadata({_list(paths)})
         where decode(key) = $key group by value"""
     yield from database.execute(query, {"key": METADATA_KEY}).fetchall()

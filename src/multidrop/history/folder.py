@@ -20,7 +20,7 @@ _NAME = re.compile(r"(\d{8,})(?:-(\d{8,}))?\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parq
 
 
 class HistoryFile(NamedTuple):
-    """A Parquet file: the first and the last segment in it, and UTC in s around its times."""
+    """A Parquet file: its first and last segment, and UTC in s before and after all its rows."""
 
     path: Path
     first: int
@@ -55,14 +55,14 @@ def parquet_files(directory: Path) -> list[HistoryFile]:
         for path in directory.iterdir():
             if match := _NAME.fullmatch(path.name):
                 first, last, begin, end = match.groups()
-                with suppress(ValueError):  # no date
+                with suppress(ValueError):  # the name has no valid date
                     file = HistoryFile(path, int(first), int(last or first), _second(begin), _second(end))
                     found.append(file)
     return sorted(found, key=lambda file: (file.first, -file.last))
 
 
 def widest(files: list[HistoryFile]) -> list[HistoryFile]:
-    """Return, in order, the files whose range of segments lies in no other file's."""
+    """Return the files whose range of segments is not inside another file's range, in order."""
     found: list[HistoryFile] = []
     for file in files:
         if not found or file.first > found[-1].last:
@@ -74,7 +74,7 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 class Listing:
     """The current files of a history; each row is in one file."""
 
-    segments: dict[int, Path] = field(default_factory=dict)  # that are not in `rows`
+    segments: dict[int, Path] = field(default_factory=dict)  # by number: those that are not in `rows`
     rows: dict[int, HistoryFile] = field(default_factory=dict)
     tens: list[HistoryFile] = field(default_factory=list)
 
@@ -88,7 +88,7 @@ def listing(folder: Path) -> Listing:
     """List a history, or a recording in segments such as run.arrows. Raises OSError if there is none."""
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
-    segments = dict(segments_of(folder / STEM))  # first: a segment removed later is in a file listed later
+    segments = dict(segments_of(folder / STEM))  # first: see the order of listing in __init__
     rows = {file.first: file for file in widest(parquet_files(folder / "rows"))}
     tens = widest(parquet_files(folder / "tens"))
     left = {number: path for number, path in segments.items() if number not in rows}

@@ -17,19 +17,19 @@ from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
-MOST_TENS = 4096  # series whose tens are kept; queries may name series without rows
+MOST_TENS = 4096  # series whose tens are cached; limited because queries may name unknown series
 
 Ten = list[float]  # values, misses, their sum, least, most
 
 
 class SeriesTens:
-    """The tens of one series, of all batches before the one numbered `past`."""
+    """The tens of one series, computed from all batches with numbers below `past`."""
 
     __slots__ = ("by_number", "past")
 
     def __init__(self) -> None:
         self.past = 0
-        self.by_number: dict[int, Ten] = {}  # numbers since 1970
+        self.by_number: dict[int, Ten] = {}  # by number of the ten seconds since 1970
 
     def add(self, time: int, value: float | None) -> None:
         """Add a row; None is a miss."""
@@ -54,7 +54,7 @@ class IndexedBatch(NamedTuple):
 
 
 class GrowingSegment:
-    """A segment, read as far as it is written; `damage` is the reason if reading has ended.
+    """A segment, read as far as it is written. If reading stopped at damage, `damage` describes it.
 
     Raises as ArrowsTail does.
     """
@@ -70,12 +70,12 @@ class GrowingSegment:
         self.damage: str | None = None
 
     def hold(self) -> None:
-        """Keep the segment open until one more `let_go`."""
+        """Keep the segment open until the matching call of `let_go`."""
         with self._changing:
             self._holders += 1
 
     def let_go(self) -> None:
-        """Close the segment when its last holder lets go."""
+        """End a `hold`; the last one closes the segment."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -127,7 +127,7 @@ class GrowingSegment:
             found[series].add_rows(rows.times, rows.values, rows.valid)
 
     def _batches_between(self, begin: int, end: int) -> range:
-        """Return the numbers of all batches from the first to the last that may have rows of this range."""
+        """Return the batch numbers from the first to the last batch that may have rows of this range."""
         found = [
             number for number, batch in enumerate(self._batches) if batch.least < end and begin <= batch.most
         ]
@@ -151,7 +151,7 @@ class GrowingSegment:
                     into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
 
     def _update_tens(self) -> None:
-        """Read each batch for the series whose tens lack it."""
+        """Add each batch to the tens of the series that do not include it yet."""
         end = len(self._batches)
         for number in range(min((tens.past for tens in self._tens.values()), default=end), end):
             behind = frozenset(series for series, tens in self._tens.items() if tens.past <= number)
@@ -181,7 +181,7 @@ def _codes(
 
 
 def _places(columns: RecordedColumns, wanted: frozenset[tuple[int, int]] | None) -> Sequence[int]:
-    """Return the places of the wanted rows, or of all."""
+    """Return the indexes of the rows of the wanted codes; None means all rows."""
     if wanted is None:
         return range(len(columns.time))
     return find_codes(columns.drive, columns.register, wanted)
@@ -205,8 +205,8 @@ def _rows(
             )
 
 
-MOST_KEPT = 200_000  # rows of a segment: 4 MB
-MOST_SERIES = 4096  # without rows too: names of none may be asked for
+MOST_KEPT = 200_000  # cached rows of a segment: 4 MB
+MOST_SERIES = 4096  # cached series, including requested ones without rows
 
 
 class SeriesRow(NamedTuple):
@@ -221,7 +221,7 @@ class SeriesRows:
     """Rows of one series from a range of batches."""
 
     def __init__(self, first: int) -> None:
-        self.first = self.past = first  # numbers of the first batch, and of the one behind the last
+        self.first = self.past = first  # numbers of the first batch and of the one after the last
         self.times = array("q")
         self.values = array("d")
         self.valid = bytearray()
@@ -235,7 +235,7 @@ class SeriesRows:
 class KeptSeries:
     """Caches the rows of recently requested series, so that a live plot reads each batch once.
 
-    `read` returns a batch's rows of some series.
+    `read` returns the rows of given series in a batch.
     """
 
     def __init__(self, read: Callable[[int, frozenset[Series]], Iterable[SeriesRow]]) -> None:
@@ -243,7 +243,7 @@ class KeptSeries:
         self._kept: dict[Series, SeriesRows] = {}  # in the order of their last request
 
     def rows_of(self, series: Iterable[Series], batches: range) -> dict[Series, SeriesRows]:
-        """Return the rows of each series in these batches, and perhaps in neighbouring ones."""
+        """Return each series' rows in these batches; cached rows of neighbouring batches may be included."""
         if not batches:
             return {}
         found = {one: self._found(one, batches) for one in series}

@@ -33,11 +33,11 @@ from multidrop.recording.rows import from_rows
 
 
 class History:
-    """The rows that `multidrop serve` or `HistoryWriter` keeps in a folder; or segments: `run.arrows`.
+    """The rows in a folder of `multidrop serve` or `HistoryWriter`, or in segments such as `run.arrows`.
 
-    Another process may write it at the same time: every row appears once, about 0.3 s after it was polled. A
-    series is a drive and a register, such as "pump-1.output_frequency". A moment is UTC in ns, or a datetime
-    with a time zone.
+    Another process may write the history at the same time: every row appears once, about 0.3 s after polling.
+    A series is a drive and a register, such as "pump-1.output_frequency". A moment is UTC in ns, or a
+    datetime with a time zone.
 
     Compacted files need duckdb (`pip install 'multidrop[history]'`). Methods raise ImportError if there are
     such files and duckdb is missing, ValueError for an invalid series or range, and OSError. Any thread may
@@ -46,7 +46,7 @@ class History:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
-        listing(self.folder)  # raises at once for a wrong name
+        listing(self.folder)  # raises immediately for a wrong path
         self._sources = Sources(self.folder)
 
     def __repr__(self) -> str:
@@ -64,7 +64,7 @@ class History:
 
     @property
     def damage(self) -> list[str]:
-        """Sentences about damaged segments so far."""
+        """Sentences about the damaged segments that were found so far."""
         return list(self._sources.damage.values())
 
     def metadata(self) -> Metadata:
@@ -90,16 +90,16 @@ class History:
     ) -> HistoryRows:
         """Return the rows of the series, or of all, with begin <= time < end; None means unlimited.
 
-        They come in the order of recording. Where a name was another register's in a part of the range, with
-        another unit or other names of its numbers, those rows are in a column of their own, such as
-        "motor_load [A]", and `metadata` describes both. The result is a recording like
-        `multidrop.open_recording` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
+        The rows come in the order of recording. If, in a part of the range, a name belonged to another
+        register (with another unit or other names of its numbers), the rows from that part are in a separate
+        column, such as "motor_load [A]", and `metadata` describes both columns. The result is a recording
+        like `multidrop.open_recording` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
         """
         first = ALWAYS[0] if begin is None else ns_of(begin)
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
     def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
-        """Return the quantities of the series, or of all, in the segments of this range."""
+        """Return the quantities of the series (None: of all) in the segments of this range."""
         parting = Parting({}, series)
         self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
         return parting
@@ -107,9 +107,9 @@ class History:
     def rows_of(
         self, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Iterator[Rows]:
-        """Yield the rows of `read` for parsed series and times in ns."""
+        """Yield the rows that `read` describes, for parsed series and times in ns."""
         found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
-        given = 0  # all segments up to this number were yielded
+        given = 0  # number of the last segment that was yielded
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
                 continue
@@ -117,7 +117,7 @@ class History:
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
-                except Replaced:  # before its first row: another file has its rows now
+                except Replaced:  # raised before the first row was yielded: another file has the rows now
                     found = self._sources.listing()
                     self._check_merged(number, found)
             else:
@@ -132,7 +132,7 @@ class History:
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Listing:
-        """Add all current segments to the parting; return them."""
+        """Add all current segments to `parting`; return their listing."""
         known = self._sources.known(found, begin, end)
         new = parting.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
@@ -164,14 +164,14 @@ class History:
     def buckets(
         self, series: str | Iterable[str], begin: Moment, end: Moment | None = None, points: int = 800
     ) -> dict[str, Buckets]:
-        """Return least, mean and most of each series in at most `points` equal times that cover the range.
+        """Return each series' least, mean and greatest values in at most `points` buckets of the range.
 
-        `end` None is now. Single extreme values are kept, in `most` or `least`.
-        Times of 2 s and more become whole tens of seconds, minutes, hours or days of UTC, so that the first
-        may begin before `begin` and the last end after `end`.
+        `end` None means now. Single extreme values are kept, in `most` or `least`. Buckets of 2 s and more
+        are rounded up to whole tens of seconds, minutes, hours or days of UTC. Therefore the first may start
+        before `begin`, and the last may end after `end`.
 
-        Where a name was another register's in a part of the range, with another unit or other names of its
-        numbers, only values of the newest quantity are included: see `unit` and `left_out`.
+        If, in a part of the range, a name belonged to another register (with another unit or other names of
+        its numbers), only values of the newest quantity are included: see `unit` and `left_out`.
         """
         names = parsed_series(series)
         if not names:
@@ -193,7 +193,7 @@ class History:
         self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, parting: Parting
     ) -> None:
         everything = tuple(into)
-        # A file of tens may cover many segments; if their quantities differ, each segment is read itself.
+        # A file of tens may cover many segments. If their quantities differ, read each segment instead.
         tens = [file for file in found.tens if grid.is_of_tens and parting.is_whole(file.first, file.last)]
         reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
         parted: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
@@ -219,7 +219,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> Iterator[bytes]:
-        """Yield the rows of `read` as the text of a .csv recording with a column `unit`, in pieces."""
+        """Yield the rows that `read` returns as a .csv recording with a column `unit`, in pieces of text."""
         rows = self.read(series, begin, end)
         units = units_of(rows.metadata)
         lines = (lines_with_units(batch, units) for batch in rows)
@@ -268,7 +268,7 @@ class History:
             of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
             return write_parquet(self._sources, target, batches, files, *of)
 
-        self._sources.cursor().close()  # raises without DuckDB, before a file exists
+        self._sources.cursor().close()  # raises if DuckDB is missing, before a file is created
         new_file(target).close()
         try:
             return self._sources.again(write)

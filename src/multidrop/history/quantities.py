@@ -1,7 +1,7 @@
-"""Quantities: the units of a series' values, by the metadata of their segments. Pure.
+"""Quantities: the units of a series' values, from the metadata of their segments. Pure.
 
-From one segment to the next a name may pass to another drive or family. Values of two quantities are never
-combined.
+From one segment to the next, a name may be given to another drive or family. Values of two quantities are
+never combined.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Quantity(NamedTuple):
     names: tuple[tuple[str, object], ...] = ()
 
 
-Known = Mapping[Series, Sequence[Quantity]]  # of the values of a file, the oldest first
+Known = Mapping[Series, Sequence[Quantity]]  # quantities in a file by series, the oldest first
 
 
 def quantities_of(metadata: object) -> dict[Series, Quantity]:
@@ -78,18 +78,18 @@ def _number(text: object) -> object:
 
 
 class OtherColumn(NamedTuple):
-    """The column of rows that are not of a series' newest quantity: those of this unit, or all of a file."""
+    """The column for rows in a file that are of another quantity than the series' newest one."""
 
     series: Series
-    unit: str | None  # None: all
+    unit: str | None  # of the rows; None: all rows of the file
     column: str
 
 
 class Parting:
-    """Series by the quantity that each has in the newest segment, and those that are left out of buckets.
+    """The newest quantity of each series, and its earlier ones, which buckets leave out.
 
-    Where rows are read, values of another quantity are in a column of their own, such as "load [A]". Without
-    `series` it is of all that segments describe.
+    When rows are read, values of an earlier quantity get a column of their own, such as "load [A]". `series`
+    None means all series that the segments describe.
     """
 
     def __init__(self, known: Mapping[int, Known], series: Iterable[Series] | None = None) -> None:
@@ -101,7 +101,7 @@ class Parting:
         self.learn(known)
 
     def learn(self, known: Mapping[int, Known]) -> None:
-        """Add segments; existing columns keep their quantity."""
+        """Add the quantities of further segments; existing columns keep their quantity."""
         before: Known | None = None
         for number in sorted(known.keys() - self._known.keys(), reverse=True):
             self._known[number] = found = known[number]
@@ -127,7 +127,7 @@ class Parting:
         return [number for number in numbers if number not in self._known]
 
     def renamed(self, number: int) -> list[OtherColumn]:
-        """Return the columns for this segment's values of other quantities."""
+        """Return the columns for this segment's values that are not of the newest quantity."""
         known = self._known.get(number, {})
         return [
             OtherColumn(series, None if len(known[series]) == 1 else quantity.unit, column)
@@ -136,7 +136,7 @@ class Parting:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata with a description of each column as it is in these segments."""
+        """Return the metadata, completed by a description of each column that it lacks or contradicts."""
         columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = quantities_of(metadata)

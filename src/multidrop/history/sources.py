@@ -1,4 +1,4 @@
-"""The files of a history while they are replaced: segments that are open here, and DuckDB."""
+"""Read the files of a history, which may be replaced meanwhile: open segments, and Parquet by DuckDB."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from multidrop.recording.format import Metadata
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns
 MEMORY = "200MB"  # of DuckDB
-MOST_TRIES = 50  # to read files that are being replaced; a busy machine may be slower than the compaction
-MOST_GROWING = 4  # segments whose index is kept
+MOST_TRIES = 50  # attempts to read files that are being replaced; a slow reader may need many
+MOST_GROWING = 4  # segments whose index is cached
 FILES_AT_ONCE = 200  # per query of metadata; a text may take 100 kB
 
 
 class Replaced(Exception):
-    """A file that was listed is gone: its rows are in another one, or were too old."""
+    """A listed file is gone: its rows are in another file now, or were removed because of their age."""
 
 
 class Sources:
@@ -59,7 +59,7 @@ class Sources:
             self._database.close()
 
     def listing(self) -> Listing:
-        """List the files that hold the history now, and close those that no longer do."""
+        """List the current files of the history, and close files that are no longer part of it."""
         found = listing(self.folder)
         with self._changing:
             for number in set(self._growing) - set(found.segments):
@@ -68,9 +68,9 @@ class Sources:
 
     @contextmanager
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
-        """Give a segment, as far as it is written, open until the block is left.
+        """Yield a segment, read as far as it is written, and keep it open during the block.
 
-        Give None if it has no rows in this range, or cannot be read. Raises Replaced.
+        Yield None if it has no rows in this range, or cannot be read. Raises Replaced.
         """
         segment: GrowingSegment | None = None
         with self._changing:
@@ -92,14 +92,14 @@ class Sources:
                 segment.let_go()
 
     def _held(self, number: int, path: Path) -> GrowingSegment | None:
-        """Return a segment for the caller to let go of. The indexes of the newest ones are kept."""
+        """Return a segment, which the caller must `let_go`. The indexes of the newest segments are cached."""
         segment = self._growing.get(number)
         if segment is None:
             try:
                 segment = GrowingSegment(path)
             except FileNotFoundError:
                 raise Replaced from None
-            except ValueError as error:  # no head yet, or lost in a power cut
+            except ValueError as error:  # the head is not written yet, or was lost in a power cut
                 if path.exists() and path.stat().st_size:
                     self.damage[number] = str(error)
                 return None
@@ -138,7 +138,7 @@ class Sources:
         self._known |= read
 
     def cursor(self) -> Any:
-        """Return a cursor of DuckDB, to be closed. Raises ImportError."""
+        """Return a cursor of DuckDB, which the caller closes. Raises ImportError."""
         with self._changing:
             return self._database.cursor()
 
@@ -196,7 +196,7 @@ def rows_of_file(
     end: int,
     renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the rows of the series, or of all, in the order of their requests. Raises Replaced at first."""
+    """Yield the series' rows (None: all), in the order of requests. Raises Replaced, before the first row."""
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
         # Sorting reads the whole file before the first rows: after Replaced, no row is yielded twice.
@@ -214,7 +214,8 @@ def gather_files(
 ) -> None:
     """Add the rows, or the tens, of the files to the buckets. Raises Replaced.
 
-    Rows' own units are read only if the metadata does not describe all series: that takes twice as long.
+    The units stated in rows are read only if the metadata does not describe all series: this takes twice as
+    long.
     """
     condition, values = _condition(list(into))
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
@@ -231,7 +232,7 @@ def gather_files(
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return each file's quantities by its rows' own units. Raises Replaced."""
+    """Return each file's quantities, from the units that its rows state. Raises Replaced."""
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
     known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
@@ -260,7 +261,7 @@ def write_parquet(
 ) -> int:
     """Write batches, and the files' rows of the series and range; return their number. Raises Replaced.
 
-    `renamed` has the columns by the first segment of a file, as `rows_of_file` takes them.
+    `renamed` maps the first segment of a file to the columns that `rows_of_file` takes.
     """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))
@@ -296,7 +297,7 @@ def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
     marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
     others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
     condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
-    if len(drives) * len(registers) > len(series):  # slower, and seldom needed
+    if len(drives) * len(registers) > len(series):  # an exact condition is slower, and seldom needed
         pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
         condition += f" and (drive, register) in ({pairs})"
     return condition, values

@@ -19,8 +19,8 @@ from multidrop.recording.format import Metadata
 from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock
 
-MOST_WAITING = 250_000  # rows that wait for a slow disk: 12 MB
-WRITING_S = 0.4  # between writes; each is a batch, and a query reads all batches of its range
+MOST_WAITING = 250_000  # unwritten rows (12 MB), if the disk is slow; further ones are dropped
+WRITING_S = 0.4  # between writes; each makes a batch, and more batches slow down queries
 TENDING_S = 60.0  # between removals of old files
 HANGING_S = 5.0  # after which a write that hangs is reported
 ENDING_S = 10.0  # how long `close` waits for the disk
@@ -37,10 +37,11 @@ class HistoryState(NamedTuple):
 
 
 class HistoryWriter:
-    """Records batches into the history in a folder, which is made: `poller.on_batch(writer.take)`.
+    """Records batches into the history in a folder, which is created: `poller.on_batch(writer.take)`.
 
     A new segment starts every `rotate` s. If duckdb is installed, a process of low priority compacts closed
-    segments. Files older than `keep` s are removed, and the oldest while all take more than `most` bytes.
+    segments. Files older than `keep` s are removed; then the oldest ones, as long as all take more than
+    `most` bytes.
 
     A full or failing disk delays no polling: rows are dropped and counted in `state()`, with the reason, and
     writing is tried again each second. Raises ValueError while another process records there, OSError if the
@@ -83,7 +84,7 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write. Takes microseconds, and never raises for the disk."""
+        """Copy the rows for the writing thread. Takes microseconds, and never raises because of the disk."""
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)
@@ -92,7 +93,7 @@ class HistoryWriter:
             self._waiting_rows += len(batch)
 
     def begin(self, metadata: Metadata) -> None:
-        """Start a segment with the metadata of a changed plant. Earlier rows are in the segment before."""
+        """Start a new segment with the metadata of a changed plant. Earlier rows stay in the old segment."""
         with self._changing:
             self._ended.append((self._waiting, metadata))
             self._waiting = []
@@ -102,14 +103,14 @@ class HistoryWriter:
         return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
 
     def _hang(self) -> str:
-        """Return a sentence if the disk does not answer, else ""."""
+        """Return a sentence if a disk access hangs, else ""."""
         since_ns = self._busy_since_ns
         seconds = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / 1e9
         return f"the disk has not answered for {seconds:.0f} s" if seconds > HANGING_S else ""
 
     @property
     def is_alive(self) -> bool:
-        """True until the thread that writes has ended."""
+        """True while the writing thread runs."""
         return self._thread.is_alive()
 
     def close(self) -> None:
@@ -176,7 +177,7 @@ class HistoryWriter:
             _log.error("a segment could not be closed: %s", failure)
 
     def _tend(self) -> None:
-        """Remove old files, and have closed segments compacted."""
+        """Remove old files, and start the compaction of closed segments."""
         self._compactor.tend(self._segments.open_number)
         now = clock.now_ns()
         if self._tended_ns is not None and now - self._tended_ns < TENDING_S * 1e9:
@@ -198,7 +199,7 @@ class Compactor:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._child: subprocess.Popen[str] | None = None
-        self._done = 0  # all segments below were compacted
+        self._done = 0  # all segments below this number are compacted
         self._not_before_ns = 0
         self.is_possible = importlib.util.find_spec("duckdb") is not None
 

@@ -6,8 +6,9 @@
 | `.csv`     | text; metadata in `NAME.csv.json` | every whole line is there  |
 | `.parquet` | Parquet, needs pyarrow            | the file cannot be read    |
 
-The table is about crashes of the process: once `write` has returned, the system has the whole batch, and only
-a power cut in the next seconds loses it. A file without its head, which is written first, cannot be read.
+The table is about crashes of the process. Once `write` has returned, the operating system has the whole
+batch, and only a power cut in the next seconds loses it. A file without its head, which is written first,
+cannot be read.
 
 All three have the same columns, and one row for every sample or miss:
 
@@ -35,8 +36,8 @@ in the file NAME.csv.json. `multidrop poll` writes `plant`, the plant file; `pla
 each line by name (multidrop.planning.prediction); and `drives`: by name each drive's line, model, address,
 settings and framing, and `registers`, by name each register's unit and step.
 
-pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; they refuse a recording with a truncated
-end until `repair` has cut it off. The reader here needs neither library, and skips such an end.
+pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows. They refuse a recording with a truncated end
+until `repair` has removed that end. The reader here needs neither library, and skips a truncated end.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix:
 def open_writer(
     path: str | os.PathLike[str], metadata: Metadata, *, overwrite: bool = False
 ) -> RecordingWriter:
-    """Return the writer of a new recording; with `overwrite`, remove an existing recording at `path` first.
+    """Return the writer of a new recording. With `overwrite`, first remove an existing recording at `path`.
 
     Raises FileExistsError if there is a file at `path`, ValueError for another suffix, TypeError for
     metadata that JSON cannot hold, and RecordingError if the file cannot be written.
@@ -101,7 +102,7 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> i
         with writer:
             for batch in reader:
                 writer.write(batch)
-    except BaseException:  # Ctrl-C as well: half a recording would pass for the whole one
+    except BaseException:  # Ctrl-C as well: half a recording would look complete
         writer.discard()
         raise
     return writer.rows

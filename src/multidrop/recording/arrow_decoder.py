@@ -1,6 +1,6 @@
 """Decode the batches of an Arrow IPC stream into rows with their names spelled out.
 
-No number in them is trusted: a damaged batch ends in an error.
+All numbers in them are checked: a damaged batch raises an error.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import RecordedRows
 
-MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch: a few may make a small file a huge table
+MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch; limits what a small file can expand to
 Buffers = tuple[Any, ...]
 
 
 class RecordedColumns(NamedTuple):
-    """Columns of a recorded batch: numbers for each row, and codes for places in the names."""
+    """Columns of a recorded batch: numbers for each row, and names as codes (indexes into a dictionary)."""
 
     time: memoryview
     monotonic_ns: memoryview
     uncertainty_ns: memoryview  # 0 for a miss
     drive: memoryview
     register: memoryview
-    value: memoryview  # without meaning for a miss
+    value: memoryview  # undefined for a miss
     status: memoryview
-    valid: bytes | None  # a bit for each row, 0 for a miss; None: there is none
+    valid: bytes | None  # a bit for each row, 0 for a miss; None: no row is a miss
     drives: tuple[str, ...]
     registers: tuple[str, ...]
     statuses: tuple[str, ...]
@@ -47,7 +47,7 @@ class RecordedColumns(NamedTuple):
 class BatchDecoder:
     """Decodes one file's batches in their order, by the dictionaries that came before each.
 
-    `columns` have each its dictionary's id, or None.
+    `columns` has each column with the id of its dictionary, or None.
     """
 
     def __init__(self, columns: Sequence[tuple[FileColumn, int | None]]) -> None:
@@ -75,7 +75,7 @@ class BatchDecoder:
 
     @property
     def known(self) -> dict[int, Names]:
-        """The dictionaries so far; a mapping that is replaced, never changed."""
+        """The dictionaries so far. The mapping is replaced on each change, never modified."""
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
@@ -132,7 +132,7 @@ class BatchDecoder:
         return valid, *data
 
     def _learn(self, header: FlatTable, body: memoryview) -> None:
-        """Replace a dictionary, or extend it."""
+        """Replace or extend a dictionary, as this message says."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
             raise ValueError("there are names of no column")
@@ -152,15 +152,15 @@ class BatchDecoder:
 
 
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
-    """Return a batch's number of rows and its buffers, which must be `count`.
+    """Return a batch's number of rows and its `count` buffers.
 
-    The buffers are copies because the core takes them: a view that it holds in the traceback of a damaged
-    batch would crash the interpreter when it is collected.
+    The buffers are copies because they are passed to the C core. A view that is still held by the traceback
+    of a damaged batch would crash the interpreter when it is collected.
     """
     if batch.table(3):
         raise ValueError("its batches are compressed, which only pyarrow and polars read")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
-    if not 0 <= rows <= len(body):  # sums with it must not wrap around
+    if not 0 <= rows <= len(body):  # otherwise sums with `rows` could overflow
         raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
     if len(places) != count:
         raise ValueError(f"there is a batch of {len(places)} buffers")

@@ -1,7 +1,7 @@
 """Encode rows as record batches of an Arrow IPC stream, with names as dictionaries.
 
-A dictionary precedes the first batch that needs it, and is written again, whole, when it has changed: polars
-and nanoarrow read no deltas. It is one piece of the file with that batch.
+A dictionary precedes the first batch that needs it. When it has changed, it is written again as a whole,
+because polars and nanoarrow read no deltas. A dictionary and its batch are appended to the file together.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Encoder:
     def __init__(self) -> None:
         self._statuses = CodeTable(STATUSES)
         self._codes: dict[int, dict[str, int]] = {number: {} for number in CODED}
-        self._dictionaries: dict[int, Names] = {}  # those in the file
+        self._dictionaries: dict[int, Names] = {}  # dictionaries as they are in the file
 
     def encode(self, batch: Rows) -> bytes:
         """Return a record batch of the rows, preceded by the dictionaries that the file lacks.
 
-        Call `forget_dictionaries` if they could not be appended.
+        Call `forget_dictionaries` if the result could not be appended to the file.
         """
         source = (
             _BatchCodes(batch, self._statuses) if isinstance(batch, Batch) else _RowCodes(batch, self._codes)
@@ -89,7 +89,7 @@ def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_
     """Yield the rows in one piece, or in several if a column has more names than codes."""
     codes = source.codes(begin, end)
     if codes is None:
-        middle = begin + (end - begin) // 16 * 8  # a bitmap starts at a whole byte
+        middle = begin + (end - begin) // 16 * 8  # a multiple of 8 rows: bitmaps start at a whole byte
         yield from _pieces(source, begin, middle)
         yield from _pieces(source, middle, end)
         return
@@ -116,7 +116,7 @@ def _bitmap(bits: memoryview | None, begin: int, end: int) -> bytes:
 
 
 class _BatchCodes:
-    """Codes of a polled batch: the core has numbered its drives and registers already."""
+    """Codes of a polled batch, whose drives and registers the C core has already numbered."""
 
     def __init__(self, batch: Batch, statuses: CodeTable) -> None:
         columns = self._columns = batch.columns()

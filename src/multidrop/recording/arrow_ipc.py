@@ -1,7 +1,7 @@
 """The messages of an Arrow IPC stream.
 
-No number in the file is trusted: a damaged file ends in an error, not in a crash. Fields have the
-numbers of Arrow's format/Message.fbs and format/Schema.fbs.
+All numbers in the file are checked: a damaged file raises an error and causes no crash. Field numbers are
+those of Arrow's format/Message.fbs and format/Schema.fbs.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Structs(bytes):
 def build(root: Table) -> bytes:
     """Return the flatbuffer of this table."""
     out = bytearray(4)
-    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # with the place of the offset to it
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # where each table's offset belongs
     while waiting:
         place, thing = waiting.popleft()
         if isinstance(thing, dict):
@@ -139,7 +139,7 @@ def _align(out: bytearray, size: int, ahead: int = 0) -> None:
 
 
 def _put_table(out: bytearray, table: Table, waiting: deque[tuple[int, Any]]) -> int:
-    """Put the vtable and then the table: its larger fields first, so that all are aligned."""
+    """Append the vtable and then the table, larger fields first, so that all fields are aligned."""
     fields = {number: value if isinstance(value, tuple) else _OFFSET for number, value in table.items()}
     in_order = sorted(fields, key=lambda number: -struct.calcsize(fields[number][0]))
     slots = [0] * (max(table, default=-1) + 1)
@@ -179,41 +179,41 @@ def _put_vector(out: bytearray, data: bytes) -> int:
 
 INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
 SINGLE, DOUBLE, NANOSECONDS = 1, 2, 3
-BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # that a column has in a batch
+BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # buffers of a column in a batch, by type
 
 
 class FileColumn(NamedTuple):
-    """A column's name, type, the first field of that (bits, precision, unit), and the bits of its codes."""
+    """A column: name, type, the type's first field (bits, precision or unit), and the bits of its codes."""
 
     name: bytes
     kind: int
     detail: int = 0
-    code_bits: int = 0  # of unsigned codes of a dictionary; 0: it has none
+    code_bits: int = 0  # bits of the unsigned codes of its dictionary; 0: no dictionary
     nullable: bool = False
 
     @property
     def buffers(self) -> int:
-        """Buffers in a batch; codes have two, as all numbers."""
+        """The number of the column's buffers in a batch; codes have two, like all numbers."""
         return 2 if self.code_bits else BUFFERS[self.kind]
 
 
 COLUMNS = (
     FileColumn(b"time", TIMESTAMP, NANOSECONDS),
     FileColumn(b"monotonic_ns", INT, 64),
-    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up: the bound stays true
+    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up: it stays an upper bound
     FileColumn(b"drive", UTF8, code_bits=16),
     FileColumn(b"register", UTF8, code_bits=16),
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
     FileColumn(b"status", UTF8, code_bits=8),
 )
-COLUMNS_BEFORE = (  # until 0.1; and as other programs write our batches
+COLUMNS_BEFORE = (  # of versions up to 0.1, and of our batches when other programs write them
     *COLUMNS[:2],
     FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
     *(FileColumn(name, UTF8) for name in (b"drive", b"register")),
     COLUMNS[5],
     FileColumn(b"status", UTF8),
 )
-CODED = {number: column for number, column in enumerate(COLUMNS) if column.code_bits}  # by dictionary's id
+CODED = {number: column for number, column in enumerate(COLUMNS) if column.code_bits}  # by dictionary id
 
 
 def schema_table(metadata: dict[bytes, bytes]) -> Table:

@@ -1,7 +1,7 @@
 """Recordings as an Arrow IPC stream (.arrows), in which every whole batch outlives a crash.
 
-The stream has no end marker, which Arrow allows: it is complete after every batch, and a recording
-under way can be read as a finished one.
+The stream has no end marker; Arrow allows this. So the file is complete after every batch, and a recording in
+progress can be read like a finished one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from multidrop.recording.format import METADATA_KEY, AppendingWriter, Metadata, 
 
 
 class ArrowsWriter(AppendingWriter):
-    """Writes each batch as one piece of the file, with the dictionaries that it needs."""
+    """Appends each batch, with the dictionaries that it needs, in one write."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         schema = schema_message({METADATA_KEY.encode(): dump_metadata(metadata).encode()})
@@ -55,7 +55,7 @@ class ArrowsWriter(AppendingWriter):
 
 
 class ArrowsReader(RecordingReader):
-    """Reads every whole message; a truncated one at the end is skipped."""
+    """Reads all complete messages; skips a truncated message at the end."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -109,7 +109,7 @@ class ArrowsReader(RecordingReader):
 
 
 def _column(field: FlatTable) -> FileColumn:
-    """Return a column as the file describes it, with -1 code bits if its codes are not ours."""
+    """Return a column as the file describes it; `code_bits` is -1 if its codes are not as we write them."""
     detail, coded = field.table(3), field.table(4)
     index = coded.table(1) if coded else None
     is_unsigned = index is not None and not index.number(1, "<?")
@@ -124,7 +124,7 @@ def _dictionary(field: FlatTable) -> int | None:
 
 
 def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
-    """Return the columns, of this or an earlier version, that match this description."""
+    """Return the columns of this or an earlier version if they match this description, else None."""
     for known in (COLUMNS, COLUMNS_BEFORE):
         if found == tuple(column._replace(nullable=False) for column in known):
             return known
@@ -156,7 +156,7 @@ class ArrowsTail:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = path.open("rb", buffering=0)  # a buffer would keep bytes that were cut off
+        self._file = path.open("rb", buffering=0)  # a buffer could return bytes that were cut off
         try:
             reader = ArrowsReader(path)
             self.metadata = reader.metadata
@@ -181,7 +181,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                if message.kind != RECORD_BATCH:  # again with its batch: a full disk may have cut both off
+                if message.kind != RECORD_BATCH:  # read again with its batch: a full disk may cut both off
                     self._decoder.decode(message, message.header, body)
                     continue
                 place = BatchPlace(message, self._decoder.known)
@@ -192,7 +192,7 @@ class ArrowsTail:
             yield batch
 
     def again(self, place: BatchPlace) -> RecordedColumns:
-        """Return a batch that `new` yielded before. Raises ValueError."""
+        """Read again a batch that `new` has yielded. Raises ValueError if it is damaged."""
         assert place.message.header
         return self._decoder.columns(place.message.header, self._body(place.message), place.names)
 
@@ -200,7 +200,7 @@ class ArrowsTail:
         length, place = message.end - message.body, message.body
         if sys.platform != "win32":
             return memoryview(os.pread(self._file.fileno(), length, place))
-        with self.path.open("rb") as file:  # Windows keeps the name of a file that is open
+        with self.path.open("rb") as file:  # on Windows the path stays valid while the file is open
             file.seek(place)
             return memoryview(file.read(length))
 

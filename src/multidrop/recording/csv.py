@@ -18,8 +18,8 @@ from multidrop.recording.format import AppendingWriter, Metadata, RecordingReade
 from multidrop.recording.rows import from_rows
 
 HEADER = ",".join(ROW_COLUMNS) + "\n"
-WITH_UNITS = ",".join([*ROW_COLUMNS, "unit"]) + "\n"  # of a text that has no metadata beside it
-FORMULA = re.compile(r"'*[=+\-@\t\r\n]")  # a spreadsheet evaluates it unless an apostrophe is in front
+WITH_UNITS = ",".join([*ROW_COLUMNS, "unit"]) + "\n"  # header of a file without a metadata file
+FORMULA = re.compile(r"'*[=+\-@\t\r\n]")  # text that needs an apostrophe in front
 ESCAPED = re.compile(r"'+[=+\-@\t\r\n]")
 EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
 BATCH_ROWS = 1 << 14
@@ -30,7 +30,7 @@ def metadata_path(path: Path) -> Path:
 
 
 class CsvWriter(AppendingWriter):
-    """Write each batch's lines in one call of the system."""
+    """Writes each batch's lines in one system call."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         described = dump_metadata(metadata)
@@ -38,7 +38,7 @@ class CsvWriter(AppendingWriter):
         try:
             with writing(path):
                 _write_whole(metadata_path(path), described + "\n")
-            self._append(HEADER.encode())  # last: a file with a header has its metadata
+            self._append(HEADER.encode())  # last, so that a file with a header always has its metadata
         except OSError:
             self.discard()
             raise
@@ -65,7 +65,7 @@ def _write_whole(path: Path, text: str) -> None:
 
 
 class CsvReader(RecordingReader):
-    """Read every whole line; without its .csv.json the metadata is empty."""
+    """Reads all complete lines. If the .csv.json is missing, the metadata is empty."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -115,7 +115,7 @@ def _parse(cells: list[str]) -> Row:
         raise ValueError(len(cells))
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells[: len(ROW_COLUMNS)]
     numbers = f"{monotonic_ns}{uncertainty_ns}{value}"
-    if not numbers.isascii() or "_" in numbers:  # Python takes 1_0 for 10
+    if not numbers.isascii() or "_" in numbers:  # Python would read 1_0 as 10
         raise ValueError(numbers)
     return Row(
         parse_time(time),
@@ -150,9 +150,9 @@ def _line(row: Row) -> str:
 
 @lru_cache(maxsize=4096)
 def _quote(text: str) -> str:
-    """Put a text with a comma, a quote or the end of a line between quotes (RFC 4180).
+    """Quote a text that contains a comma, a quote or a line end (RFC 4180).
 
-    A text that could be a formula gets an apostrophe in front, and so does one that has it already.
+    A text that could be a formula gets an apostrophe in front, even if it already starts with one.
     """
     if FORMULA.match(text):
         text = f"'{text}"
@@ -161,7 +161,7 @@ def _quote(text: str) -> str:
 
 @lru_cache(maxsize=4096)
 def _unquote(cell: str) -> str:
-    """Return the text that `_quote` was given."""
+    """Undo `_quote`: return the original text."""
     return cell[1:] if ESCAPED.match(cell) else cell
 
 

@@ -35,7 +35,7 @@ class RecordingError(OSError):
 
 @contextmanager
 def writing(path: Path, rows: int = 0) -> Iterator[None]:
-    """Raise an OSError of the block as a RecordingError of a file with this number of rows."""
+    """Convert an OSError of the block into a RecordingError; `rows` rows of the file can be read."""
     try:
         yield
     except RecordingExists:
@@ -68,7 +68,7 @@ class RecordingWriter(ABC):
         """Close the recording and remove its files."""
         with suppress(OSError):
             self.close()
-        for path in filter(Path.is_file, self.files):  # a device is not ours to remove
+        for path in filter(Path.is_file, self.files):  # never remove a device
             with suppress(OSError):
                 path.unlink()
 
@@ -80,7 +80,7 @@ class RecordingWriter(ABC):
 
 
 class AppendingWriter(RecordingWriter):
-    """A recording that grows by one write to the system a batch."""
+    """A recording to which each batch is appended with one system call."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -96,15 +96,15 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-_REASONS = {  # a library's own sentence is about its internals
+_REASONS = {  # replace libraries' error messages, which describe their internals
     UnicodeDecodeError: "its text is not UTF-8",
     struct.error: "its lengths do not fit together",
-    RuntimeError: "its lengths do not fit together",  # nanoarrow's
+    RuntimeError: "its lengths do not fit together",  # raised by nanoarrow
 }
 
 
 class RecordingReader(ArrowTable):
-    """A recording as it was when it was opened; may be iterated over more than once.
+    """A recording with the rows that it had when it was opened; may be iterated over more than once.
 
     Tables of pandas or polars and the wide form hold all rows in memory. An Arrow library accepts the reader
     itself, such as `pyarrow.table(reader)`.
@@ -140,7 +140,7 @@ class RecordingReader(ArrowTable):
         return CArrayStream.from_c_arrays([rows.arrow() for rows in self], layout).__arrow_c_stream__()
 
     def wide(self, *columns: str) -> WideRows:
-        """Return a column for each `drive.register`, or for these alone, and a row for each time.
+        """Return a table with a column for each `drive.register`, or for the given ones, and a row per time.
 
         Only registers of one request share a row, and a miss is null: see `WideRows`. Raises ValueError for a
         column that is not in the recording, or if the recording is damaged.
@@ -148,7 +148,7 @@ class RecordingReader(ArrowTable):
         return WideRows((row for rows in self for row in rows), columns, self._registers())
 
     def _registers(self) -> list[str]:
-        """Return the wide form's columns for every polled register."""
+        """Return the wide form's column names for all polled registers."""
         drives = self.metadata.get("drives")
         described = drives.items() if isinstance(drives, dict) else ()
         return [
@@ -159,7 +159,7 @@ class RecordingReader(ArrowTable):
         ]
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
-        """Return an error with the number of readable rows and the damage."""
+        """Return a ValueError that states the damage and the number of readable rows."""
         reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
         return ValueError(f"{self.path} is damaged after row {rows}: {reason}")
 
@@ -167,7 +167,7 @@ class RecordingReader(ArrowTable):
         return ValueError(f"{path or self.path} is not a recording: {reason}")
 
     def _parse_metadata(self, text: bytes, path: Path | None = None) -> Metadata:
-        """Return metadata, from this file or the one at `path`. Raises ValueError for no JSON object."""
+        """Parse metadata of this file, or of the one at `path`. Raises ValueError if it is no JSON object."""
         try:
             metadata = json.loads(text)
         except ValueError as error:
@@ -180,7 +180,7 @@ class RecordingReader(ArrowTable):
 
 
 def dump_metadata(metadata: Metadata) -> str:
-    """Return the metadata as a recording holds it. Raises TypeError for what JSON cannot hold."""
+    """Return the metadata as JSON. Raises TypeError for values that JSON cannot hold."""
     return json.dumps(metadata, ensure_ascii=False)
 
 
@@ -193,9 +193,9 @@ def already_there(path: Path) -> RecordingExists:
 
 
 def new_file(path: Path) -> FileIO:
-    """Open a file that is not there yet: an existing one may hold months of data.
+    """Create and open a file. Raises RecordingExists for an existing file, which may hold months of data.
 
-    A device or a pipe exists and has no data to lose. Raises RecordingExists and OSError.
+    An existing device or pipe is opened, because it has no data to lose. Raises OSError.
     """
     mode = "wb" if path.exists() and not path.is_file() else "xb"
     try:
@@ -205,7 +205,7 @@ def new_file(path: Path) -> FileIO:
 
 
 class AppendFile:
-    """A new file. Raises RecordingExists if there is one at this path, and OSError, as do its methods."""
+    """A new file. Raises RecordingExists if the path exists. The methods, too, raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
@@ -215,8 +215,8 @@ class AppendFile:
     def append(self, piece: bytes | memoryview) -> None:
         """Append the whole piece, or leave the file as it was if the piece does not fit.
 
-        The same holds if a signal handler raises. If the file cannot be cut back at once, that happens
-        before the next piece.
+        The same holds if a signal handler raises. If the file cannot be truncated immediately, it is
+        truncated before the next piece is appended.
         """
         if self._is_truncated:
             self._cut()
@@ -224,7 +224,7 @@ class AppendFile:
         written = 0
         try:
             while written < len(piece):
-                # Released at once: a view that an exception's traceback keeps forbids its buffer to grow.
+                # Release the view now: if a traceback kept it, the underlying buffer could not grow.
                 with memoryview(piece)[written:] as left:
                     written += self._file.write(left)
         except BaseException:

@@ -1,7 +1,7 @@
-"""Recordings as Parquet (.parquet), the smallest for keeping; needs pyarrow.
+"""Recordings as Parquet (.parquet), the smallest format for archiving; needs pyarrow.
 
-A Parquet file can be read only once it is closed, and not at all after a crash: record into .arrows,
-and convert.
+A Parquet file can be read only after it has been closed, so a crash loses it. Record into .arrows, then
+convert.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from multidrop.recording.format import (
 )
 from multidrop.recording.rows import RecordedRows
 
-GROUP_ROWS = 1 << 17  # that wait in memory
+GROUP_ROWS = 1 << 17  # rows that are gathered in memory
 TEXTS = ("drive", "register", "status")
 MOST_TEXT = 1 << 26  # bytes of a text column in GROUP_ROWS rows
 MOST_OF_GROUP = 1 << 29  # unpacked bytes of a group of rows
@@ -49,7 +49,7 @@ def _pyarrow(path: Path) -> Any:
 
 
 class ParquetWriter(RecordingWriter):
-    """Gather rows, and write them in large groups."""
+    """Gathers rows, and writes them in large groups."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
@@ -93,7 +93,7 @@ class ParquetWriter(RecordingWriter):
 
 
 class ParquetReader(RecordingReader):
-    """Read one group of rows at a time."""
+    """Reads one group of rows at a time."""
 
     truncated = 0
 
@@ -103,12 +103,12 @@ class ParquetReader(RecordingReader):
         with self._open() as file:
             found = file.schema_arrow
         wanted = self._arrow.schema(schema())
-        has_units = found.names == [*wanted.names, "unit"]  # as a history has them
+        has_units = found.names == [*wanted.names, "unit"]  # the format of a history's files
         self._columns = wanted.names
         if found.types[: len(wanted)] != wanted.types or not (has_units or found.names == wanted.names):
             raise self._not_a_recording("it is a Parquet file with other columns")
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
-        if has_units and not self.metadata.get("drives"):  # a register may have two units
+        if has_units and not self.metadata.get("drives"):  # rows of one register may have different units
             raise self._not_a_recording(
                 "it is a file of `multidrop hub`: read its folder with multidrop.History"
             )
@@ -117,7 +117,7 @@ class ParquetReader(RecordingReader):
         c_array = nanoarrow().c_array
         rows = 0
         with self._open(read_dictionary=TEXTS) as file:
-            # Not by groups: a damaged one may claim any size.
+            # Do not read by groups: a damaged group may claim any size.
             batches = file.iter_batches(GROUP_ROWS, columns=self._columns)
             while (batch := self._next(batches, rows)) is not None:
                 yield RecordedRows(c_array(batch))
@@ -134,9 +134,9 @@ class ParquetReader(RecordingReader):
             yield opened
 
     def _check_sizes(self, described: Any) -> None:
-        """Raise ValueError for a group of rows that would take too much memory once it is unpacked.
+        """Raise ValueError for a group of rows that would take too much memory when unpacked.
 
-        The sizes of single columns are not read: pyarrow aborts the process for a damaged group.
+        Sizes of single columns are not read, because pyarrow aborts the process if a group is damaged.
         """
         for number in range(described.num_row_groups):
             size = described.row_group(number).total_byte_size
@@ -161,7 +161,7 @@ class ParquetReader(RecordingReader):
         return batch
 
     def _with_texts(self, batch: Any, rows: int) -> Any:
-        """Return the batch with texts in place of numbers into a dictionary of texts."""
+        """Return the batch with its dictionary codes replaced by the texts."""
         compute, columns = self._arrow.compute, []
         for name, column in zip(self._columns, batch.columns, strict=True):
             if name in TEXTS:

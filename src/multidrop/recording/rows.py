@@ -44,7 +44,7 @@ def _values(column: Any) -> Iterable[Any]:
 def texts_of(column: Any) -> Iterator[str]:
     """Yield each row's text of a column."""
     ends, text = memoryview(column.buffer(1))[: column.length + 1], bytes(column.buffer(2))
-    if text.isascii():  # decoded once: names and statuses mostly are
+    if text.isascii():  # usual case: decode all texts together
         letters = text.decode("ascii")
         return (letters[begin:end] for begin, end in pairwise(ends))
     return (text[begin:end].decode(errors="replace") for begin, end in pairwise(ends))

@@ -1,7 +1,7 @@
 """Recordings in segments: `run.arrows` becomes run.00000001.arrows, run.00000002.arrows, and so on.
 
-Each is a recording of its own, and crash-safe as any. Numbers only grow, also over restarts: they, and not
-the clock, say which is older.
+Each segment is a complete recording, as crash-safe as any other. Numbers only grow, also across restarts. The
+segment with the lower number is the older one, whatever the clock said.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # bytes; a longer end is damage, not a truncated batch, and is kept
+MOST_CUT = 1 << 24  # bytes; a longer unreadable end is damage, not a truncated batch, and is kept
 
 
 def segments_of(path: Path) -> list[tuple[int, Path]]:
@@ -33,10 +33,11 @@ def segments_of(path: Path) -> list[tuple[int, Path]]:
 class SegmentWriter(RecordingWriter):
     """A recording that starts a new segment `every` s, on the monotonic clock.
 
-    A segment is created with its first rows. Whenever one starts, segments that ended more than `keep` s ago
-    are removed, and then the oldest while all take more than `most` bytes; never the current one. All new
-    segments have numbers above `after`. Raises ValueError while another process records there, or if the name
-    does not end in .arrows, TypeError for metadata that JSON cannot hold, and RecordingError.
+    A segment is created with its first rows. Whenever a segment starts, those that ended more than `keep` s
+    ago are removed; then the oldest ones, as long as all together take more than `most` bytes. The current
+    segment is never removed. All new segments have numbers above `after`. Raises ValueError if another
+    process records there or the name does not end in .arrows, TypeError for metadata that JSON cannot hold,
+    and RecordingError.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class SegmentWriter(RecordingWriter):
 
     @property
     def open_number(self) -> int:
-        """The number of the current or next segment: those below it are closed."""
+        """The number of the current or next segment. All segments with lower numbers are closed."""
         return self.number if self._segment else self.number + 1
 
     def write(self, batch: Rows) -> None:
@@ -143,7 +144,7 @@ class StoredFile(NamedTuple):
     """A file of rows whose number grows with the time of recording."""
 
     path: Path
-    number: int  # of its last segment
+    number: int  # of the last segment in it
     end: float  # time of its newest row, in s since 1970
     size: int  # in bytes
 
@@ -153,11 +154,11 @@ def outlived(
 ) -> list[StoredFile]:
     """Return the files to remove: those that are older than `keep` s, and the oldest beyond `most`.
 
-    `now` is in s since 1970, `most` is the number of bytes that may stay; None means unlimited. The oldest
+    `now` is in s since 1970. Files of up to `most` bytes in all are kept. None means unlimited. The oldest
     file is the one with the lowest number, whatever the clock said.
 
-    An age is the sum of the times from each file's end to the next one's, and to `now`. A step longer than
-    `keep` is skipped, because the clock jumped or the recording paused: neither empties a history.
+    A file's age is the sum of the intervals between the ends of all later files, up to `now`. An interval
+    longer than `keep` is skipped: a jump of the clock, or a pause in recording, must not empty a history.
     """
     in_order = sorted(files, key=lambda file: file.number)
     ages = {} if keep is None else _ages(in_order, now, keep)
@@ -173,7 +174,7 @@ def outlived(
 
 
 def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
-    """Return the age in s of each number, without steps that are longer than this, or back in time."""
+    """Return each number's age in s, not counting intervals that are negative or longer than `longest`."""
     ends: dict[int, float] = {}
     for file in files:
         ends[file.number] = min(file.end, ends.get(file.number, file.end))  # a copy may have a later time
@@ -187,7 +188,7 @@ def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, 
 
 
 def parse_age(text: str) -> float:
-    """Return the seconds in an age such as "30 days"; ValueError if it is none."""
+    """Return the seconds of an age such as "30 days". Raises ValueError for other texts."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:(s|min|h)|(day|week)s?)", str(text).strip(), re.ASCII)
     seconds = float(match[1]) * AGES[match[2] or match[3]] if match else 0.0
     if not 1.0 <= seconds <= 36525 * AGES["day"]:
@@ -198,7 +199,7 @@ def parse_age(text: str) -> float:
 
 
 def parse_size(text: str) -> int:
-    """Return the bytes in a size such as "20 GB"; ValueError if it is none."""
+    """Return the bytes of a size such as "20 GB". Raises ValueError for other texts."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(kB|MB|GB|TB)", str(text).strip(), re.ASCII)
     size = round(float(match[1]) * SIZES[match[2]]) if match else 0
     if not SIZES["kB"] <= size <= 10**18:
@@ -210,7 +211,7 @@ _CLOSED_IN_CHILDREN = getattr(os, "O_CLOEXEC", 0) or getattr(os, "O_NOINHERIT", 
 
 
 class FileLock:
-    """A lock, held until `close` or the process ends; the file stays, because removing it would be a race.
+    """A lock, held until `close` or the end of the process. Its file stays: removing it would be a race.
 
     Raises BlockingIOError while another process holds it, and OSError if the file cannot be created.
     """

@@ -1,4 +1,4 @@
-"""Show a recording as pictures and as one page; needs matplotlib, the extra `plot`."""
+"""Show a recording as pictures or as one HTML page; needs matplotlib (the extra `plot`)."""
 
 from multidrop.report.html import plot_page as plot_page
 from multidrop.report.html import report_page as report_page

@@ -26,11 +26,11 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # in a picture; the rest are shown as one
-LEAST_IN_BIN = 20  # values, before a share of misses means something
+MOST_REASONS = 6  # in a picture; all others are shown together
+LEAST_IN_BIN = 20  # values; with fewer, a share of misses is not significant
 BINS = 12  # of the output frequency
 FREQUENCY = "output_frequency"
-ROOM = 2.0  # a picture's axis, as a multiple of the 99 % quantile of the delays
+ROOM = 2.0  # length of an axis, as a multiple of the 99 % quantile of the delays
 SHORTEST_AXIS = 0.001  # s
 SHADES = ("#B00020", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#0072B2", "#999999")
 
@@ -41,7 +41,7 @@ class DelaySeries:
 
     drive: str
     seconds: Array
-    exact: bool  # else the request, whose length is unknown, is included
+    exact: bool  # if False, the delay includes the request, whose length is unknown
 
     def quantile(self, part: float) -> float:
         return float(np.quantile(self.seconds, part))
@@ -50,13 +50,13 @@ class DelaySeries:
 def delays(recording: Recording) -> list[DelaySeries]:
     """Return the delays of every drive that answered.
 
-    The first reply after a loss is left out: it may answer the lost request, so its delay is unknown.
+    The first reply after a lost request is left out: it may answer the lost request, so its delay is unknown.
     """
     found = []
     for drive in recording.drives:
         request = _request_seconds(recording, drive)
         answered = [(series, ~series.missed & ~_spans_loss(series)) for series in recording.of(drive)]
-        # An exchange is one reply to several registers: its stamps count once.
+        # An exchange reads several registers in one reply: count its time stamps once.
         times = np.concatenate([series.time[there] for series, there in answered])
         stamps, firsts = np.unique(times, return_index=True)
         if len(stamps):
@@ -75,7 +75,7 @@ def _spans_loss(series: Series) -> Array:
 
 
 def _request_seconds(recording: Recording, drive: str) -> float | None:
-    """Return the time of a request and a reply's first character; None without usable metadata."""
+    """Return the s that a request and a reply's first character take; None without usable metadata."""
     about = recording.about(drive)
     try:
         baudrate, format = about["settings"].split()
@@ -88,7 +88,7 @@ def _request_seconds(recording: Recording, drive: str) -> float | None:
 
 
 def draw_delays(found: Sequence[DelaySeries]) -> Figure:
-    """Draw a row for each of the first MOST_DRIVES: a box between the quartiles, whiskers to 1 % and 99 %."""
+    """Draw a box plot of the first MOST_DRIVES drives: quartiles, and whiskers to 1 % and 99 %."""
     found = found[:MOST_DRIVES]
     figure, (axes,) = new_figure([0.8 + 0.32 * len(found)])
     axes.boxplot(
@@ -114,7 +114,7 @@ def draw_delays(found: Sequence[DelaySeries]) -> Figure:
 
 
 def draw_rates(recording: Recording) -> Figure:
-    """Draw the values a second of the first MOST_DRIVES drives, and below the misses a second by reason."""
+    """Draw values per second of the first MOST_DRIVES drives, and below misses per second by reason."""
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
     bins = TimeBins(recording.begin, recording.end)
     for number, drive in enumerate(recording.drives[:MOST_DRIVES]):
@@ -154,8 +154,8 @@ def reasons_of(recording: Recording, drive: str) -> Counter[str]:
 def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
     """Return output frequencies in Hz, and the drive's share of missed values near each.
 
-    The frequency at a miss is the last one that was read. Values that were not asked for do not count.
-    None without misses, or if the drive has no frequency or a constant one.
+    The frequency at a miss is the last one that was read. Values that were not requested do not count. Return
+    None if there are no misses, or if the drive has no frequency or a constant one.
     """
     (frequency, *_) = (*recording.of(drive, FREQUENCY), None)
     reasons = [reason for reason in reasons_of(recording, drive) if not reason.startswith(UNASKED)]
@@ -180,7 +180,7 @@ def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
 
 
 def draw_miss_shares(recording: Recording) -> Figure | None:
-    """Draw misses against output frequency: noise that comes with speed shows as a slope."""
+    """Draw misses against output frequency: noise that grows with speed shows as a slope."""
     shares = {drive: miss_shares(recording, drive) for drive in recording.drives[:MOST_DRIVES]}
     if not any(shares.values()):
         return None
@@ -199,18 +199,18 @@ def draw_miss_shares(recording: Recording) -> Figure | None:
 
 _LINE_FIGURES = ("utilisation", "cycle_ms")
 _DRIVE_FIGURES = ("exchanges_per_second", "silence_ms", "character_ms")
-MOST_FIGURE = 1e9  # a larger one is not of our plans
+MOST_FIGURE = 1e9  # sanity limit of a plan's figures
 
 
 @dataclass(frozen=True, eq=False)
 class LineUse:
-    """A line's answered exchanges: their times, and the time that each needed of the line."""
+    """A line's answered exchanges: when they were, and how much line time each of them needed."""
 
     line: str
     planned: Mapping[str, Any]
     time: Array  # ns UTC
-    needed: Array  # s: request, response delay, reply, silence after it; never more than it took
-    asked: Mapping[str, int]  # exchanges that were answered, by drive
+    needed: Array  # s: request, response delay, reply, silence; at most the measured time
+    asked: Mapping[str, int]  # number of answered exchanges, by drive
     values: int  # in their replies
     seconds: float
 
@@ -231,7 +231,7 @@ class LineUse:
 
 
 def line_uses(recording: Recording) -> list[LineUse]:
-    """Return the use of every line whose plan the recording holds; none if a plan is damaged."""
+    """Return the use of every line whose plan is in the recording; an empty list if a plan is damaged."""
     try:
         plans = recording.metadata.get("planned", {})
         return [_line_use(recording, line, planned) for line, planned in plans.items()]
@@ -240,7 +240,7 @@ def line_uses(recording: Recording) -> list[LineUse]:
 
 
 def _checked(planned: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plan with its figures as floats. Raises what `line_uses` catches."""
+    """Return the plan with its figures as floats. Raises errors that `line_uses` catches."""
     drives = {
         name: {**drive, **{key: _figure(drive[key]) for key in _DRIVE_FIGURES}}
         for name, drive in planned["drives"].items()
@@ -274,18 +274,19 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
     time, needed, silence = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
     time, needed, silence = time[order], needed[order], silence[order]
-    if len(time):  # the longer of two neighbours' silences is kept
+    if len(time):  # between two exchanges the line keeps the longer of their silences
         needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
-        # A port may be faster than its settings, such as a network's: limit its need to the measured time.
+        # Some ports, such as a network's, are faster than their settings: limit the need to the measured
+        # time.
         needed[:-1] = np.minimum(needed[:-1], np.diff(time) / 1e9)
     end = float(needed[-1]) if len(time) else 0.0
     return LineUse(line, planned, time, needed, asked, values, max(recording.seconds + end, 1e-9))
 
 
 def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
-    """Return the time and the seconds to its reply's end of each answered exchange, and how many values.
+    """Return each answered exchange's time and its seconds up to the reply's end; and the number of values.
 
-    Values of one time were read together; the blocks may differ from the plan's.
+    Values with the same time were read by one exchange, whose registers may differ from the plan.
     """
     registers = [register for block in drive["blocks"] for register in block["registers"]]
     read = [(series, ~series.missed) for register in registers for series in recording.of(name, register)]
@@ -315,7 +316,7 @@ def _characters(framing: Framing, request: Message) -> int:
 
 
 def draw_utilisation(uses: Sequence[LineUse], recording: Recording) -> Figure:
-    """Draw utilisation over time, and dashed the planned one."""
+    """Draw each line's utilisation over time, with the planned one dashed."""
     figure, (axes,) = new_figure([2.2])
     bins = TimeBins(recording.begin, recording.end)
     for number, use in enumerate(uses):

@@ -26,7 +26,7 @@ from multidrop.report.load import Recording, Series
 from multidrop.report.style import MOST_DRIVES, png
 from multidrop.report.value_plot import FAULTS, plot
 
-SHORT = 32  # characters, in a cell that is not broken
+SHORT = 32  # characters; a cell with up to so many is not wrapped
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; }
@@ -45,7 +45,7 @@ div.wide { overflow-x: auto; }
 
 
 def plot_page(recording: Recording, figure: Figure) -> str:
-    """Return a page with the picture of values."""
+    """Return an HTML page with this picture of values."""
     return _page(f"{recording.path.name}", [_about(recording), _image(figure, "values over time")])
 
 

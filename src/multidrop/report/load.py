@@ -16,13 +16,13 @@ from multidrop.polling.batch import ROW_COLUMNS
 from multidrop.recording import open_recording
 
 RAW = "raw count"  # unit of values without a known scale
-LARGEST = 1e150  # drawable value: axes compute with differences and products
+LARGEST = 1e150  # largest drawable value: axes compute products of values
 LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: dates beyond it cannot be computed
-PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step is a pause in polling, such as of a suspended process
-MOST_ROWS = 100_000_000  # they take 5 GB
+PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step is a pause, for example of a suspended process
+MOST_ROWS = 100_000_000  # these take 5 GB
 MOST_NAMES = 4096  # of drives, registers or statuses
 LONGEST_NAME = 4096  # bytes
-LARGEST_COUNT = 2**53  # that a column of values can hold exactly
+LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
 Array = NDArray[Any]
 
 
@@ -37,14 +37,14 @@ class TimeSpan:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One register of one drive: a value, or NaN for a miss, for each time it was due."""
+    """One register of one drive: for each time that it was due, a value, or NaN for a miss."""
 
     drive: str
     register: str
     time: Array  # int64, ns UTC
     value: Array  # float64
     uncertainty: Array  # float64, ns
-    status: Array  # int, into `statuses`
+    status: Array  # int, index into `statuses`
     statuses: tuple[str, ...]
     metadata: Mapping[str, Any]  # of the register
 
@@ -63,7 +63,7 @@ class Series:
 
     @cached_property
     def pauses(self) -> Array:
-        """True for each row, except the last, that is followed by a pause without values or misses."""
+        """For each row except the last: True if a pause without values or misses follows."""
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
@@ -96,7 +96,7 @@ class Series:
         return np.asarray(self.time[self.missed & (self.status == self.statuses.index(reason))])
 
     def faults(self) -> list[TimeSpan]:
-        """Return the spans in which a register of faults was not 0; a miss ends no fault."""
+        """Return the spans in which a fault register was not 0; a miss does not end a fault."""
         there = ~self.missed
         time, value = self.time[there], self.value[there]
         if not len(time):
@@ -134,7 +134,7 @@ class Recording:
     path: Path
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
-    truncated: int  # bytes at the recording's end that were left out
+    truncated: int  # skipped bytes at the recording's end
 
     @property
     def statuses(self) -> tuple[str, ...]:
@@ -180,7 +180,7 @@ class Recording:
 
 
 def load(path: str | Path) -> Recording:
-    """Load a recording. Raises OSError, and ValueError for a file of another kind, empty, or too large."""
+    """Load a recording. Raises OSError; ValueError if it is no recording, empty, or too large."""
     reader = open_recording(path)
     codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
     parts: list[list[Array]] = []
@@ -230,7 +230,7 @@ def load(path: str | Path) -> Recording:
 
 
 def _described(drives: object) -> dict[str, Any]:
-    """Return the metadata of drives and registers, without what `Plant.metadata` would not write."""
+    """Return the metadata of drives and registers, without values that `Plant.metadata` never writes."""
     found = {}
     for name, about in _tables(drives):
         registers = {register: _checked(table) for register, table in _tables(about.get("registers"))}
@@ -265,7 +265,7 @@ def _numbers(column: Any) -> Array:
 
 
 def _codes(column: Any, known: dict[str, int]) -> Array:
-    """Return the code of each row's text by `known`, to which new texts are added."""
+    """Return the code of each row's text from `known`; new texts are added to `known`."""
     ends = np.array(column.buffer(1))[: column.length + 1]
     lengths = np.diff(ends)
     if lengths.max(initial=0) > LONGEST_NAME:

@@ -1,4 +1,4 @@
-"""The style of all pictures: colours for everyone's eyes, few lines, time in UTC."""
+"""The style of all pictures: colours that colour-blind readers can distinguish, few lines, time in UTC."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from matplotlib.figure import Figure
 from multidrop.printable import printable
 from multidrop.report.load import Array
 
-# Okabe and Ito's, without black and yellow; then the same once more, dashed.
-MOST_DRIVES = 100  # in a picture; tables have all
+# Okabe and Ito's colours, without black and yellow; further drives have the same colours, dashed.
+MOST_DRIVES = 100  # in a picture; tables list all drives
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 TEXT = "#555555"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
 FEWEST_BINS, MOST_BINS = 10, 120  # of the time axis
-BIN_NS = 2_000_000_000  # the width of one, between these
-SHORTEST_NS = 1_000_000_000  # time axis
+BIN_NS = 2_000_000_000  # width of a bin, if the number of bins is within these limits
+SHORTEST_NS = 1_000_000_000  # least length of the time axis
 WIDTH = 11.0  # inches
 DPI = 110
 LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21  # inches
 
-_DATES: Any = dates  # it has no types
+_DATES: Any = dates  # matplotlib.dates has no type hints
 
 
 class TimeBins:
-    """The bins into which a picture cuts the time of a recording, given in ns UTC."""
+    """The bins into which a picture divides the time of a recording; times are in ns UTC."""
 
     def __init__(self, begin: int, end: int) -> None:
         bins = int(np.clip((end - begin) / BIN_NS, FEWEST_BINS, MOST_BINS))
@@ -42,7 +42,7 @@ class TimeBins:
         self.middles = days(((self._edges[1:] + self._edges[:-1]) / 2).astype(np.int64))
 
     def rates(self, time: Array, weights: Array | None = None) -> Array:
-        """Return for each bin how many times a second, or their weights a second, lie in it."""
+        """Return for each bin the number of times in it, or the sum of their weights, per second."""
         return np.asarray(np.histogram(time, self._edges, weights=weights)[0] / self._seconds)
 
     def label(self, axes: Axes) -> None:
@@ -52,7 +52,7 @@ class TimeBins:
 
 
 def label(text: str) -> str:
-    """Return a name for a picture: without mathematics, and never left out of a legend."""
+    """Return the name in a form that matplotlib neither reads as a formula nor leaves out of a legend."""
     shown = printable(text).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
@@ -81,7 +81,7 @@ def set_title(axes: Axes, text: str) -> None:
 
 
 def add_legend(figure: Figure, handles: Sequence[Any], columns: int = 6) -> None:
-    """Add a legend above the axes, as wide as there is room, in a figure that grows by its rows."""
+    """Add a legend above the axes, as wide as fits; the figure grows by the legend's height."""
     longest = max((len(handle.get_label()) for handle in handles), default=0)
     columns = max(1, min(columns, int(WIDTH / (LEGEND_MARK + LEGEND_LETTER * longest))))
     rows = -(-len(handles) // columns)
@@ -90,14 +90,14 @@ def add_legend(figure: Figure, handles: Sequence[Any], columns: int = 6) -> None
 
 
 def mark_times(axes: Axes, time: Array, height: float, apart: int, **details: Any) -> None:
-    """Draw a tick at each time; those of the same `apart` ns, which would overlap, are one."""
+    """Draw a tick at each time. Ticks within the same `apart` ns would overlap, and are drawn as one."""
     if len(time):
         time = np.unique(time // max(1, apart)) * max(1, apart)
         axes.plot(days(time), np.full(len(time), height), "|", **details)
 
 
 def days(time: Array) -> Array:
-    """Return times in ns UTC as matplotlib counts them."""
+    """Convert times from ns UTC to matplotlib's days."""
     return np.asarray(_DATES.date2num(np.asarray(time, dtype="datetime64[ns]")))
 
 

@@ -32,7 +32,7 @@ from multidrop.report.style import (
     set_title,
 )
 
-FIRST = (  # shown before others when there are more than fit
+FIRST = (  # registers that precede the others if not all fit
     "output_frequency",
     "output_current",
     "motor_speed",
@@ -43,15 +43,15 @@ FIRST = (  # shown before others when there are more than fit
     "heatsink_temperature",
 )
 MOST_PANELS = 8
-MOST_POINTS = 4000  # of a line: more cannot be seen
-FEW_POINTS = 200  # each has a dot of its own
+MOST_POINTS = 4000  # of a curve: more points cannot be seen
+FEW_POINTS = 200  # up to so many points, each is drawn as a dot
 FAULTS = "fault"
 
 CURVES_INCHES = 1.9
 
 
 class Panel(NamedTuple):
-    """A quantity, which has a panel of its own: amperes and per cent share no axis."""
+    """A quantity with a panel of its own, because amperes and per cent cannot share an axis."""
 
     register: str
     unit: str
@@ -69,7 +69,7 @@ class Content:
     panel: Panel
     series: list[Series]
     lanes: list[Lane]  # none: curves
-    hidden: int  # lanes that have no room
+    hidden: int  # number of lanes without room
 
     @property
     def inches(self) -> float:
@@ -79,7 +79,7 @@ class Content:
 def plot(
     recording: Recording, drives: Sequence[str] = (), registers: Sequence[str] = ()
 ) -> tuple[Figure, list[str]]:
-    """Return the picture, and the registers and drives that had no room in it.
+    """Return the picture, and the names of registers and drives for which it had no room.
 
     Raises ValueError for unknown names, and if there is no value to draw.
     """
@@ -111,7 +111,7 @@ def plot(
 
 
 def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[str]) -> list[Series]:
-    """Return the drives' series, or those of the first MOST_DRIVES. Raises ValueError for unknown names."""
+    """Return the series of `drives`, or of the first MOST_DRIVES. Raises ValueError for unknown names."""
     _check("drive", drives, recording.drives)
     shown = set(drives or recording.drives[:MOST_DRIVES])
     chosen = [series for series in recording.series if series.drive in shown]
@@ -153,7 +153,7 @@ def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
     return sorted(found, key=lambda panel: (order.get(panel.register, len(order)), panel.unit == RAW))
 
 
-# ---- how it is drawn ----
+# ---- drawing ----
 
 
 def _draw(axes: Axes, content: Content, recording: Recording) -> None:
@@ -194,7 +194,7 @@ def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: 
 
 
 def _fit(axes: Axes, series: Sequence[Series]) -> None:
-    """Scale the y axis: whole numbers for counts, room around a constant value, 0 if it is near."""
+    """Scale the y axis: whole numbers for counts, room around a constant value; include 0 if it is near."""
     drawn = np.concatenate([one.drawable for one in series])
     seen = drawn[~np.isnan(drawn)]
     if not len(seen):
@@ -235,7 +235,7 @@ def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
 
 
 def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
-    """Shade the time of faults where their drives are drawn: of lanes, those of the drive alone."""
+    """Shade each drive's faults: across the panel if it has the drive's curve, else across its lanes."""
     shade: dict[str, Any] = {"color": FAULT, "alpha": 0.08, "lw": 0}
     for one in faults:
         rows = [row for row, lane in enumerate(content.lanes) if lane.drive == one.drive]
@@ -268,14 +268,14 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
     return time[kept], value[kept]
 
 
-# Tol's pale ones: no state has the colour of a drive.
+# Tol's pale colours: no state has the colour of a drive.
 COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
-HATCHES = ("", "////", "....")  # the colours once more, and again
+HATCHES = ("", "////", "....")  # patterns, for when the colours are used up
 MOST_LANES = 64  # in one panel
-NARROWEST = 1 / 1500  # of the time axis: a shorter state is drawn so wide
-LETTER = 1 / 140  # of the time axis: the width of a letter
+NARROWEST = 1 / 1500  # part of the time axis: the least width of a state
+LETTER = 1 / 140  # part of the time axis: the width of a letter
 LANE_INCHES = 0.24
-MOST_TEXTS = 50  # with one name, in one lane
+MOST_TEXTS = 50  # labels with one name in one lane
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,16 +284,16 @@ class Lane:
 
     drive: str
     title: str
-    is_bit: bool  # either on or off
+    is_bit: bool  # the state is on or off
     time: Array  # of its rows, ns UTC
     missed: Array
-    state: tuple[str, ...]  # of each run of rows that are alike
+    state: tuple[str, ...]  # of each run of equal rows
     begin: Array  # of each state, ns UTC
     end: Array
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return the lanes of a panel, and how many had no room: bits that were never set are left out first."""
+    """Return a panel's lanes, and how many had no room. Bits that were never set are left out first."""
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found
@@ -349,7 +349,7 @@ def lanes_inches(lanes: Sequence[Lane]) -> float:
 
 
 def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
-    """Draw a row for each lane, its states as bars; names that fit nowhere go into a legend."""
+    """Draw each lane as a row of bars, one per state. Names that fit into no bar go into a legend."""
     names = dict.fromkeys(state for lane in lanes if not lane.is_bit for state in lane.state)
     styles = {name: _style(number) for number, name in enumerate(names)}
     span = max(recording.end - recording.begin, 1)
@@ -391,7 +391,7 @@ def _style(number: int) -> dict[str, Any]:
 
 
 def _longest_first(lane: Lane) -> list[str]:
-    """Return the states by falling duration: drawn last, short ones are not hidden by long ones."""
+    """Return the states, longest first: drawn in this order, long states do not cover short ones."""
     lasting = dict.fromkeys(lane.state, 0)
     for name, length in zip(lane.state, (lane.end - lane.begin).tolist(), strict=True):
         lasting[name] += length

@@ -1,6 +1,6 @@
-"""Identify the family of a drive that answers: read what each family's document says it must have.
+"""Identify the family of a drive that answers: check the registers that each family's document requires.
 
-Only reads are sent. A family without an `identify` script must answer its first readings.
+Only reads are sent. A drive of a family without an `identify` script must answer the family's first readings.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 R = TypeVar("R")
 Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError without a good reply
 
-MOST_READINGS = 3  # that a family without an `identify` script must answer
+MOST_READINGS = 3  # readings that must be answered if the family has no `identify` script
 
 
 def identify(
     sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask
 ) -> tuple[list[Drive], str]:
-    """Return drives of the families that fit best, and the doubt that is left.
+    """Return a drive of each family that fits best, and a sentence about the remaining doubt.
 
-    There are several if they fit equally well, and none if none fits.
+    Several families may fit equally well; the list is empty if none fits.
     """
     found = [candidate(family, sweep.settings, sweep.framing, address) for family in families]
     drives = [drive for drive in found if drive is not None]
     scores: list[tuple[int, Drive]] = []
     for drive in drives:
-        with suppress(BusError, ValueError):  # a register that it must have is missing
+        with suppress(BusError, ValueError):  # the drive lacks a register of this family
             scores.append((_score(drive, ask), drive))
     if scores:
         best = max(score for score, _ in scores)
@@ -51,8 +51,8 @@ def identify(
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
     """Return a drive of the family with these settings; None if its manual does not allow them.
 
-    A drive with two stop bits, or on a pseudo-terminal with another parity, answers in the sweep's
-    format too: it is given the family's usual one.
+    A drive with two stop bits, or with another parity on a pseudo-terminal, answers in the sweep's format,
+    too. If the family does not allow that format, the drive gets the family's usual one.
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None
@@ -65,7 +65,7 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
 
 
 def _score(drive: Drive, ask: Ask) -> int:
-    """Return the number of checks that the drive passes. Raises if one excludes the family."""
+    """Return the number of checks that the drive passes. Raises if a check excludes the family."""
     score = 0
     if type(drive).identify is not Drive.identify:
         _run(drive, drive.identify.script(), ask)
@@ -92,7 +92,7 @@ def _resembles(drive: Drive, ask: Ask) -> bool:
 
 
 def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
-    """Carry a script out that only reads; return its result. Raises WriteForbidden for any other step."""
+    """Run a script that only reads; return its result. Raises WriteForbidden if it tries anything else."""
 
     def do(step: Step) -> Any:
         if not isinstance(step, Read):
@@ -116,8 +116,8 @@ def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
 
 MOST_TIMEOUT = 1.0  # s, for a drive with a known address only
 TRIES = 3
-LATE_NS = 500_000_000  # for which late replies are waited for
-SHORTEST_REPLY = 5  # bytes, of an exception; less is noise
+LATE_NS = 500_000_000  # how long to wait for late replies
+SHORTEST_REPLY = 5  # bytes of an exception reply; fewer bytes are noise
 
 
 # Results for frames that answer another request.
@@ -125,7 +125,7 @@ _MISDIRECTED = (FrameFault.BAD_ADDRESS, FrameFault.BAD_FUNCTION, FrameFault.BAD_
 
 
 def is_whole(framing: Framing, received: bytes) -> bool:
-    """Tell whether one frame with a good checksum is all that came."""
+    """Return True if the received bytes are exactly one frame with a valid checksum."""
     if framing is Framing.RTU:
         return len(received) >= SHORTEST_REPLY and crc16(received, len(received)) == 0
     return framing is Framing.TCP or (received[:1] == b":" and received[-2:] == b"\r\n")
@@ -140,7 +140,7 @@ class Scan(Protocol):
 
 
 class Probe:
-    """Find out whether a drive answers at an address, which one, and whether it is alone."""
+    """Finds out whether a drive answers at an address, which family it has, and whether it is alone."""
 
     def __init__(self, scan: Scan, sweep: Sweep, address: int) -> None:
         self._scan = scan
@@ -150,8 +150,8 @@ class Probe:
         self.answers = self.damaged = self.followed = 0
         self.whole_frame = ""  # a frame with a valid checksum that did not match the request, and why
         self.excess = 0.0
-        self._answered = False  # the last request
-        self._has_missed = False  # some request
+        self._answered = False  # whether the last request was answered
+        self._has_missed = False  # whether any request was not answered
         self._asked_ns = 0
         for _ in range(TRIES):
             self._ask(sweep.request.to(address))
@@ -171,10 +171,10 @@ class Probe:
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
         """Identify the drive, as far as reading can."""
-        # Its response delay is known: after a short timeout a request counts as unanswered.
+        # The drive's response delay is known, so a short timeout is enough.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         drives, guess = self._identify(families, LEAST_TIMEOUT, known)
-        if self._has_missed and not self._is_in_step():  # it became slower, or this computer did
+        if self._has_missed and not self._is_in_step():  # the drive or this computer became slower
             drives, guess = self._identify(families, MOST_TIMEOUT, MOST_TIMEOUT)
         documented = max((drive.response_delay for drive in drives), default=LEAST_TIMEOUT)
         self.excess = self.response_delay - documented
@@ -195,7 +195,7 @@ class Probe:
         return identify(self._sweep, self._address, families, self._reply)
 
     def _is_in_step(self) -> bool:
-        """Say whether no reply is late: one may have been taken for that to another question."""
+        """Return False if a reply was late, and perhaps mistaken for the reply to another request."""
         request, peer = self._sweep.request.to(self._address), self._scan.peer(MOST_TIMEOUT, MOST_TIMEOUT)
         found = self._scan.ask(self._sweep, request, peer, self._asked_ns + LATE_NS)
         return found.result > 0 and found.stale < SHORTEST_REPLY

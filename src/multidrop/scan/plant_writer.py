@@ -1,4 +1,4 @@
-"""Write a plant file of the drives that a scan has found, with doubts as comments."""
+"""Write a plant file with the drives that a scan has found, and with doubts as comments."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plant_text(
 
 def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
     drive = candidate(family, device.settings, device.framing, device.address)
-    assert drive is not None  # else it would not have been identified
+    assert drive is not None  # identified drives fit their family
     yield "[[line.drive]]"
     if device.doubt:
         yield f"# {device.doubt}"
@@ -65,5 +65,5 @@ def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
 
 
 def _text(value: str) -> str:
-    """Return a basic string of TOML: that of JSON, as far as paths and names go."""
+    """Quote a path or name as a basic string of TOML, which has the same syntax as JSON for these."""
     return json.dumps(value, ensure_ascii=False)

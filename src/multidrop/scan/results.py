@@ -14,8 +14,8 @@ GUESS = "it only reads like one: look at its name plate"
 class Found:
     """A drive that answers: `models` fit equally well; it is empty if no family fits.
 
-    The settings are the first ones of its families that it answered: a drive with another number of stop
-    bits answers too.
+    The settings are the first ones that it answered. Its number of stop bits may differ, because a drive
+    answers requests with another number, too.
     """
 
     address: int
@@ -30,7 +30,8 @@ class Found:
 class Crowd:
     """An address whose answers never match the request.
 
-    Several drives seem to have it, unless `reply` says why a whole frame with a good checksum is none.
+    Probably several drives have this address. If `reply` is not empty, a frame with a valid checksum came,
+    and `reply` says why it does not match.
     """
 
     address: int
@@ -41,7 +42,7 @@ class Crowd:
 
 @dataclass(frozen=True)
 class Noise:
-    """A setting with garbage at so many addresses that it cannot come from drives."""
+    """A setting with invalid bytes at so many addresses that they must be noise."""
 
     settings: Settings
     framing: Framing
@@ -60,7 +61,7 @@ class Untried:
 
 @dataclass(frozen=True)
 class Progress:
-    """One more address is done; `left` is the time in s until the end if the rest stays silent."""
+    """One more address is done. `left` is the remaining time in s if no further drive answers."""
 
     settings: Settings
     framing: Framing

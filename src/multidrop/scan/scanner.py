@@ -1,6 +1,6 @@
-"""Scan a line: carry out sweeps one after another, and find drives in their replies.
+"""Scan a line: carry out sweeps one after another, and find drives by the replies.
 
-The line is an argument, and no clock is read: completions hold the times.
+The line is an argument. No clock is read; times come from the completions.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from multidrop.scan.identify import MOST_TIMEOUT, TRIES, Probe, is_whole
 from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 
-NOISY = 1 / 3  # of a sweep's addresses: more garbage than this is noise, not drives
-LEAST_NOISY = 4  # such addresses
-BEGUN = 2  # characters that show the start of a reply
-LATE = 8  # addresses back: a reply may be so many time-outs late and still be matched
+NOISY = 1 / 3  # of a sweep's addresses: invalid bytes at more of them are noise, not drives
+LEAST_NOISY = 4  # addresses with invalid bytes, before they count as noise
+BEGUN = 2  # characters after which a reply counts as started
+LATE = 8  # a reply may be late by this many addresses' timeouts and still be matched to its request
 
 
 class CarryOut(Protocol):
@@ -41,8 +41,8 @@ class CarryOut(Protocol):
 def scan(carry_out: CarryOut, sweeps: Sequence[Sweep], families: Sequence[type[Drive]]) -> Iterator[Finding]:
     """Carry out the sweeps; yield findings as soon as they are made, and progress in between.
 
-    Time-outs grow with the response delays that are seen. Raises LineError when the port is lost or
-    takes no setting at all.
+    Timeouts grow with the measured response delays. Raises LineError if the port is lost or supports none of
+    the settings.
     """
     yield from _Scan(carry_out, families).run(sweeps)
 
@@ -51,10 +51,10 @@ class _Scan:
     def __init__(self, carry_out: CarryOut, families: Sequence[type[Drive]]) -> None:
         self._carry_out = carry_out
         self._families = families
-        self._peers: list[Peer] = []  # kept alive: the line refers to them
+        self._peers: list[Peer] = []  # references that keep the line's peers alive
         self._found: set[tuple[int, Framing, int]] = set()
         self._crowded: set[tuple[int, Framing, int]] = set()
-        self._excess = 0.0  # s that replies took longer than is usual in their families
+        self._excess = 0.0  # s by which replies exceeded the usual delay of their family
         self._refusals: list[LineError] = []
 
     def run(self, sweeps: Sequence[Sweep]) -> Iterator[Finding]:
@@ -65,7 +65,7 @@ class _Scan:
             raise self._refusals[-1]
 
     def _learned(self, sweep: Sweep) -> Sweep:
-        """Add to the sweep's patience where an adapter or a long way has been seen to be slow."""
+        """Return the sweep, with more patience if replies were slow (adapter or network)."""
         return replace(sweep, patience=sweep.patience + min(2 * self._excess, MOST_TIMEOUT))
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
@@ -110,10 +110,11 @@ class _Scan:
                 yield Crowd(address, sweep.settings, sweep.framing, whole_frame)
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion:
-        """Carry out an exchange; an echo of the request does not count."""
+        """Carry out an exchange; an echo of the request does not count as a reply."""
         completion = self._once(sweep, sweep.framing, request, peer, not_before_ns)
         if sweep.framing is not Framing.TCP and completion.raw == build_request(sweep.framing, request):
-            # A reply may be a copy of its request here: an exchange in another framing shows an echo.
+            # The reply to this request may equal it. Use another framing to find out whether the adapter
+            # echoes.
             other = Framing.ASCII if sweep.framing is Framing.RTU else Framing.RTU
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._sweep_peer(sweep))
             completion = self._once(sweep, sweep.framing, request, peer)
@@ -140,7 +141,7 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer whose timeout lasts until the start of a reply; a probe then waits for the rest."""
+        """Return a peer whose timeout ends at the start of a reply; a probe later reads a complete reply."""
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.request.to(sweep.addresses[0]))
         window = sweep.patience + (BEGUN - length) * settings.character
@@ -153,12 +154,12 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Identify a drive without its format: a drive often answers in several, and is reported once."""
+    """Return a drive's key without its format: it may answer in several, but is reported once."""
     return address, sweep.framing, sweep.settings.baudrate
 
 
 def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[int]:
-    """Return the addresses whose reply came after its time-out, in place of another's."""
+    """Return the earlier addresses whose late reply came during this address's exchange."""
     if completion.result > 0 or not completion.raw:
         return []
     found = []

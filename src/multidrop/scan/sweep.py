@@ -20,16 +20,16 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
-GATEWAY_PATIENCE = 1.0  # s: a gateway says after a while that a drive does not answer
-ADDRESSES = range(1, 32)  # asked unless the caller says otherwise
+GATEWAY_PATIENCE = 1.0  # s until a gateway reports that a drive does not answer
+ADDRESSES = range(1, 32)  # scanned by default
 _ILLEGAL_ADDRESS = 2  # the exception code
-# There, a reply with the value 0 equals its request's echo; an address is never 0.
+# With these carriers a reply with the value 0 equals its request's echo. An address register is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
 @dataclass(frozen=True)
 class ScanRequest:
-    """A read, without the address that it goes to."""
+    """A read without a drive address."""
 
     function: int
     start: int
@@ -46,7 +46,7 @@ class Sweep:
 
     settings: Settings
     framing: Framing
-    families: tuple[type[Drive], ...]  # whose documents say that they answer
+    families: tuple[type[Drive], ...]  # families that answer, by their documents
     request: ScanRequest
     addresses: tuple[int, ...]
     silence: float
@@ -54,13 +54,13 @@ class Sweep:
 
     @property
     def each(self) -> float:
-        """Seconds for a silent address: silence, request, time-out."""
+        """Seconds that a silent address takes: line silence, request, timeout."""
         request = len(build_request(self.framing, self.request.to(1)))
         return self.silence + request * self.settings.character + self.patience
 
     @property
     def needed(self) -> float:
-        """Seconds if no drive answers."""
+        """Seconds that the sweep takes if no drive answers."""
         return len(self.addresses) * self.each
 
 
@@ -71,11 +71,11 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """Return the sweeps of all settings in these families' documents, the likeliest in least time first.
+    """Return the sweeps of all settings in these families' documents, most likelihood per second first.
 
-    Every setting is swept with the patience that usual response delays need, and then again with the
-    longest that the documents allow. Without baud rates and formats, all of the documents are used.
-    Raises ValueError for one that no manual has, and if no sweep is left.
+    Every setting is swept with the patience that usual response delays need, and again with the longest that
+    the documents allow. `baudrates` and `formats` limit the settings; by default the documents' are used.
+    Raises ValueError for a baud rate or format that is in no document, and if no sweep is left.
     """
     settings = _settings(families)
     _check("baud rate", baudrates, {setting.baudrate for setting, _ in settings})
@@ -95,7 +95,7 @@ def sweeps(
 
 
 def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
-    """Leave out sweeps of the same bytes: a port with a fixed format sends them the same way again."""
+    """Drop sweeps that send the same bytes: on a port with a fixed format they are repetitions."""
     brisk: dict[tuple[Framing, ScanRequest], Sweep] = {}
     patient: dict[tuple[Framing, ScanRequest], Sweep] = {}
     for sweep in planned:
@@ -107,7 +107,7 @@ def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
 
 
 def over_tcp(planned: Sequence[Sweep]) -> list[Sweep]:
-    """Return the sweeps of a port of Modbus TCP: each request once, for as long as a gateway may wait."""
+    """Return the sweeps for a Modbus TCP port: each request once, with the timeout that a gateway needs."""
     once: dict[ScanRequest, Sweep] = {}
     for sweep in planned:
         if sweep.framing in MODBUS:
@@ -129,7 +129,7 @@ def _patient(sweep: Sweep) -> Sweep:
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Return each setting's families and their likelihood: documents name the usual setting first."""
+    """Return each setting's families with a likelihood, because documents name the usual setting first."""
     found: dict[Setting, dict[type[Drive], float]] = {}
     for family in families:
         for framing in family.framings:
@@ -157,7 +157,7 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register that most families answer; among several, the most common one."""
+    """Return the register that most families answer; of equal ones, the most common register."""
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,
@@ -176,7 +176,7 @@ _known: WeakKeyDictionary[type[Drive], Mapping[Table, Collection[int]]] = WeakKe
 
 
 def _addresses(family: type[Drive]) -> Mapping[Table, Collection[int]]:
-    """Return the readable addresses of each table, found once for each family."""
+    """Return the readable addresses of each table; cached for each family."""
     if family not in _known:
         found: dict[Table, set[int]] = {}
         for register in family.registers.values():
@@ -191,7 +191,7 @@ def _has(family: type[Drive], register: Register[Any]) -> bool:
 
 
 def _answers(family: type[Drive], register: Register[Any]) -> bool:
-    """Tell whether the family has this register, or a documented exception for one that it lacks."""
+    """Return True if the family has this register, or a documented exception for unknown registers."""
     if _has(family, register):
         return True
     reads = register.table in _addresses(family)

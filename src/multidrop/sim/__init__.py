@@ -1,4 +1,4 @@
-"""Simulated drives that behave as their documents say, on ptys and TCP ports, at the pace of a wire."""
+"""Simulated drives on ptys and TCP ports: they behave as documented, with the timing of a serial line."""
 
 from multidrop.sim.drive import DriveCounters as DriveCounters
 from multidrop.sim.drive import EncodedDrive as EncodedDrive

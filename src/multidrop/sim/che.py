@@ -10,7 +10,7 @@ from multidrop.sim.protocol import MODBUS, Reason, Refusal
 
 CONTROL, SETPOINT = 0x1000, 0x2000
 STARTS = range(1, 5)
-FULL = 10_000  # the setpoint that is 100 %
+FULL = 10_000  # raw setpoint for 100 %
 DEVICE_CODE = 0x0101  # CHE, universal
 _MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # 5001H by exception code
 
@@ -22,11 +22,10 @@ def _signed(raw: int) -> int:
 class SimulatedCHE(MotorDrive):
     """INVT CHE. The setpoint is a percentage of P0.04, the drive's option `maximum_frequency`.
 
-    Output power is 0.01 kW, as a CHF100A has it; no manual of a CHE says so.
+    The unit of output power is 0.01 kW, as on a CHF100A; no manual of a CHE states it.
 
-    For `storing` s after a write to the EEPROM the drive is busy. The manual does not say
-    whether a stop, a start or the jog's own stop ends a jog or a run: here both stops end both, and a start
-    ends a jog.
+    For `storing` s after a write to the EEPROM the drive is busy. The manual does not say what ends a jog or
+    a run. Here both stop commands end both, and a start ends a jog.
     """
 
     functions = (0x03, 0x06)
@@ -55,7 +54,7 @@ class SimulatedCHE(MotorDrive):
     def accept(self, cell: MemoryCell, raw: int) -> int:
         if self.now < self._busy_until:
             raise Refusal(Reason.BUSY)
-        if cell.address == SETPOINT:  # the library writes no negative one; the drive takes it
+        if cell.address == SETPOINT:  # the library writes no negative setpoint, but the drive accepts it
             if not -FULL <= _signed(raw) <= FULL:
                 raise Refusal(Reason.VALUE)
             return raw

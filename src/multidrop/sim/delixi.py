@@ -7,7 +7,7 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import COMMAND, QUERY, SET, STATE, STORE, Reason, Refusal
 
-MOST_GAP = 10e-3  # s between two bytes; of part 3, for want of another
+MOST_GAP = 10e-3  # s between two bytes; from part 3, the only one that states a gap
 UNDER_VOLTAGE = 7  # fault number, POFF
 
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # by the codes of P04.28
@@ -22,8 +22,9 @@ RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28
 class SimulatedDelixi(MotorDrive):
     """Delixi by standard Modbus. The manual has no exceptions: a request that fails gets no answer.
 
-    Not in the document: a run command is confirmed and has no effect in a fault and where P00.00 is not 2,
-    and the setpoint is 0 where P00.01 is not 1; a start ends a jog. Gaps are those of part 3.
+    Assumptions beyond the document: a run command is confirmed without effect during a fault, or if P00.00 is
+    not 2. The setpoint is 0 if P00.01 is not 1. A start ends a jog. The longest gap within a frame is that of
+    part 3.
     """
 
     functions = (0x03, 0x06)
@@ -60,10 +61,10 @@ class SimulatedDelixi(MotorDrive):
 class SimulatedDelixiNative(MotorDrive):
     """Delixi by its own protocol: a set is answered with its copy, a query with the value.
 
-    While `locked` is set, no parameter may be written: FEH. F0H refuses a start in a fault, and any run
-    command unless P00.00 is 2; the manual does not describe that case, nor the effect of P00.01 on K = 04:
-    here the setpoint that was written last counts. Faults from 10 on are shown in decimal digits, as they
-    are printed, in their records too.
+    While `locked` is set, writes of parameters are refused by FEH. A start during a fault is refused by F0H.
+    The manual does not describe a run command if P00.00 is not 2; here F0H refuses it. Nor does it describe
+    the effect of P00.01 on K = 04; here the setpoint that was written last counts. Faults from 10 on are read
+    as hex digits that look like the printed decimal number, also in the fault records.
     """
 
     begins = BY_LINE
@@ -84,7 +85,7 @@ class SimulatedDelixiNative(MotorDrive):
         return super().accept(cell, raw)
 
     def changed(self, cell: MemoryCell) -> None:
-        if cell.name == "stored_frequency":  # the last setpoint counts
+        if cell.name == "stored_frequency":  # the setpoint that was written last counts
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
 
@@ -118,5 +119,5 @@ class SimulatedDelixiNative(MotorDrive):
 
 
 def _printed(fault: int) -> int:
-    """Return the count whose hex digits are the fault's decimal ones: 10 is printed 00000010."""
+    """Return the count whose hex digits equal the fault's decimal digits: fault 10 is 00000010H."""
     return int(str(fault), 16)

@@ -1,7 +1,7 @@
-"""SimulatedDrive: answers requests from its memory, as the drive's class declares it.
+"""SimulatedDrive: answers requests from its memory, whose layout the drive's class declares.
 
-It uses no ports and no clocks: a request and its time come in, a reply or None comes out. Families' own
-behaviour is in their files.
+It uses no ports and no clocks: its input is a request with its time, its output a reply or None. The special
+behaviour of families is in their own files.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multidrop.sim.memory import Memory, MemoryCell, decode, pack
 from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
-MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
+MOST_REMEMBERED = 10_000  # stored writes, which bounds memory
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # writes have the limit of reads
 # s: serial-line guide 2.5.2.1; Delixi, part 3; a network may take its time
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3, Framing.TCP: 10.0}
@@ -40,18 +40,18 @@ class DriveCounters:
     """Counts of one drive since it was made."""
 
     requests: int = 0  # addressed to it alone
-    replies: int = 0  # refusals too
+    replies: int = 0  # including refusals
     refusals: int = 0
     broadcasts: int = 0
     damaged: int = 0  # frames with its address
-    early: int = 0  # frames that did not keep the silence after a reply
+    early: int = 0  # frames that came before the silence after a reply was over
     functions: Counter[int] = field(default_factory=Counter)
     eeprom_writes: Counter[str] = field(default_factory=Counter)
     writes: deque[Written] = field(default_factory=lambda: deque(maxlen=MOST_REMEMBERED))
 
 
 def _most_cells(drive: Drive) -> dict[int, int]:
-    """Return the most cells of a request by the code that reads them: at least those of one register."""
+    """Return a request's limit of cells by the function code that reads them; at least one register fits."""
     most: dict[int, int] = {}
     held = [(register.table, len(register.reach)) for register in drive.registers.values()]
     for table, words in [*held, *((text.table, 1) for text in drive.texts.values())]:
@@ -69,7 +69,7 @@ class SimulatedDrive:
 
     functions: ClassVar[Collection[int] | None] = None  # None: all of its protocol
     codes: ClassVar[Mapping[Reason, int] | None] = None  # of refusal; None: the protocol's own
-    needs_silence: ClassVar[bool] = False  # the document says that a frame without it is ignored
+    needs_silence: ClassVar[bool] = False  # by its document, a frame without silence before it is ignored
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
@@ -77,8 +77,8 @@ class SimulatedDrive:
         self.response_delay = drive.response_delay if response_delay is None else response_delay
         self.memory = Memory(type(drive), drive.framing)
         self.counters = DriveCounters()
-        self.now = 0.0  # of the last request
-        self.deaf_until = 0.0  # ignores all frames before; inf: a dead drive
+        self.now = 0.0  # time of the last request
+        self.deaf_until = 0.0  # until then all frames are ignored; inf: a dead drive
         self.most = _most_cells(drive)
         for proof in drive.identity_proofs:
             self.memory.set(drive.register(proof.register), proof.example)
@@ -104,13 +104,13 @@ class SimulatedDrive:
             self.changed(cell)
 
     def pass_time(self, now: float) -> None:
-        """Bring the drive to the time `now`."""
+        """Advance the drive's state to the time `now`."""
 
     def refresh(self, cell: MemoryCell) -> None:
-        """Give the cell the value that is read from it now."""
+        """Set the cell to the value that a read at this time returns."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
-        """Return the count that is stored when this one is written. Raises Refusal."""
+        """Return the count to store if `raw` is written to the cell. Raises Refusal."""
         register = cell.register
         if register is None or register.words > 1:
             return raw
@@ -130,10 +130,10 @@ class SimulatedDrive:
                     raise Refusal(Reason.VALUE)
 
     def changed(self, cell: MemoryCell) -> None:
-        """Act on a write to the cell, by the line or from outside."""
+        """React to a changed cell, whether it was written over the line or from outside."""
 
     def wore(self) -> None:
-        """Act on a write to the EEPROM."""
+        """React to a write to the EEPROM."""
 
     def takes_broadcast(self, request: Message) -> bool:
         return self.drive.broadcasts
@@ -154,7 +154,7 @@ class SimulatedDrive:
         return GAPS.get(self.drive.framing, self.drive.settings.t3_5)
 
     def receive(self, frame: Frame) -> Message | None:
-        """Return the reply to a frame for this drive or for all, if there is one."""
+        """Return the reply to a frame for this drive or a broadcast; None if there is no reply."""
         if not frame.intact:
             self.counters.damaged += 1
             return self._answer_damaged(frame)
@@ -162,7 +162,7 @@ class SimulatedDrive:
             return self.answer(frame.message, frame.end)
         if not self._is_for_all(frame.address) and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
-        return None  # of a length that its function does not have
+        return None  # a length that does not fit its function
 
     def _is_for_all(self, address: int) -> bool:
         return address == 0 and self.drive.framing is not Framing.TCP
@@ -250,7 +250,7 @@ class SimulatedDrive:
             self.changed(cell)
 
     def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        """Return whether a write there wears the EEPROM; assume so for settings of unknown memory."""
+        """Return whether a write to this cell wears the EEPROM; True for settings of unknown memory."""
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
             return False

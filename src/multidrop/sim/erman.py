@@ -18,14 +18,14 @@ _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DEC
 class SimulatedERMAN(MotorDrive):
     """ERMAN. Coils keep their state; START acts when it is written while neither stop is on.
 
-    The manual does not say whether a coil is a level or a pulse. Here clearing START stops as well, and
-    neither clearing a stop nor a reset starts anything. Nor does it say when the motor counts as
-    overloaded (here above 1.2 times its rated current), or whether it obeys the line's commands if b.001
-    is not 2: here it does.
+    The manual leaves three points open. It does not say whether a coil is a level or a pulse: here clearing
+    START stops as well, and clearing a stop or resetting starts nothing. It does not say when the motor is
+    overloaded: here above 1.2 times its rated current. And it does not say whether the drive obeys the line
+    if b.001 is not 2: here it does.
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    codes = {  # every example prints 03 for a wrong address, against the table of section 5
+    codes = {  # all examples print 03 for a wrong address, which contradicts the table of section 5
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 3,
         Reason.WRITE_ADDRESS: 3,

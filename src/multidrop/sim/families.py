@@ -1,4 +1,4 @@
-"""The simulation of each family, and of each profile."""
+"""The simulated drive for each family and each profile."""
 
 from __future__ import annotations
 
@@ -44,6 +44,6 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Simulate a drive as its family's document says, or as a class or file of one's own declares."""
+    """Return the drive's simulation: its family's, or a general one for a user's own class or file."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
     return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

@@ -1,6 +1,6 @@
 """FaultyWire: a wire that damages, delays and loses bytes between its client and its drives.
 
-Bytes and times come in, bytes and times come out; chance comes from one seed.
+Input and output are bytes with times. All random decisions come from one seed.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class FaultyWire(Wire):
         self._random = random.Random(f"{faults.seed} {name}")
         self._stray: list[Transmission] = []  # noise and echo on their way to the client
         self._held: Transmission | None = None  # a reply that waits for the next one
-        self._back_at: float | None = None  # when the port that is gone comes back
+        self._back_at: float | None = None  # when a removed port comes back
 
     def _strikes(self, fault: str) -> bool:
         rate: float = getattr(self.faults, fault)
@@ -60,7 +60,7 @@ class FaultyWire(Wire):
         return True
 
     def _damaged(self, frame: bytes) -> bytes:
-        """Return the frame with at most one damage, which every checksum shows."""
+        """Return the frame, damaged at most once, so that every checksum detects it."""
         for fault, damage in DAMAGES.items():
             if self._strikes(fault):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))
@@ -135,7 +135,7 @@ class FaultyWire(Wire):
             return data
         if now >= self._back_at:
             self._come_back()
-        return b""  # the client is cut off
+        return b""  # the client is disconnected
 
     @property
     def wake(self) -> float | None:
@@ -150,13 +150,13 @@ class FaultyWire(Wire):
 
     def _hang_up(self, now: float) -> None:
         self.where = self.path  # a TCP port keeps its number
-        self._name = os.path.realpath(self.path)  # not that of its link
+        self._name = os.path.realpath(self.path)  # name of the pty, not of the link to it
         self.close()
         self._back_at = now + self._up_to(self.faults.away)
 
     def _come_back(self) -> None:
         self._back_at = None
-        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # else it may be free again
+        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # else the old name may be free
         try:
             self.open()
         finally:
@@ -175,7 +175,7 @@ def _ptys_up_to(name: str) -> list[int]:
 
 
 def _rate(means: str) -> Any:
-    """A field from 0, never, to 1, always."""
+    """Return a dataclass field for a rate from 0 (never) to 1 (always)."""
     return field(default=0.0, metadata={"means": means, "example": "0.01"})
 
 
@@ -185,10 +185,10 @@ def _most(default: float, example: str, means: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Rates of faults; of `drop`, `flip` and `repeat` at most one happens to a frame.
+    """Rates of faults. At most one of `drop`, `flip` and `repeat` happens to a frame.
 
-    So any of the three checksums shows the damage. A reply later than its family's response time-out
-    cannot be distinguished from the next one of the same kind.
+    Therefore each of the three checksums detects the damage. If a reply is later than its family's response
+    timeout, it cannot be distinguished from the reply to the next equal request.
     """
 
     seed: int = field(default=0, metadata={"means": "the same one brings the same faults", "example": "7"})
@@ -236,7 +236,7 @@ HELP = (
 
 
 def load_faults(path: Path | str) -> Faults:
-    """Read the faults of a file. Raises ValueError with all that is wrong in it."""
+    """Read the rates of faults from a file. Raises ValueError with all mistakes in it."""
     path = Path(path)
     place = TomlPlace(path)
     document = place.attempt(read_document, path, "faults' file")

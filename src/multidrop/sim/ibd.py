@@ -22,12 +22,12 @@ FORMATS = ("8N1", "8E1", "8O1")
 class SimulatedIBD(MotorDrive):
     """INNOVERT IBD, set up for RS-485 (Prb.01 = 5, Prb.02 = 2), with the outputs of the manual's example.
 
-    The manual has no exceptions: a request that fails gets no answer. A value above the largest is
-    stored as the largest, and the echo shows the value that was written. A run while it jogs changes
-    no mode: a stop and a new run end a jog (table 3).
+    The manual has no exceptions: a request that fails gets no answer. A value above the maximum is stored as
+    the maximum, while the reply repeats the written value. A run command does not end a jog: only a stop
+    followed by a new run does (table 3).
 
-    Not in the manual: a command is confirmed and has no effect unless Prb.02 = 2; the setpoint is 0
-    where Prb.01 is neither 5 nor 0; Prb.00 counts 0.01 Hz, as 2001H does.
+    Assumptions beyond the manual: a command is confirmed without effect unless Prb.02 = 2. The setpoint is 0
+    if Prb.01 is neither 5 nor 0. The unit of Prb.00 is 0.01 Hz, as that of 2001H.
     """
 
     functions = (0x03, 0x06)
@@ -60,7 +60,7 @@ class SimulatedIBD(MotorDrive):
         return self.word(source) / 100 if source is not None else 0.0
 
     def _control(self, bits: int) -> None:
-        """Obey the word; the manual is ambiguous, and BIT3 and BIT2 are read as a number here."""
+        """Carry out a control word. The manual is ambiguous; here BIT3 and BIT2 are read as one number."""
         if bits & 0x10:
             self.motor.reset()
         action = bits & 0x03

@@ -1,7 +1,7 @@
 """A drive's memory: the cells of its tables, as the drive's class declares them.
 
-A cell is reached by function code and address; tables that several codes reach (03, 06 and 10) are one
-space. It holds a bit, a word, or Delixi's four bytes.
+A cell is found by function code and address. A table that several codes access (03, 06 and 10) is one address
+space. A cell holds a bit, a word, or Delixi's four bytes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[object, int], MemoryCell] = {}  # tables that are read alike share them
+        self._cells: dict[tuple[object, int], MemoryCell] = {}  # one for all tables read alike
         self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
@@ -70,7 +70,7 @@ class Memory:
             if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
-                self._read.setdefault((table.read, cell.address), None)  # unless a reading is there too
+                self._read.setdefault((table.read, cell.address), None)  # unless it is also readable
             elif table.read is not None:
                 self._read[table.read, cell.address] = cell
             if register.access is Access.READING:
@@ -119,7 +119,7 @@ class Memory:
         return register.value_in(data, register.address - reach.start)
 
     def set(self, register: Register[Any], value: float | None) -> None:
-        """Hold this value, rounded to the register's step; bits that do not fit are lost.
+        """Store this value, rounded to the register's step; bits that do not fit are lost.
 
         None is the device's "no value". Raises ValueError if the register has no such count.
         """
@@ -143,7 +143,7 @@ class Memory:
         return 0 if register.scaled_by is None else int(self.get(register.scaled_by) or 0)
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
-        """Hold these bits, of a register that is a part of its words beside those of the others."""
+        """Store this raw count. If the register is a part of its words, the other bits keep their value."""
         self._put(register, raw, register.coding.mask)
 
     def _put(self, register: Register[Any], raw: int, mask: int) -> None:
@@ -157,12 +157,12 @@ class Memory:
             cell.raw = int.from_bytes(data[size * at : size * (at + 1)]) & _MASKS[register.table.carrier]
 
     def get_text(self, text: Text) -> str:
-        """Return a text as it is read."""
+        """Return the text in its registers, as a read decodes it."""
         cells = (self._cell(text.table, address) for address in self._addresses(text))
         return text.decode(b"".join(pack(cell.table, cell.raw) for cell in cells))
 
     def set_text(self, text: Text, value: str) -> None:
-        """Hold a text. Raises ValueError for one that does not fit."""
+        """Store a text. Raises ValueError if it does not fit."""
         data = text.encode(value)
         for at, address in enumerate(self._addresses(text)):
             self._cell(text.table, address).raw = int.from_bytes(data[2 * at : 2 * at + 2])
@@ -182,14 +182,14 @@ def _space(table: Table) -> object:
 
 
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
-    """Return True for the register whose name and span a cell has: a writable one, then a whole one."""
+    """Return True if `register` should replace `known` as a cell's: a writable, or else a whole one, wins."""
     if known is None or register.access is not Access.READING:
         return True
     return known.part is not None and register.part is None
 
 
 def _placed(register: Register[Any], raw: int) -> int:
-    """Return the bits that hold a raw count, at the place of its part."""
+    """Return a raw count's bits, shifted to the place of the register's part."""
     if register.part is None:
         return bits_of(raw, register.number_format)
     return raw << register.part[0] & register.coding.mask

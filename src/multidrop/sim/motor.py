@@ -1,7 +1,7 @@
 """A motor and the power part that feeds it: ramps, volts and amperes, heat, faults.
 
-Pure physics: no registers, and time is an argument. Only `run` and `jog` start the motor, and neither
-does so while a fault stands.
+Only physics: no registers, and time is an argument. Only `run` and `jog` start the motor, and not during a
+fault.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ BRAKING_TORQUE = 0.3
 SLIP = 0.04  # at rated torque
 HEATING = 35.0  # degrees above ambient at rated current
 WARMING_TIME = 120.0  # s
-RUN_OUT_TIME = 10.0  # s in which the shaft runs out without voltage, from the rated frequency
+RUN_OUT_TIME = 10.0  # s until the shaft stands still without voltage, from the rated frequency
 REGENERATION = 0.06  # rise of the DC bus while braking
 SAG = 0.02  # fall of the DC bus at rated current
 
@@ -35,7 +35,7 @@ class Rating:
     """The name plate of a motor."""
 
     frequency: float = 50.0  # Hz
-    voltage: float = 400.0  # V, of the mains too
+    voltage: float = 400.0  # V, also of the mains
     current: float = 5.0  # A
     power: float = 2.2  # kW
     torque: float = 14.6  # Nm
@@ -52,7 +52,7 @@ class Motor:
     def __init__(self, rating: Rating | None = None, *, now: float = 0.0) -> None:
         self.rating = rating or Rating()
         self.now = now
-        self.target = 0.0  # Hz; a negative one turns it the other way
+        self.target = 0.0  # Hz; negative: in the other direction
         self.jog_frequency = 5.0
         self.maximum_frequency = self.rating.frequency
         self.acceleration_time = 10.0
@@ -61,7 +61,7 @@ class Motor:
         self.ambient = 25.0  # degrees Celsius
         self.direction = 1  # or -1
         self.frequency = 0.0  # Hz at the output, negative backwards
-        self.shaft = 0.0  # Hz, of the rotor
+        self.shaft = 0.0  # speed of the rotor, in Hz
         self.energised = False
         self.heatsink = self.ambient
         self.run_seconds = 0.0
@@ -71,7 +71,7 @@ class Motor:
         self._brakes = False  # by direct current
 
     def run(self, direction: int | None = None) -> None:
-        """Run at `target`, which may change; without a direction, in the current one."""
+        """Run at `target`, which may change meanwhile. Without `direction`, keep the current one."""
         self._start(direction, None)
 
     def jog(self, direction: int | None = None) -> None:
@@ -86,7 +86,7 @@ class Motor:
         self._brakes = False
 
     def stop(self) -> None:
-        """Go down the ramp, then take the voltage off."""
+        """Ramp down, then switch the voltage off."""
         self._goal = 0.0
         self._brakes = False
 
@@ -98,14 +98,14 @@ class Motor:
         self._brakes = self.energised = True
 
     def coast(self) -> None:
-        """Take the voltage off; the shaft runs out."""
+        """Switch the voltage off and let the shaft run out."""
         self._goal = 0.0
         self._brakes = False
         self.frequency = 0.0
         self.energised = False
 
     def trip(self, code: int) -> None:
-        """Coast because of a fault, and stay off until it is reset."""
+        """Coast because of a fault; the motor stays off until `reset`."""
         self.coast()
         self.fault = code
         self.faults.appendleft(code)
@@ -140,7 +140,7 @@ class Motor:
             self.energised = False
 
     def _approach(self, goal: float, ramp_time: float, seconds: float) -> float:
-        """Change the frequency for at most `seconds`; return those that are left."""
+        """Ramp towards `goal` for at most `seconds`; return the seconds that are left."""
         distance = abs(goal - self.frequency)
         needed = distance * ramp_time / self.maximum_frequency
         if needed <= seconds:
@@ -150,7 +150,7 @@ class Motor:
         return 0.0
 
     def fault_record(self, number: int) -> int:
-        """Return the code of a fault, the latest being number 1; 0 if there is none."""
+        """Return the code of the fault with this number (1: the latest); 0 if there is none."""
         return self.faults[number - 1] if number <= len(self.faults) else 0
 
     @property

@@ -1,8 +1,8 @@
 """MotorDrive: a simulated drive with a motor behind its registers.
 
-Settings of common names set the motor up, monitors of common names show its state. A family's own
-registers are in two tables: `obeys`, the commands of writes, and `shows`, the counts of reads; their keys
-are (function code that reads the table, address).
+Settings with common names configure the motor, and monitors with common names show its state. A family's own
+registers are in two tables: `obeys` has functions that carry out writes, and `shows` has functions that
+return the count to read. The keys are (function code that reads the table, address).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
-    """A drive with a motor. A monitor that is set from outside keeps that value."""
+    """A drive with a motor. If a monitor is set from outside, it keeps that value."""
 
     obeys: ClassVar[Mapping[tuple[int, int], Callable[[Any, int], None]]] = {}
     shows: ClassVar[Mapping[tuple[int, int], Callable[[Any], int]]] = {}  # raw counts
@@ -54,14 +54,14 @@ class MotorDrive(SimulatedDrive):
         """Set initial state that the class does not declare."""
 
     def trip(self, code: int) -> None:
-        """Provoke a fault by the family's code."""
+        """Cause the fault with this code of the family."""
         self.motor.trip(code)
 
     def pass_time(self, now: float) -> None:
         self.motor.run_to(now)
 
     def set_up(self) -> None:
-        """Set the motor up as the registers say."""
+        """Configure the motor from the registers."""
         for name in _SETTINGS:
             value = self._known(name)
             if value:
@@ -122,10 +122,11 @@ class MotorDrive(SimulatedDrive):
 
 
 class ProfileDrive(MotorDrive):
-    """A drive of a profile, whose registers have roles: `heeds` has commands by role, `tells` monitors.
+    """A drive of a profile, whose registers have the names of their roles.
 
-    `is_local` takes the command away from the line, as the keypad does. `power_cycle` loses all that is not
-    a setting in EEPROM.
+    `heeds` maps a role to the function that carries out a write, `tells` maps a role to the function that
+    returns the count to read. While `is_local` is set, the keypad is in control and the line's commands are
+    ignored. `power_cycle` loses everything except settings in EEPROM.
     """
 
     heeds: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
@@ -133,7 +134,7 @@ class ProfileDrive(MotorDrive):
 
     def prepare(self) -> None:
         self.is_local = False
-        self.word_before = 0  # the control word before the one that is heeded
+        self.word_before = 0  # the control word before the present one
         if "signature" in self.drive.registers:
             values: Any = self.drive.register("signature").values
             self["signature"] = next(iter(values))
@@ -165,11 +166,11 @@ class ProfileDrive(MotorDrive):
             super().refresh(cell)
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True if the bits are set in this word, and were not in the one before."""
+        """Return True if one of the bits is set in this word and none was set in the previous word."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:
-        """Take the mains away and give them back: commands, setpoint and faults are gone."""
+        """Switch the mains off and on: commands, setpoint and faults are lost."""
         self.motor.coast()
         self.motor.reset()
         for name in ("control", "reset", "reference"):
@@ -180,4 +181,4 @@ class ProfileDrive(MotorDrive):
         self.powered_up()
 
     def powered_up(self) -> None:
-        """Take the state that the drive has when its mains come."""
+        """Set the state that the drive has after power-up."""

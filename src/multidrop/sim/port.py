@@ -1,4 +1,4 @@
-"""The simulator's end of a line: a pty, or a TCP port that takes one client at a time."""
+"""The simulator's end of a line: a pty, or a TCP port that accepts one client at a time."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ MOST_READ = 4096
 class PtyPort:
     """A pty whose other side a client opens by its path.
 
-    A descriptor of the client's side stays open here, so that the pty outlives its clients. Of their
-    settings only the baud rate counts: a pty keeps no parity.
+    A descriptor of the client's side stays open here, so that the pty outlives its clients. Of
+    the clients' settings only the baud rate has an effect: a pty stores no parity.
     """
 
     def __init__(self, settings: Settings, link: Path | None) -> None:
@@ -53,7 +53,7 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # no reader: lost, as on a wire
+        with contextlib.suppress(BlockingIOError):  # without a reader the bytes are lost, as on a wire
             os.write(self._master, data)
 
     def baudrate(self) -> int | None:
@@ -69,7 +69,7 @@ class PtyPort:
 
 
 class TCPPort:
-    """A listening socket; the next client may come when the present one has gone."""
+    """A listening socket; it accepts the next client when the current one has disconnected."""
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
@@ -85,7 +85,7 @@ class TCPPort:
         self.path = f"{parts.scheme}://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for; it changes when a client comes or goes."""
+        """Return the descriptor to wait for; it changes when a client connects or disconnects."""
         return (self._client or self._listener).fileno()
 
     def read(self) -> bytes:
@@ -116,7 +116,7 @@ class TCPPort:
                 self._client.send(data)
 
     def baudrate(self) -> None:
-        """Return None: a client's baud rate cannot be seen."""
+        """Return None: over TCP a client's baud rate is unknown."""
 
     def close(self) -> None:
         self._hang_up()

@@ -72,7 +72,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
     if arguments.command in STOPS:
-        by = printable(by)[:MOST_CHARACTERS]  # no name may hold a stop back
+        by = printable(by)[:MOST_CHARACTERS]  # a long name must not prevent a stop
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
         raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
     log, urls = arguments.audit or state_folder() / "commands.jsonl", urls_of(arguments)
@@ -81,7 +81,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 
 @asynccontextmanager
 async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]:
-    """Yield a connected commander. If that fails, a stop's error says that nothing was sent."""
+    """Yield a connected sender of commands. If connecting fails, a stop's error says that it was not sent."""
     from multidrop.fleet.commands.fleet_commands import HARD_WIRED
     from multidrop.fleet.errors import FleetError
 
@@ -119,9 +119,9 @@ def _what(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 async def _command(arguments: argparse.Namespace) -> int:
-    """Show the command, let a person confirm it, and carry it out by a new offer.
+    """Show the command, let a person confirm it, and then send it as a new request.
 
-    The offer that was shown is valid for one second only, and a person takes longer.
+    The gateway's offer for the shown command is valid for only one second; a person takes longer.
     """
     from multidrop.fleet.commands.messages import CommandAnswer
 

@@ -1,4 +1,4 @@
-"""The NATS servers of a fleet: options, addresses, and the paths that an action uses."""
+"""The NATS servers of a fleet: options, addresses, and the connections that an action uses."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Drop a log line that asyncio of Python 3.11 writes for each TLS connection closed by the far end."""
+    """Return False for the log line of Python 3.11's asyncio about a TLS connection closed by the far end."""
     return "eof_received" not in record.getMessage()
 
 
@@ -115,7 +115,7 @@ def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
 
 
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
-    """Run an action with three paths to the servers, and close them afterwards."""
+    """Run an action with three connections to the servers, and close them afterwards."""
 
     async def with_paths() -> int:
         from multidrop.fleet.servers.connections import paths_of

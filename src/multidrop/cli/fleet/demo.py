@@ -1,4 +1,4 @@
-"""`multidrop fleet demo`: a fleet on this machine; one gateway is killed, and the others take over."""
+"""`multidrop fleet demo`: a fleet on this computer; one gateway is killed, and the others take over."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
 LINES = 12
 DRIVES = 2  # on each line
-WAIT_S = 60.0  # for steps that take seconds on an idle machine
+WAIT_S = 60.0  # timeout of steps that take seconds on an idle computer
 RUN_S = 2.0  # before the kill, and after each step
 KEEP = "100 MB"  # of samples, of the 256 MB of each server
 
@@ -61,7 +61,7 @@ class Stage:
         return {name: line["master"] for name, line in self.fleet["lines"].items()}
 
     def are_masters(self, gateways: Sequence[str]) -> bool:
-        """Return True if exactly these gateways are the masters of all lines."""
+        """Return True if every line has a master, and these gateways are the masters."""
         return set(self.masters().values()) == set(gateways)
 
     def unsent(self) -> list[int | None]:
@@ -85,7 +85,7 @@ class Stage:
             raise OSError(f"{what} not within {WAIT_S:.0f} s: the demo has failed") from None
 
     async def calm(self, seconds: float) -> None:
-        """Wait until no line has changed its master for so long: a view may lag."""
+        """Wait until no line has changed its master for `seconds`, because a view may lag."""
         before: dict[str, str | None] | None = None
         while (found := self.masters()) != before:
             before = found
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     program = server_program(OLDEST)
     stage = Stage()
     with temporary_folder() as folder, ExitStack() as stack:
-        none = dict.fromkeys((CREDENTIALS, CA), "")  # those of the user's own fleet
+        none = dict.fromkeys((CREDENTIALS, CA), "")  # ignore the variables of the user's own fleet
         children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
         stack.callback(children.close)
         demo = Demo(folder, children, stage)
@@ -135,7 +135,7 @@ def gap_s(times_ns: Sequence[int], killed_ns: int) -> float:
 
 
 def plant_file(ports: Mapping[str, int]) -> str:
-    """Return a plant file with these lines, on ports of this machine."""
+    """Return a plant file with these lines, on TCP ports of this computer."""
     return "\n".join(
         f'[[line]]\nname = "{line}"\nport = "tcp://127.0.0.1:{port}"\n'
         + "".join(
@@ -227,12 +227,12 @@ class Demo:
         await stage.until(lambda: stage.are_masters(GATEWAYS), f"{KILLED} had lines again")
         stage.note(f"it has a share of the lines again: {stage.shares()}")
         await asyncio.sleep(RUN_S)
-        # At its end a gateway forwards for a few seconds only.
+        # A gateway that ends forwards its samples for only a few seconds.
         await stage.until(lambda: stage.unsent() == [0] * len(GATEWAYS), "all messages were forwarded")
         return lines, killed_ns
 
     def end(self) -> dict[str, list[int]]:
-        """End all in good order, let the hub read the rest, and return the times of samples by drive."""
+        """Stop all processes cleanly, store the remaining samples, and return their times by drive."""
         children = self._children
         children.end(*GATEWAYS, "lines", "hub")
         self._start_hub("hub-once", "--once", "--json")

@@ -14,11 +14,11 @@ import sys
 import time
 
 PR_SET_PDEATHSIG = 1  # prctl(2)
-ATTEMPTS = 100  # processes that are being killed may still write
+ATTEMPTS = 100  # retries, because processes that are being killed may still write
 
 
 def become(parent: int, words: list[str]) -> None:
-    """Become the program; end if the parent has already ended."""
+    """Replace this process by the program; exit instead if the parent has already ended."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() == parent:
         os.execv(words[0], words)

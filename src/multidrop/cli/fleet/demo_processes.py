@@ -1,4 +1,4 @@
-"""The processes of `fleet demo`: none of them, and no file, outlives it, however it ends."""
+"""The processes of `fleet demo`: all processes and files are removed, however the command ends."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tempfile import mkdtemp
 from multidrop.cli.fleet import demo_guard
 
 GUARD = [sys.executable, "-I", "-S", str(demo_guard.__file__)]
-ENDING_S = 10.0  # for a process that was asked to end
+ENDING_S = 10.0  # timeout for a process that was asked to exit
 NODES = ("n1", "n2", "n3")
-ATTEMPTS = 3  # another program may take a port that was just free
+ATTEMPTS = 3  # retries, because another program may take a port that was just free
 STARTING_S = 20.0
 
 CONFIGURATION = """
@@ -87,7 +87,7 @@ class Children:
         _reap(self._running[name])
 
     def end(self, *names: str) -> None:
-        """Ask these to end in good order, and wait for them. Raises OSError if one does not end."""
+        """Ask these processes to exit cleanly, and wait for them. Raises OSError if one does not exit."""
         for name in names:
             self._running[name].terminate()
         for name in names:
@@ -98,7 +98,7 @@ class Children:
                 raise OSError(f"{name} of the demo did not end: {self._last_line(name)}") from None
 
     def close(self) -> None:
-        """Kill all that still run."""
+        """Kill all processes that still run."""
         for process in self._running.values():
             process.kill()
         for process in self._running.values():
@@ -122,7 +122,7 @@ def _reap(process: subprocess.Popen[str]) -> None:
 
 
 def server_program(oldest: tuple[int, int]) -> str:
-    """Return a nats-server of this version or newer: of the Python package, or on the path.
+    """Return a nats-server of this version or newer: the Python package's, or one on the PATH.
 
     Raises ValueError if there is none.
     """

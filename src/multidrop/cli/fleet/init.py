@@ -1,4 +1,4 @@
-"""`multidrop fleet init`: sets the NATS servers up for a fleet, and stores the plant."""
+"""`multidrop fleet init`: prepares the NATS servers for a fleet, and stores the plant there."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The picture of a fleet, as lines of text for a width and a height.
 
-Everything that matters is in words as well as in colours. What is old is dim, and its age is told.
+Everything important is shown in words as well as in colours. An old view is dim, and shows its age.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from multidrop.cli.fleet.tables import (
 )
 from multidrop.cli.support.screen_text import cut
 
-OLD_S = 3.0  # an older view is shown as old
-NOTES = 4  # lines of notes, and of problems
-MOVES = 8  # rows of moves with their head, if lines need the room
+OLD_S = 3.0  # a view older than this is drawn dim
+NOTES = 4  # at most so many lines of notes, and as many of problems
+MOVES = 8  # rows of the table of moves, with its head, if the lines need the remaining room
 
 
 def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
-    """Draw gateways, lines and moves of what `fleet watch --json` prints, and its "notes" at the foot."""
+    """Draw gateways, lines, moves and "notes" of `told`, which is as `fleet watch --json` prints it."""
     width, height = size
     is_old = told["age_s"] is None or told["age_s"] > OLD_S
     top = [_title(told, head, width), _warning(told, width)]
@@ -65,13 +65,13 @@ def _fitting(lines: list[str], room: int) -> list[str]:
     if len(lines) <= room:
         return lines
     kept = room - 1
-    if kept < 2:  # only a head
+    if kept < 2:  # there is room only for the head
         return []
     return [*lines[:kept], f"and {len(lines) - kept} more lines"]
 
 
 def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list[str | int]]:
-    """Order lines without a master first, then those whose master does not answer."""
+    """Return a sort key: lines without a master first, then lines whose master does not answer."""
     return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 

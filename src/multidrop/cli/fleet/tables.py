@@ -46,7 +46,7 @@ def gateway_table(fleet: Told, width: float = inf) -> list[str]:
 
 
 def _fitting(table: list[Row], sides: str, left_out: Iterable[str], width: float) -> list[str]:
-    """Return the lines of a table, whose first row is its head, with as many columns as fit."""
+    """Return a table (its first row is the head) as lines of text, with as many columns as fit."""
     for column in left_out:
         found = aligned(table, sides)
         if max(map(len, found)) <= width:
@@ -119,7 +119,7 @@ def unsure_lines(fleet: Told) -> list[str]:
 
 
 def lost_lines(fleet: Told) -> list[str]:
-    """Return the lines whose master has lost their port: they are not polled."""
+    """Return the lines whose master has lost the port: these lines are not polled."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
 
 
@@ -143,7 +143,7 @@ def count_sentence(fleet: Told) -> str:
 
 
 def move_table(moves: Iterable[Told], width: float = inf) -> list[str]:
-    """Return a line for each move: time, line, former and new master; the former one only if it fits."""
+    """Return a line of text for each move: time, line, former master (if it fits) and new master."""
     rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
     found = aligned(rows, "<<<<")
     if max(map(len, found), default=0) <= width:

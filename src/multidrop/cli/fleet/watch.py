@@ -82,7 +82,7 @@ def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
 def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
     """Yield a function that draws a fleet on the whole terminal.
 
-    On a terminal without cursor control each picture is printed below the last one.
+    On a terminal without cursor control each picture is printed below the previous one.
     """
     from rich.console import Console
     from rich.control import Control

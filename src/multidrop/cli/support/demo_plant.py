@@ -57,7 +57,7 @@ def plant_file(port: str, registers: Sequence[str]) -> str:
 
 
 def start_motors(line: PlantLine, ledger: Path) -> None:
-    """Start every simulated motor, each at another frequency; announce it on a terminal: it takes seconds."""
+    """Start the simulated motors at different frequencies; say so on a terminal, because it takes seconds."""
     if sys.stdout.isatty():
         print_text(f"starting the motors of {counted(len(line.drives), 'simulated drive')} ...", flush=True)
     with Bus(line.port, ledger=ledger) as bus:
@@ -71,12 +71,12 @@ def start_motors(line: PlantLine, ledger: Path) -> None:
 
 @contextmanager
 def simulator(plant: Path, ports: Path) -> Iterator[None]:
-    """Simulate in a child process, so that both sides do not share an interpreter."""
+    """Simulate in a child process, so that simulator and poller do not share an interpreter."""
     words = [sys.executable, "-X", "utf8", "-m", __name__, str(plant)]
     if hasattr(os, "openpty"):
         words += ["--ports", str(ports)]
     pipe = subprocess.PIPE
-    # Its own session, or group on Windows, shields it from Ctrl-C: it must outlive the polling.
+    # A session of its own (on Windows a group) shields the child from Ctrl-C: it must outlive the polling.
     apart: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
         apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
@@ -92,7 +92,7 @@ def simulator(plant: Path, ports: Path) -> Iterator[None]:
 
 
 def simulate(words: Sequence[str]) -> int:
-    """Simulate until standard input ends, which it does with the parent process."""
+    """Simulate until standard input ends, which happens when the parent process ends."""
 
     def end_with_parent() -> None:
         os.read(0, 1)

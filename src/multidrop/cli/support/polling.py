@@ -33,11 +33,11 @@ class PollingSession(NamedTuple):
 
 
 class Rotation(NamedTuple):
-    """A recording in segments: the length of each in s, and the limits of age and size."""
+    """The splitting of a recording: seconds per segment, and the limits of age and size."""
 
     every: float
-    keep: float | None = None  # s
-    most: int | None = None  # bytes
+    keep: float | None = None  # limit of age, in s
+    most: int | None = None  # limit of size, in bytes
 
 
 def _open(out: Path, metadata: Metadata, rotation: Rotation | None) -> RecordingWriter:
@@ -57,7 +57,7 @@ def polling_session(
     takers = list(consumers)
     with ExitStack() as stack:
         interruption = stack.enter_context(noting_signals())
-        poller = stack.enter_context(closing(Poller(plant)))  # first: no recording without ports
+        poller = stack.enter_context(closing(Poller(plant)))  # first: without ports, create no recording
         if out:
             takers.append(stack.enter_context(_open(out, plant.metadata(), rotation)).write)
 
@@ -69,7 +69,7 @@ def polling_session(
         try:
             yield PollingSession(poller, interruption, hand_out)
         finally:
-            hand_out()  # the rows of the poller's closing, also after a failure
+            hand_out()  # the last rows of the closing poller, also after a failure
 
 
 HISTORY = 240  # points, one a second
@@ -90,7 +90,7 @@ class LiveDrive:
     line_utilisation: float = 1.0  # as planned; from 1 on, the polls leave no spare time
     newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
     missed: dict[str, Row] = field(default_factory=dict)  # misses newer than the register's sample
-    last_miss: str = ""  # status of the last miss of a request that was sent
+    last_miss: str = ""  # status of the last missed value whose request was sent
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -161,7 +161,7 @@ class LiveDrive:
         return "turns" if row and row.value else ""  # 0 Hz may be a stop, or a run at a setpoint of 0
 
     def _is_bare(self, row: Row) -> bool:
-        """Return True for flags with no bit set: they name no state."""
+        """Return True for flags without a set bit, which name no state."""
         values = self.polled.drive.register(row.register).values
         return not row.value and values is not None and issubclass(values, Flag)
 
@@ -176,8 +176,8 @@ class LiveDrive:
 class LivePlant:
     """All drives of a plant, and the statistics of its lines: so far, and of the last RECENT seconds.
 
-    Rows, statistics and times are arguments: it reads no clock. `planned` is `plant.metadata()["planned"]`,
-    for a screen that marks old values.
+    Rows, statistics and times are arguments; the class reads no clock. A screen that marks old values passes
+    `plant.metadata()["planned"]` as `planned`.
     """
 
     def __init__(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
@@ -214,14 +214,14 @@ class LivePlant:
 # ---- side reads ----
 
 LEAST_PAUSE_S = 0.1  # between two reads
-MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # of a line's time: with spare time, and on a full line
+MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # of a line's time: if it has spare time, and if it is full
 
 
 class SideRead(NamedTuple):
     """One read of a register: its value as text, or why there is none."""
 
     text: str
-    time: int  # UTC, ns: the read was over
+    time: int  # of the end of the read, UTC in ns
 
 
 class SideReader:
@@ -273,5 +273,5 @@ def pause_s(read_s: float, utilisation: float) -> float:
 
 
 def _in_words(failure: BusError) -> str:
-    """Return the kind of a failure in a few words, such as "no reply"."""
+    """Describe a failure in a few words, such as "no reply"."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(failure).__name__).lower()

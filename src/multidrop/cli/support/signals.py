@@ -1,9 +1,9 @@
 """SIGINT (Ctrl-C), SIGTERM and SIGHUP while a command runs.
 
-SIGINT and SIGTERM interrupt a command at once. Polling and sniffing note the first one, finish and record the
-exchange in progress, and are interrupted by the second. SIGHUP, from a closing terminal, ends a command as
-the first SIGINT does, except a stop, which continues; further SIGHUPs are ignored. Service managers send it
-to a gateway that should reload its plant file.
+SIGINT and SIGTERM interrupt a command immediately. Polling and sniffing are exceptions: at the first signal
+they finish and record the exchange in progress, and the second one interrupts them. SIGHUP, from a closing
+terminal, ends a command as the first SIGINT does; further SIGHUPs are ignored. A stop continues despite
+SIGHUP. Service managers send SIGHUP to a gateway that should reload its plant file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @contextmanager
 def handling(handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals) -> Iterator[None]:
-    """Call `handler` for these signals. In another thread than the main one this has no effect."""
+    """Call `handler` for these signals. Outside the main thread this has no effect."""
     try:
         before = {number: signal.signal(number, handler) for number in numbers}
     except ValueError:
@@ -61,7 +61,7 @@ class Interruption:
 
     def __init__(self) -> None:
         self.came = False
-        self._is_asked = False  # by a person or a service manager, who may be impatient
+        self._is_asked = False  # SIGINT or SIGTERM came: the next one interrupts
 
     def note(self, number: int, frame: FrameType | None) -> None:
         if self._is_asked:
@@ -127,7 +127,7 @@ def on_end_signals(end: Callable[[], object]) -> None:
 
 
 def run_loop(work: Coroutine[Any, Any, T]) -> T:
-    """Do the same as `asyncio.run`; if a signal cancels the work, raise KeyboardInterrupt."""
+    """Run the work as `asyncio.run` does; if a signal cancels it, raise KeyboardInterrupt."""
     import asyncio
 
     try:

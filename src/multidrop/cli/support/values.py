@@ -55,7 +55,7 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 
 def shortened(name: str) -> str:
-    """Return a long name without its middle: names may differ at their ends."""
+    """Shorten a long name by removing its middle, because names may differ at their ends."""
     if columns_of(name) <= LONGEST_NAME:
         return name
     return f"{_first(name, 12)}...{_first(name[::-1], LONGEST_NAME - 15)[::-1]}"

@@ -13,7 +13,7 @@ from multidrop.printable import printable
 
 
 def confirm(question: str, arguments: argparse.Namespace) -> None:
-    """Return if --yes was given or the user answers yes on the terminal; raise WriteForbidden otherwise."""
+    """Unless --yes was given, ask the user; raise WriteForbidden if the answer is not yes."""
     if arguments.yes:
         return
     if not sys.stdin.isatty():
@@ -45,10 +45,10 @@ def _drop_typed_input() -> None:
 
 @contextmanager
 def reporting_interruption(drive: Drive, command: str) -> Iterator[list[str]]:
-    """On Ctrl-C, add the requests sent so far as notes, also while the port is opened or closed.
+    """On Ctrl-C, add notes about the requests sent so far, also while the port is being opened or closed.
 
-    The caller replaces the notes in the list: at first it says that no request was sent. A failure that was
-    being handled is added.
+    Yields the list of notes, which at first says that no request was sent; the caller replaces its contents.
+    A failure that was being handled is added to the notes.
     """
     known = [f"{drive.name}: the {command} was not sent"]
     try:
