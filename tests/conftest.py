@@ -1,4 +1,4 @@
-"""Rules for all tests: none of them writes into the ledger of the user who runs them."""
+"""Rules for all tests: no test writes into the EEPROM ledger of the user who runs it."""
 
 import gc
 import os
@@ -116,7 +116,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _gathered() -> Iterator[None]:
-    """Gather a file's garbage in the file, and spare the next ones' collections what it imported."""
+    """Collect garbage after each file, and exclude the rest from later collections: imports stay anyway."""
     yield
     gc.collect()
     gc.freeze()
@@ -124,19 +124,19 @@ def _gathered() -> Iterator[None]:
 
 @pytest.fixture
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for every drive and turn however busy the machine is; not for tests in which one is silent."""
+    """Use time-outs that a busy computer never exceeds; not for tests with a silent drive."""
     be_patient(monkeypatch.setattr, monkeypatch.setitem)
 
 
 @pytest.fixture
 def _turns_awaited(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for a write's turn however busy the machine is, also where a drive is silent."""
+    """Never let a write expire on a busy computer; also for tests with a silent drive."""
     await_turns(monkeypatch.setattr, monkeypatch.setitem)
 
 
 @pytest.fixture(scope="module")
 def _patient_module() -> Iterator[None]:
-    """Do the same for a line that a module's tests share."""
+    """Do the same as `_patient` for a line that all tests of a module share."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         be_patient(monkeypatch.setattr, monkeypatch.setitem)
         yield
@@ -144,7 +144,7 @@ def _patient_module() -> Iterator[None]:
 
 @pytest.fixture
 def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out what takes the time of a picture: its pixels; for tests of what is said beside it."""
+    """Write a picture without pixels or layout, to save time in tests of the text beside it."""
     require_module("matplotlib")
 
     def savefig(figure: object, file: IO[bytes], **options: object) -> None:
@@ -155,7 +155,7 @@ def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def _laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw pictures without their pixels: texts are read and have their places, which takes half the time."""
+    """Lay pictures out without rendering pixels, in half the time: texts and their places can be checked."""
     require_module("matplotlib")
 
     def savefig(figure: Any, file: IO[bytes], **options: object) -> None:
@@ -167,7 +167,7 @@ def _laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def _states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return directories, each a new one; pytest's own numbering takes as long as a small test."""
+    """Return a source of new directories; pytest's own numbering takes as long as a small test."""
     whole = tmp_path_factory.mktemp("states")
     return (whole / str(number) for number in count())
 

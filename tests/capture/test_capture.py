@@ -1,4 +1,4 @@
-"""Captures: ours as Wireshark takes them, others' as we take them."""
+"""Captures: Wireshark reads the library's captures, and the library reads other programs' captures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures that are damaged, cut, large, or change under the reader."""
+"""Captures that are damaged, truncated, large, or that change during reading."""
 
 from __future__ import annotations
 

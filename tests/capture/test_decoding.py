@@ -1,4 +1,4 @@
-"""Captures become rows: with a plant file in engineering units, without one raw registers."""
+"""Captures become rows: values in units with a plant file, raw registers without one."""
 
 from __future__ import annotations
 

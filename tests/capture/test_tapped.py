@@ -1,4 +1,4 @@
-"""Lines that are polled, tapped: what a capture of them says is what was recorded, value for value."""
+"""A capture of a polled line gives the same rows as the recording of that poll."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures of a tcp:// line: Wireshark decodes them as Modbus/TCP, and so do we."""
+"""Captures of a tcp:// line: Wireshark and the library decode them as Modbus/TCP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop check`, and the other commands on a family's file."""
+"""`multidrop check` and other commands with a family file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line as a whole: help, statuses, sentences; and `models`."""
+"""The command line as a whole: help, exit statuses, error sentences; and `models`."""
 
 from __future__ import annotations
 

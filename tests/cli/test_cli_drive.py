@@ -1,4 +1,4 @@
-"""Commands for one drive, carried out on a simulated one."""
+"""Commands for one drive, against a simulated drive."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def toy() -> SimulatedDrive:
 
 @pytest.fixture
 def port(toy: SimulatedDrive) -> Iterator[str]:
-    """A line with two drives, at 1 and 2."""
+    """The port of a line with two drives, at the addresses 1 and 2."""
     toy["output_frequency"] = 49.9
     toy["output_current"] = 3.25
     toy["mystery"] = 777
@@ -435,7 +435,7 @@ Che = tuple[ReceivedRequests, list[object]]
 
 @pytest.fixture
 def che() -> Iterator[Che]:
-    """Return the requests of a CHE, and the words that name it."""
+    """Return the requests that a simulated CHE receives, and the arguments that select it."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2

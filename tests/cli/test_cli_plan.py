@@ -1,4 +1,4 @@
-"""`plan`: what it tells of a plant file, without a port; and prediction beside measurement after `poll`."""
+"""`plan`: its output for a plant file, without a port; prediction beside measurement after `poll`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
 
 @pytest.fixture
 def fitting(tmp_path: Path) -> Path:
-    """Two drives that are asked for little."""
+    """A plant file with two drives at low rates."""
     path = tmp_path / "fitting.toml"
     path.write_text(
         LINE.format("hall-1", 1)
@@ -30,7 +30,7 @@ def fitting(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def crowded(tmp_path: Path) -> Path:
-    """Four drives on 9600 bit/s that are wanted 50 times a second, on the second of two lines."""
+    """A plant file whose second line has four drives at 9600 bit/s, each polled 50 times a second."""
     path = tmp_path / "crowded.toml"
     path.write_text(
         LINE.format("hall-1", 1)

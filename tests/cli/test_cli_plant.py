@@ -1,4 +1,4 @@
-"""Commands that take a plant file and a name in it in place of PORT MODEL ADDRESS."""
+"""Commands that take a plant file and a name instead of PORT MODEL ADDRESS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that run for a while: demo, poll, simulate; and convert. Each in a process of its own."""
+"""Commands that run for a while: demo, poll, simulate; and convert. Each runs in its own process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop scan` on a simulated line: what it prints, writes and returns."""
+"""`multidrop scan` on a simulated line: its output, its plant file and its exit status."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  #
 
 @pytest.fixture(autouse=True)
 def _slow_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A drive that answered at once is waited for, when a busy machine holds its next answer up."""
+    """Use a longer least time-out: a busy computer may delay the next reply of a fast drive."""
     monkeypatch.setattr(multidrop.scan.identify, "LEAST_TIMEOUT", 0.1)
 
 

@@ -1,4 +1,4 @@
-"""`sniff` and `decode`: live, behind a network, from captures, and what goes wrong."""
+"""`sniff` and `decode`: on a live line, behind a network, from captures, and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop doctor`: what it reads out of the system, and what it says of it."""
+"""`multidrop doctor`: the facts that it reads from the system, and its report."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def ended(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exceptio
 
 @pytest.fixture
 def sysfs(tmp_path: Path) -> Path:
-    """An FTDI adapter as Linux shows it: links from classes to the tree of devices."""
+    """A folder like Linux's /sys with an FTDI adapter: links from classes to the tree of devices."""
     usb = tmp_path / "devices/pci0000:00/usb1/1-2"
     port = usb / "1-2:1.0/ttyUSB0"
     (port / "tty/ttyUSB0").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The table of `poll` on a terminal: cut where it does not fit, and redrawn over itself at any width."""
+"""The table of `poll` on a terminal: cut to the terminal's width, and redrawn in place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log's thread: who logs never waits, and what was lost meanwhile is told."""
+"""The log's thread: logging calls never wait, and lost lines are counted and reported."""
 
 from __future__ import annotations
 

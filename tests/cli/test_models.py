@@ -1,4 +1,4 @@
-"""Families by name and from files of the user's own; every failure is one ValueError sentence."""
+"""Families by name and from the user's files; every failure is a ValueError with one sentence."""
 
 from __future__ import annotations
 

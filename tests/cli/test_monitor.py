@@ -1,4 +1,4 @@
-"""The monitor: what it knows, how it looks at any size, and that its keys do nothing but stop."""
+"""The monitor: its values, its picture at any terminal size, and its keys, which can only stop drives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Output whose encoding lacks letters, as that of a pipe on Windows does."""
+"""Output in an encoding that lacks letters, such as a pipe's on Windows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers in words of a command, requests and files: decimal digits of ASCII alone."""
+"""Numbers in command arguments, requests and files: only ASCII decimal digits are accepted."""
 
 from __future__ import annotations
 

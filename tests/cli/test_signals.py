@@ -1,4 +1,4 @@
-"""Signals while a command runs: impatience, and a terminal that is closed."""
+"""Signals during a command: repeated Ctrl-C, and a closed terminal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PATIENCE = 60.0
 
 @pytest.fixture
 def hangup_is_deadly() -> Iterator[None]:
-    """Whatever the tests were begun with."""
+    """Let SIGHUP end the process, even if the tests run under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)

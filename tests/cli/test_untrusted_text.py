@@ -1,4 +1,4 @@
-"""Names from files and arguments: whatever stands in them commands no terminal and breaks no page."""
+"""Names from files and arguments: their characters control no terminal and break no page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drives come to a bus and leave it, on any thread; each is on one bus at a time."""
+"""Drives join and leave a bus, on any thread; each drive is on one bus at a time."""
 
 from __future__ import annotations
 

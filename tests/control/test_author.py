@@ -1,4 +1,4 @@
-"""The audit log says who asked for a write, and in which way."""
+"""The audit log records who requested a write, and through which interface."""
 
 from __future__ import annotations
 

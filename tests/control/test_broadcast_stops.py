@@ -1,4 +1,4 @@
-"""Broadcasts: only to drives of one known family, and never after a later stop."""
+"""Broadcast stops: sent only to drives of one known family, and never after a later stop."""
 
 from __future__ import annotations
 

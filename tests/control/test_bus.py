@@ -420,7 +420,7 @@ def test_a_verb_of_a_drive_that_is_on_no_bus() -> None:
 
 @pytest.fixture
 def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait so long for each reply, though the drive answers at once: the machine may be busy."""
+    """Wait half a second for each reply of a fast drive, because the computer may be busy."""
     monkeypatch.setattr(peers, "LEAST_TIMEOUT", 0.5)
     monkeypatch.setattr(Rig, "response_timeout", 0.5)
 

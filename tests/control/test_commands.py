@@ -1,4 +1,4 @@
-"""Commands of a server on a drive: their results, and stops for which the system has no thread."""
+"""Commands of a server on a drive: their results, and stops if the system has no thread left."""
 
 from __future__ import annotations
 

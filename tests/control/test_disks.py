@@ -1,4 +1,4 @@
-"""Ledger and audit log on disks that are full, come back or take nothing, and under a clock set back."""
+"""Ledger and audit log on disks that are full, recover or fail, and with a clock that is set back."""
 
 from __future__ import annotations
 

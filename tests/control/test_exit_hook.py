@@ -1,4 +1,4 @@
-"""Leaving by a signal: all buses are stopped at once, and no second signal keeps a motor running."""
+"""Exit by a signal: all buses are stopped in parallel, and a second signal does not abort the stops."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Act:
 
 @pytest.fixture
 def caught() -> Iterator[list[int]]:
-    """The signals that had the effect that they had before."""
+    """Return a list of the signals that reached the handlers which the program had set before."""
     found: list[int] = []
     before = [
         (each, signal.signal(each, lambda number, frame: found.append(number)))

@@ -1,8 +1,8 @@
-"""Replies lost, damaged, doubled, merged, cut, and among foreign frames and junk: nothing is mistaken.
+"""Replies that are lost, damaged, doubled, merged, truncated, or amid junk: none is mistaken for another.
 
-As test_hostile_line.py, which has more kinds of faults, but with nothing of the library at the far end: what
-the drives hold, the checksums and the judge of what we send are our own. A seed makes the same faults in
-the same order; the port and the time are real. For longer:
+test_hostile_line.py has more kinds of faults. Here the far end is independent of the library: the drives'
+registers, the checksums, and the check of sent frames. A seed reproduces the faults and their order; the port
+and the time are real. A longer run:
 `HOSTILE_SEEDS=50 pytest -m "" tests/control/test_hostile_responder.py`.
 """
 

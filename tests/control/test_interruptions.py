@@ -1,4 +1,4 @@
-"""Ctrl-C at any step of an exchange: what may have been sent is told, and nothing is left behind."""
+"""Ctrl-C at any step of an exchange: the caller learns what may have been sent, and nothing leaks."""
 
 from __future__ import annotations
 

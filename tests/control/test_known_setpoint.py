@@ -1,4 +1,4 @@
-"""The setpoint that a drive is known to hold, after each end that a write of it can have."""
+"""The setpoint that the library assumes in a drive, after each possible outcome of a write."""
 
 from __future__ import annotations
 

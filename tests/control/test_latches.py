@@ -1,4 +1,4 @@
-"""Latches of drives that come and go, and of stops that a signal's exception interrupts."""
+"""Latches of drives that join and leave, and latches of stops that a signal's exception interrupts."""
 
 from __future__ import annotations
 

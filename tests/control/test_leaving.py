@@ -1,4 +1,4 @@
-"""Leaving: what is ended, stopped, waited for and told as a bus is left, or as drives are about to be."""
+"""Closing a bus or removing drives: calls that end, stops that are sent and awaited, and the report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ledger knows a drive by what its port is, counts what wears, and is not spent by simulated drives."""
+"""The ledger identifies drives by their port's hardware, counts EEPROM writes, and ignores simulators."""
 
 from __future__ import annotations
 

@@ -301,7 +301,7 @@ def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
 
 @pytest.fixture
 def shared() -> Iterator[tuple[int, Bus, Mastership]]:
-    """A port without replies, seen from the line."""
+    """Return the far end of a line without replies, its bus and its mastership."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)

@@ -1,4 +1,4 @@
-"""Verbs and plain writes by their steps: what ends them, what is taken back, and what is told and noted."""
+"""Verbs and plain writes, step by step: how they end, what is undone, and what is reported and logged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bus around a write: rules, identity, outcomes, EEPROM, stops; against simulated drives."""
+"""Writes with `Bus` and simulated drives: rules, identity, outcomes, EEPROM, stops."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Whatever is called in whatever order: no forbidden frame leaves, and none that starts a motor unasked.
+"""No order of calls sends a forbidden frame, or starts a motor without a call of `start` or `jog`.
 
-What is allowed is typed here from the documents, not taken from the library's declarations.
+The allowed frames were typed from the documents, not taken from the library's declarations.
 """
 
 from __future__ import annotations

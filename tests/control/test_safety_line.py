@@ -1,6 +1,6 @@
-"""Faults on the way to a motor, through the real engine and a pty: what left, and what the caller was told.
+"""Faults between caller and motor, with the real engine and a pty: sent frames and reported results.
 
-The same cases as on a clock of the test's own (test_safety_bus.py); here the drive counts what it heard.
+test_safety_bus.py has the same cases on a simulated clock. Here the drive counts the frames that it receives.
 """
 
 from __future__ import annotations

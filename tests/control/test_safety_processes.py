@@ -1,4 +1,4 @@
-"""Leaving and dying, two processes at one ledger, and an adapter's echo: on real ports and processes."""
+"""Processes that exit or die, two processes with one ledger, and an adapter's echo, on real ports."""
 
 from __future__ import annotations
 

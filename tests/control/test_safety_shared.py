@@ -1,8 +1,8 @@
 """A second client on the same line, whose frames collide with ours: sent frames and results.
 
-No drive can tell its requests from ours, and we cannot tell the reply to its read of our drive from that
-to our own: what is read on a line with two clients is not to be trusted. What is commanded is: nothing
-that starts a motor or is a pulse is sent twice, none starts unasked, and what we are told of it is true.
+A drive cannot distinguish the requests of two clients, and a client cannot distinguish the replies to its
+reads from those to the other's. So reads on such a line are not reliable, but commands are: no start and no
+pulse is sent twice, no motor starts without a call, and the results of commands are true.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Stops while the system fails: signals at any line, no memory, no descriptors, a ledger that others hold."""
+"""Stops while the system fails: signals at any line, no memory, no descriptors, a locked ledger."""
 
 from __future__ import annotations
 
@@ -406,7 +406,7 @@ def counts(frame: FrameType) -> bool:
 
 @pytest.fixture
 def _unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let setpoints be written as often as these tests begin anew."""
+    """Disable the budget of EEPROM writes, because these tests write setpoints again and again."""
     monkeypatch.setattr(WriteRecords, "count", lambda *_: None)
 
 

@@ -1,8 +1,8 @@
 """A stop always wins: no call from before a stop moves a motor after it.
 
-Real ports and threads, and responders of our own that note every frame. Order is judged on the wire alone:
-a line delivers in order, so any frame after a stop's first one was sent after its call.
-Threads that start motors are held during their checks until the stop is called. More of it:
+The ports and threads are real, and the far ends record every frame. A line keeps the order of frames, so any
+frame after a stop's first frame was sent after the call of the stop. Threads that start motors are paused
+during their checks until the stop is called. A longer run:
 `STOP_EXAMPLES=100 pytest -m '' tests/control/test_stop_wins.py`.
 """
 

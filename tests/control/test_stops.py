@@ -1,4 +1,4 @@
-"""A stop wins against earlier calls, locked ledgers, hung logs and deaf lines."""
+"""A stop wins against earlier calls, locked ledgers, hung logs and lines on which no drive answers."""
 
 from __future__ import annotations
 

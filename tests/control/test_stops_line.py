@@ -1,4 +1,4 @@
-"""A stop against late answers, other threads and a port that is closed: through the real engine and a pty."""
+"""A stop despite late replies, other threads and a closed port, through the real engine and a pty."""
 
 from __future__ import annotations
 

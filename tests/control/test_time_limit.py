@@ -1,4 +1,4 @@
-"""Nothing of what is called within a time limit is sent after it, but a stop."""
+"""A call with a time limit sends no request after that time, except a stop."""
 
 from __future__ import annotations
 

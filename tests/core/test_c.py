@@ -1,4 +1,4 @@
-"""The C core's own test programs, built by the system's compiler with its sanitizers, and run."""
+"""Build the C core's own test programs with the system's compiler and sanitizers, and run them."""
 
 import os
 import sys

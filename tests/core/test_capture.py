@@ -1,4 +1,4 @@
-"""Sniffed bytes are cut into frames of both directions: the documents' own frames, mixed and damaged."""
+"""Sniffed bytes are cut into frames of both directions: frames from the documents, mixed and damaged."""
 
 from __future__ import annotations
 

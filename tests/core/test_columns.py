@@ -1,4 +1,4 @@
-"""Completions become columns: numbers on every wire, scales, misses, and their room."""
+"""Completions become columns: numbers of every format, scales, misses, and the columns' capacity."""
 
 from __future__ import annotations
 

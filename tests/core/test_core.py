@@ -862,7 +862,7 @@ def test_ports_come_and_go(drive: Drive) -> None:
 
 @pytest.fixture
 def descriptors() -> Iterator[int]:
-    """Open as many as the system lets a process have."""
+    """Raise the limit of open descriptors to the system's maximum, and return it."""
     least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     yield most

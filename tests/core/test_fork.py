@@ -1,4 +1,4 @@
-"""A process that forks: its child opens lines of its own, and leaves those of its parent alone."""
+"""A forked process: the child opens its own lines, and does not touch its parent's lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames: every one that the documents print, and replies that other libraries take for good."""
+"""Frames: all that the documents print, and replies that other libraries accept."""
 
 from __future__ import annotations
 

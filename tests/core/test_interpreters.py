@@ -1,4 +1,4 @@
-"""Sub-interpreters: refused with a sentence, before anything of the core is loaded."""
+"""Sub-interpreters: refused with one sentence before the core is loaded."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """The drive's proof, a read of another length. READ was not answered, and its window is over."""
+    """A read of another length as the drive's proof, after READ was not answered and its window is over."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -187,7 +187,7 @@ def test_a_reply_is_found_where_the_line_babbled_before_its_request(line: LineDr
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """The proof of a drive that another process may have asked READ, or anything of that length."""
+    """The proof of a drive that may owe another process a reply of READ's length."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()

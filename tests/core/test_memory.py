@@ -1,4 +1,4 @@
-"""Memory of the structs that the core uses at every exchange."""
+"""The size of the structs that the core uses in every exchange."""
 
 from __future__ import annotations
 

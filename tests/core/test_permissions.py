@@ -1,4 +1,4 @@
-"""Mastership: a deadline of CLOCK_BOOTTIME; the kernel kills a process that stood still beyond it."""
+"""Mastership: a deadline of CLOCK_BOOTTIME; the kernel kills a process that was suspended beyond it."""
 
 from __future__ import annotations
 

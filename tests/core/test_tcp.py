@@ -1,4 +1,4 @@
-"""Modbus TCP: frames as others print and build them, and exchanges on a clock that the test sets."""
+"""Modbus TCP: frames that others print and build, and exchanges on a clock that the test sets."""
 
 from __future__ import annotations
 

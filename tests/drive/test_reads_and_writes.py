@@ -1,4 +1,4 @@
-"""`Drive.read`, `write` and their like: registers, names and texts, attached and not."""
+"""`Drive.read`, `write` and similar methods: registers, names and texts; attached and unattached drives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registers: scaling that is exact, spans that hold, names that read well."""
+"""Registers: exact scaling, enforced spans, readable names."""
 
 from enum import IntEnum, IntFlag
 from typing import Any

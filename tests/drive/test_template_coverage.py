@@ -1,4 +1,4 @@
-"""The script that says which share of a reader's templates the register model holds."""
+"""The script that reports which share of a folder of register templates the register model can describe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every family: declarations that hold together, and no verb that does what its document forbids."""
+"""Every family: consistent declarations, and no verb that its document forbids."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 @pytest.fixture(scope="module")
 def fleet(nats: Cluster) -> Cluster:
-    """Return them after `fleet init`."""
+    """Return three servers after `fleet init`."""
     from multidrop.fleet.servers.connections import paths_of
     from multidrop.fleet.servers.setup import set_up
 

@@ -1,6 +1,6 @@
-"""All tasks and threads of a fleet's gateway that must go on: each that ends is logged, and ends the gateway.
+"""Required tasks and threads of a fleet's gateway: if one ends, it is logged, and the gateway ends.
 
-A failure on one line is that line's alone.
+A failure on one line affects only that line.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`multidrop fleet`: one sentence for each mistake, and the output about a fleet."""
+"""`multidrop fleet`: one sentence for each mistake, and its output about a fleet."""
 
 from __future__ import annotations
 

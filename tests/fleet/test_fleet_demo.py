@@ -1,4 +1,4 @@
-"""`fleet demo`: it shows a takeover, and leaves nothing behind however it ends."""
+"""`fleet demo`: it shows a takeover, and removes its processes and files, however it ends."""
 
 from __future__ import annotations
 

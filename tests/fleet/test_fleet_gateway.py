@@ -1,4 +1,4 @@
-"""One gateway of a fleet: whom it answers, and how it ends."""
+"""One gateway of a fleet: which clients it answers, and how it ends."""
 
 from __future__ import annotations
 

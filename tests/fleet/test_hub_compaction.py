@@ -1,4 +1,4 @@
-"""Files of a hub become few: each row is read once before, between and after."""
+"""Compaction of a hub's files: each row is read exactly once before, during and after it."""
 
 from __future__ import annotations
 

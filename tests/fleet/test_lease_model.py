@@ -1,4 +1,4 @@
-"""All interleavings of a lease's holder and a taker, in discrete time, decided by the code's own rules."""
+"""All interleavings of a lease's holder and a gateway that takes it over, with the code's own rules."""
 
 from __future__ import annotations
 

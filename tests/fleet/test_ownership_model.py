@@ -1,4 +1,4 @@
-"""All interleavings of gateways that claim one line and give it away, decided by the code's own rules."""
+"""All interleavings of gateways that claim and release one line, with the code's own rules."""
 
 from __future__ import annotations
 

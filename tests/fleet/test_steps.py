@@ -1,4 +1,4 @@
-"""The steps of a gateway, and when it takes them: on a loop whose time is its own, without a server."""
+"""The steps of a gateway and their order, in simulated time, without a server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers in JetStream's place that are none: each is one sentence, and ends no gateway, forwarder or hub."""
+"""Invalid answers instead of JetStream's: each causes one sentence and ends no gateway, forwarder or hub."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records that are damaged or hostile: each is left out with a warning, and harms no other."""
+"""Damaged or hostile records: each is skipped with a warning and affects no other record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tasks that swallow a cancellation are ended in finite time."""
+"""Tasks that ignore a cancellation are ended in finite time."""
 
 from __future__ import annotations
 

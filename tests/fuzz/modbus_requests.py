@@ -1,4 +1,4 @@
-"""Bytes of a Modbus TCP client, whatever they are: each request has one answer, of the right shape."""
+"""Feed arbitrary bytes of a Modbus TCP client: each request gets one answer of the right shape."""
 
 from __future__ import annotations
 

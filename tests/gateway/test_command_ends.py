@@ -1,4 +1,4 @@
-"""The end of a drive's commands: when it was, and its outcome, by whichever way they came."""
+"""When a drive's commands ended, and their outcomes, whichever interface they came through."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A full disk, on a file system of its own: polling and stops go on, and it is said until there is room."""
+"""A full disk, on its own file system: polling and stops continue, and it is reported until there is room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stops through the gateway: whatever else is broken or busy, they are sent, and seen to have stopped."""
+"""Stops through the gateway: sent and verified, whatever else is broken or busy."""
 
 from __future__ import annotations
 

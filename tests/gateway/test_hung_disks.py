@@ -42,7 +42,7 @@ SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for no part, and for no end, for longer than needed."""
+    """Shorten the time limits for starting and closing parts."""
     for module, name in ((parts, "START_S"), (parts, "BUILD_S"), (reload, "QUICK_S")):
         monkeypatch.setattr(module, name, SHORT_S)
     monkeypatch.setattr(historian, "CLOSING_S", SHORT_S)

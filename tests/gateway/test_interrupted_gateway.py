@@ -44,7 +44,7 @@ class Counting(EncodedDrive):
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Iterator[Counting]:
-    """The drive of the line of plant.toml."""
+    """A simulated drive, and a plant.toml with its line."""
     drive = Counting(InvtCHE(1, baudrate=38400))
     with Simulator([Wire([drive], unpaced=True)]) as simulator:
         (tmp_path / "plant.toml").write_text(

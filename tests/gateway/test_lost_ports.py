@@ -1,4 +1,4 @@
-"""A port that is not there when the gateway starts: its line is lost, and the others are polled."""
+"""A port that is absent when the gateway starts: its line is lost, and the others are polled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reload of the plant file: with mistakes all goes on as before, and without them the new plant is polled."""
+"""Reload of the plant file: with mistakes nothing changes; without mistakes the new plant is polled."""
 
 from __future__ import annotations
 

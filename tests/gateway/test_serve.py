@@ -1,4 +1,4 @@
-"""The command `serve` as its users and the service manager run it, in a process of its own."""
+"""The command `serve` as users and the service manager run it, in its own process."""
 
 from __future__ import annotations
 

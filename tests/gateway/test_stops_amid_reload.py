@@ -1,4 +1,4 @@
-"""Stops amid a reload, of drives whose names are on their way from one line to another."""
+"""Stops during a reload, of drives whose names move from one line to another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compaction: broken off at each of its steps, killed, and done again."""
+"""Compaction: interrupted at each of its steps, killed, and repeated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gateway's historian: settings, the feed, and what it answers."""
+"""The gateway's historian: settings, rows from polling, and answers to requests."""
 
 from __future__ import annotations
 

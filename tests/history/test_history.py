@@ -1,4 +1,4 @@
-"""History: what it reads is what was recorded, and its buckets are what plain Python reckons."""
+"""History: it returns the recorded rows, and its buckets equal those computed in plain Python."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COMPACTED = pytest.mark.parametrize("compacted", usually(2, 0, 4), ids="{} compa
 
 @pytest.fixture(scope="module")
 def rows() -> list[list[Row]]:
-    """Four segments: two behind each other, one after a gap, and one after the clock was set back."""
+    """The rows of four segments: two in succession, one after a gap, one after the clock was set back."""
     begins = (NOON, NOON + 80 * SECOND, NOON + 300 * SECOND, NOON + 60 * SECOND)
     made = [random_rows(seed, begin, 400) for seed, begin in enumerate(begins)]
     return [

@@ -1,4 +1,4 @@
-"""Kill -9 at any moment: no row that was written is missing, and none is there twice."""
+"""Kill -9 at any moment: no written row is missing or doubled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HistoryWriter: whatever the disk does, nobody waits, and what is lost is counted."""
+"""HistoryWriter: its callers never wait for the disk, and lost rows are counted."""
 
 from __future__ import annotations
 

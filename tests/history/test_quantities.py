@@ -1,4 +1,4 @@
-"""A name that is another quantity from one segment on: two units are never put together."""
+"""A name that has another unit from one segment on: two units are never mixed."""
 
 from __future__ import annotations
 

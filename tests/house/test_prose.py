@@ -1,4 +1,4 @@
-"""The house's rules of words: what a name, a docstring and a line may be."""
+"""Check the rules for the project's wording: names, docstrings and line lengths."""
 
 from __future__ import annotations
 

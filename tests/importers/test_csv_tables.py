@@ -1,4 +1,4 @@
-"""CSV tables: words and numbers that have two meanings are gaps, and so is whatever is not stated."""
+"""CSV tables: ambiguous words and numbers are gaps, and so are facts that the table does not state."""
 
 from __future__ import annotations
 

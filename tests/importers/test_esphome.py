@@ -1,4 +1,4 @@
-"""ESPHome's `modbus_controller`: which device an entity is of, offsets, masks, filters, and packages."""
+"""ESPHome's `modbus_controller`: entities and their devices, offsets, masks, filters, and packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged and hostile files of other programs: a family that loads, or one sentence, in bounded time."""
+"""Damaged and hostile files of other programs give a family that loads, or one sentence, in bounded time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every key of a source's schema has a treatment; a key that no table has is a marked gap."""
+"""Every key of a source's schema is handled; an unknown key is a marked gap."""
 
 from __future__ import annotations
 

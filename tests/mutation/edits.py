@@ -1,4 +1,4 @@
-"""Every small mistake of a kind that could be made in a file of C or Python, one at a time."""
+"""Generate every small mistake (mutant) of a C or Python file, one at a time."""
 
 from __future__ import annotations
 

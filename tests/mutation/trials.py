@@ -1,4 +1,4 @@
-"""A copy of the tree in which one mutant after the other is tried, and never the tree itself."""
+"""A copy of the source tree in which mutants are tried one by one; the original is never changed."""
 
 from __future__ import annotations
 

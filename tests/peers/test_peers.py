@@ -43,7 +43,7 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
 
 @pytest.fixture(params=COMMANDS)
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, str]]:
-    """Give our port with a server behind it, and its framing."""
+    """Give a port with a server behind it, and the server's framing."""
     command = COMMANDS[request.param](tmp_path)
     with linked_ptys() as (theirs, ours):
         started = [theirs if word == "PORT" else word for word in command]

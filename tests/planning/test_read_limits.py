@@ -1,4 +1,4 @@
-"""Reading together if a class states no limit, and groups that always share a request."""
+"""Block sizes if a class states no limit, and groups that always share a request."""
 
 from __future__ import annotations
 

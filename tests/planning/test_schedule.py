@@ -1,4 +1,4 @@
-"""The schedule, with a clock that the tests hold in their hands."""
+"""The schedule, with a clock that the test sets."""
 
 from __future__ import annotations
 

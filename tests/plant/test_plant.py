@@ -106,7 +106,7 @@ def load(tmp_path: Path) -> Load:
 
 @pytest.fixture
 def mistakes(load: Load, tmp_path: Path) -> Mistakes:
-    """The sentences without the file's path, their required prefix."""
+    """A function that returns the mistakes of a plant file, without the file's path at their start."""
 
     def mistakes(text: str) -> list[str]:
         with pytest.raises(PlantError) as refusal:

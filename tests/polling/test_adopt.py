@@ -1,4 +1,4 @@
-"""Plants that are adopted while others are polled, on a clock that only the test lets pass."""
+"""Plants that are adopted while another one is polled, on a clock that the test sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches: row by row, and taken by Arrow's users as they are."""
+"""Batches: read row by row, and passed to users of Arrow."""
 
 from __future__ import annotations
 

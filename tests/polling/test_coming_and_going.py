@@ -1,4 +1,4 @@
-"""Drives that are added to and removed from a poll that is under way, and from a bus."""
+"""Drives that join and leave a running poller, and a bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exceptions in a poller's threads: a line's failure is that line's alone, and no thread ends in silence."""
+"""Exceptions in a poller's threads: a failure affects only its line, and no thread ends silently."""
 
 from __future__ import annotations
 

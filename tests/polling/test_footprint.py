@@ -1,4 +1,4 @@
-"""Memory of a polling process, which a small machine must afford."""
+"""Memory of a polling process, limited for small machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A poller in `for` and `async for`, drives by name, and drives that are added in Python."""
+"""A poller in `for` and `async for`, drives by name, and drives that Python code adds."""
 
 from __future__ import annotations
 

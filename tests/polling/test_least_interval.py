@@ -1,4 +1,4 @@
-"""A drive that bears no request soon after another: it is left alone for so long, and the line is not."""
+"""A drive that needs a pause between requests: only this drive waits, not the line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A poller whose lines other processes may take over: its requests and rows over time."""
+"""A poller whose lines other processes may take over: its requests and rows during these changes."""
 
 from __future__ import annotations
 

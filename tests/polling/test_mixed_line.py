@@ -1,4 +1,4 @@
-"""All families on one line, each at its own baud rate and format: no value is taken for another's."""
+"""All families on one line, with different baud rates and formats: no value goes to the wrong drive."""
 
 from __future__ import annotations
 

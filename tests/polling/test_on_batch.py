@@ -1,4 +1,4 @@
-"""A function that a poller calls with its batches: on which thread, when it fails, and how it ends."""
+"""A poller's callback for batches: its thread, its failures, and its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A block that a drive does not answer as a whole is split: bounded, and no register is lost."""
+"""Blocks that a drive does not answer as a whole are split: in bounded time, without losing a register."""
 
 from __future__ import annotations
 

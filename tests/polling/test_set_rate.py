@@ -1,4 +1,4 @@
-"""Rates that are changed while a plant is polled, on a clock that only the test lets pass."""
+"""Rates that change while a plant is polled, on a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def clocked(*drives: PolledDrive) -> ClockedLines:
 
 @pytest.fixture
 def two() -> Iterator[ClockedLines]:
-    """Two drives, four registers of each once in 100 ms."""
+    """A plant with two drives; four registers of each are polled every 100 ms."""
     with clocked(*(polled(toy(address), ALL, 0.1) for address in (1, 2))) as made:
         made.run(2)
         yield made

@@ -1,6 +1,6 @@
-"""Rows of a machine that sleeps while it polls: each has the time of its exchange.
+"""Rows of a computer that sleeps while it polls: each has the time of its exchange.
 
-No machine here can be put to sleep: a library put before the system's has the clocks of one that was.
+The test computer does not sleep: a preloaded library gives the process the clocks of one that slept.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Stories of a path that holds everything up and keeps the order: a modem, a gateway, a stalled network.
+"""A path that delays everything and keeps the order, such as a modem, a gateway or a stalled network.
 
-No value is another register's, and values keep coming; on a clock of the test's own.
+No value is assigned to the wrong register, and polling continues. The tests set the clock.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Stories of Modbus TCP behind a path that delays: late, doubled and reordered replies, on a test's clock.
+"""Modbus TCP on a path that delays: late, doubled and reordered replies, on a clock that the test sets.
 
-A reply with its request's id needs no proof; a gateway with ids of its own is dealt with as RTU is.
+A reply with its request's id needs no proof. A gateway that replies with its own ids is treated like RTU.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Useless proofs: the device is silent to them, or holds an unexpected value."""
+"""Useless proofs: the device does not answer them, or the register holds an unexpected value."""
 
 from __future__ import annotations
 

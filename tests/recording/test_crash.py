@@ -1,7 +1,7 @@
-"""Clients that are killed at random while they poll, record and write: what they told of is there, once.
+"""Clients that are killed at random while they poll, record and write: acknowledged data is there once.
 
-Acknowledged is what a client said after the call had returned: rows that `Writer.write` took, and
-numbers that `Drive.write` confirmed. 20 are killed here, and as many as one likes by
+A client acknowledges data after the call has returned: rows that `Writer.write` took, and numbers that
+`Drive.write` confirmed. By default 20 clients are killed; more with
 `pytest tests/recording/test_crash.py --kills 200`.
 """
 

@@ -1,4 +1,4 @@
-"""Recordings: what is written is read, by us and by others, and stays the same when converted."""
+"""Recordings: the library and other programs read what was written, also after a conversion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings whose writer was killed, whose disk was full, or which are none: what is whole is kept."""
+"""Recordings after a kill or a full disk, and files that are no recordings: all complete data is kept."""
 
 from __future__ import annotations
 

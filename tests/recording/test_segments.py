@@ -1,4 +1,4 @@
-"""Recordings in segments: rotation, numbers, what is kept, and what a kill leaves."""
+"""Recordings in segments: rotation, numbers, removal of old segments, and the state after a kill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A machine for which there is no nanoarrow records all the same."""
+"""A machine without nanoarrow can still record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures and pages of a recording: what is in them, by their numbers; how they look, people must see."""
+"""Pictures and pages of a recording: the numbers in them; their look is not tested."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of
 
 @pytest.fixture(scope="module", autouse=True)
 def _imported() -> None:
-    """Import matplotlib where these tests run; each worker that only collects them needs 0.5 s for it."""
+    """Import matplotlib when these tests run: at collection, it would cost each worker 0.5 s."""
     global np, Recording, load, plot, plot_page, png, report_page, _about, _drives
     global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
     global MOST_DRIVES, MOST_LANES, MOST_PANELS, MOST_POINTS, thinned

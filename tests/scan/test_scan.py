@@ -1,4 +1,4 @@
-"""Scanning a simulated line on the test's own clock: what is found, how soon, and what is not."""
+"""Scanning a simulated line on the test's clock: drives that are found, the time, drives that are missed."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def declared(*drives: object) -> set[tuple[int, str, str, str]]:
 
 @pytest.fixture(scope="module")
 def whole_scan() -> tuple[Line, list[object]]:
-    """All sweeps over a line of all eight, and what they found."""
+    """Scan a line with all eight drives completely; return the sweeps and their results."""
     line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
     return line, found(line, sweeps(FAMILIES))
 

@@ -1,4 +1,4 @@
-"""A simulated drive of a class of one's own: memory, access, limits, refusals, counters."""
+"""A simulated drive of a user's class: memory, access, limits, refusals, counters."""
 
 import math
 

@@ -1,7 +1,7 @@
 """Every family answers as its document says: whole frames in, whole frames out, at chosen times.
 
-Frames written out with their checksum are printed in the family's document, where they are not
-marked as built from its tables; the others' checksums are worked out by checksums.py.
+Frames with a written checksum are printed in the family's document, unless they are marked as built from its
+tables. checksums.py computes the checksums of all other frames.
 """
 
 from __future__ import annotations

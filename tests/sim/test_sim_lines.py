@@ -1,4 +1,4 @@
-"""Simulated lines for real: ptys and TCP ports, opened by a client that knows nothing of the simulator."""
+"""Simulated lines on real ptys and TCP ports, with a client that is independent of the simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masters that others wrote read and write simulated drives: mbpoll over RTU, pymodbus over ASCII."""
+"""Masters by other authors read and write simulated drives: mbpoll over RTU, pymodbus over ASCII."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cutting requests out of what is heard; frames are the documents' own."""
+"""Cutting requests out of received bytes; the frames are those that the documents print."""
 
 import random
 

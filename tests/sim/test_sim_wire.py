@@ -1,4 +1,4 @@
-"""One line of simulated drives: who hears what, and when every byte is through. The clock is the test's."""
+"""One line of simulated drives: which drives receive a byte, and when it has passed, on the test's clock."""
 
 from __future__ import annotations
 

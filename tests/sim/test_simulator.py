@@ -1,4 +1,4 @@
-"""The simulator's thread: it ends when it is told to, and a drive that fails silences no other wire."""
+"""The simulator's thread: it ends on request, and a failing drive affects no other wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Former peers: a port is closed while replies are on their way, and opened again."""
+"""A port that is closed while replies are on their way, and opened again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Another process asked before this one, and the answer is still on its way when this one asks."""
+"""Late replies to requests of another process that used the line before."""
 
 from __future__ import annotations
 

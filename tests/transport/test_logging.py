@@ -1,4 +1,4 @@
-"""Loggers under `multidrop.*`: a port's coming and going, frames, writes, refusals and stops."""
+"""Loggers under `multidrop.*`: ports that open, vanish and return, frames, writes, refusals and stops."""
 
 from __future__ import annotations
 

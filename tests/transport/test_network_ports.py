@@ -1,4 +1,4 @@
-"""Ports behind a network: delayed requests never arrive later, and a flood fills no memory."""
+"""Network ports: stalled requests are never sent later, and a flood does not fill the memory."""
 
 from __future__ import annotations
 

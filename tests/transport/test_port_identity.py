@@ -1,4 +1,4 @@
-"""A port's name that another USB adapter has when it comes back: its line is another, with other motors."""
+"""Another USB adapter that gets the name of a lost port is not used: its line has other motors."""
 
 from __future__ import annotations
 

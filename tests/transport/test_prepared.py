@@ -1,4 +1,4 @@
-"""Reads with `Bus` are planned once, and again after a change of their conditions."""
+"""Reads with `Bus` are planned once, and again if their conditions change."""
 
 from __future__ import annotations
 

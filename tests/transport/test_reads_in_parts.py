@@ -1,4 +1,4 @@
-"""Reads with `Bus` of blocks that a drive refuses or ignores as a whole: in parts, without losses."""
+"""Reads with `Bus` that a drive refuses or ignores as a whole are split, without losing a register."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Lines whose transceiver is switched by RTS or its driver, with a driver that logs its calls.
 
-No RS-485 hardware is here: the driver is a library put before the system's, and the port a pseudo-terminal.
-tests/c/test_rs485.c has the times to the nanosecond, on a clock of its own.
+There is no RS-485 hardware: a preloaded library simulates the driver, and the port is a pseudo-terminal.
+tests/c/test_rs485.c checks the times to the nanosecond, on a simulated clock.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Statistics: every ending of an exchange in the guide's counters, quantiles, spans, and whose they are."""
+"""Statistics: each result of an exchange in the guide's counters, quantiles, time spans, and their owners."""
 
 from __future__ import annotations
 

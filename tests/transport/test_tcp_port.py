@@ -1,4 +1,4 @@
-"""Ports of Modbus TCP: their names, which drives they take, and far ends that speak something else."""
+"""Modbus TCP ports: names, accepted drives, and peers that speak another protocol."""
 
 from __future__ import annotations
 

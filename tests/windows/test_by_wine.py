@@ -159,7 +159,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def wine() -> Iterator[Wine]:
-    """Give Wine with a server that survives vanishing terminals, because it is not their session leader."""
+    """Give Wine, whose server survives vanishing terminals because it is in another session."""
     found = Wine(Path(FOLDER))
     subprocess.run(["wineserver", "-w"], env=found.environment, check=True)
     with BoundProcess(["wineserver", "-f", "-p"], env=found.environment) as server:

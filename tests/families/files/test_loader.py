@@ -1,4 +1,4 @@
-"""Families from files: the class that is made, and every mistake with its place and what would be right."""
+"""Families from files: the resulting class; each mistake with its place and a correct example."""
 
 from __future__ import annotations
 

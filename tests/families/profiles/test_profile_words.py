@@ -1,4 +1,4 @@
-"""The frames that each profile's verbs send, against the words of the manuals, typed from them."""
+"""The frames that each profile's verbs send, compared with words that were typed from the manuals."""
 
 from __future__ import annotations
 

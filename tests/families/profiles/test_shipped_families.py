@@ -1,4 +1,4 @@
-"""The families that ship as files: their tables, typed from the manuals, and how they are found and used."""
+"""The families that ship as files: their tables, typed from the manuals, and their use."""
 
 from __future__ import annotations
 

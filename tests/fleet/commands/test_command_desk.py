@@ -1,4 +1,4 @@
-"""Commands at the gateway: each is sent once, in time, by the present master, or not at all."""
+"""Commands at a gateway: the present master sends each once and in time, or not at all."""
 
 from __future__ import annotations
 

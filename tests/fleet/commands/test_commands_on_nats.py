@@ -1,4 +1,4 @@
-"""Commands on real servers: to the present master alone, over three paths and carried out once."""
+"""Commands on real servers: delivered on three paths, carried out once, by the present master only."""
 
 from __future__ import annotations
 

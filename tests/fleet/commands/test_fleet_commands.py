@@ -1,4 +1,4 @@
-"""Askers: what they are told is certain where it says so, and a command is sent once whatever is answered."""
+"""The sender of a command: certain outcomes are true, and the command is sent once, whatever is answered."""
 
 from __future__ import annotations
 

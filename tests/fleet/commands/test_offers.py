@@ -1,4 +1,4 @@
-"""Commands of a fleet on a drive that has left its line meanwhile."""
+"""Offers of a command whose drive has left its line since."""
 
 from __future__ import annotations
 

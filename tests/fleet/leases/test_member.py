@@ -1,4 +1,4 @@
-"""Gateways' state machines on a real cluster, with lines that are not there."""
+"""Gateways' state machines on a real cluster, with fake lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gateways that say by other rules whose a line is: who they are, and when they are gone."""
+"""Gateways with an incompatible ownership protocol: which they are, and when they are gone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A line that is closed: its commands end at once, its stops are answered until it is closed."""
+"""A line that is being closed: commands end at once; stops are answered until it is closed."""
 
 from __future__ import annotations
 

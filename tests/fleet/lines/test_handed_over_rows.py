@@ -1,4 +1,4 @@
-"""Requests in flight while a line is handed over: each of them has its row."""
+"""Requests in flight while a line is handed over: each has its row."""
 
 from __future__ import annotations
 

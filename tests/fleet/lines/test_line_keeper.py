@@ -1,4 +1,4 @@
-"""The work on a gateway's lines, on records in memory."""
+"""A gateway claims, opens and releases lines, with records in memory."""
 
 from __future__ import annotations
 

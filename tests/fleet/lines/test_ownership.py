@@ -1,4 +1,4 @@
-"""Whose a line is: the balance, and who may claim and give away when."""
+"""Ownership of lines: the balance between gateways, and who may claim or release a line when."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records of a share's lines: when they are read, and that no change is missed for good."""
+"""Records of the lines in a gateway's share: when they are read, and that every change is noticed."""
 
 from __future__ import annotations
 

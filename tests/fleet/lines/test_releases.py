@@ -1,4 +1,4 @@
-"""Lines are closed for others only while these can claim them, now and in the next moment."""
+"""A line is released only while other gateways can claim it, now and in the next moment."""
 
 from __future__ import annotations
 

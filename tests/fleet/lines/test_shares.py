@@ -1,4 +1,4 @@
-"""Shares of lines: assigned at once, or in a cold start once no gateway comes or goes."""
+"""Shares of lines: assigned immediately, or, at a cold start, once no gateway joins or leaves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages: what any reader of Arrow finds in them, and bytes that are none."""
+"""Messages of samples: any Arrow reader opens them, and invalid bytes are refused."""
 
 from __future__ import annotations
 

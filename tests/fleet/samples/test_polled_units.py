@@ -1,4 +1,4 @@
-"""Units of a fleet's samples: each row has that of the description which it was polled under."""
+"""Units of a fleet's samples: each row has the unit of the description under which it was polled."""
 
 from __future__ import annotations
 

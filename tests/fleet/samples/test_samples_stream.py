@@ -1,4 +1,4 @@
-"""Whose a message of the stream is, and its number, whatever its writer put into its headers."""
+"""The gateway and number of a message in the stream, whatever its writer put into the headers."""
 
 from __future__ import annotations
 

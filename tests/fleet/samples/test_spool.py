@@ -1,4 +1,4 @@
-"""The spool: appended rows are on the disk, whatever happens, and lost ones are counted."""
+"""The spool: appended rows are on the disk after any failure, and lost rows are counted."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Answers that a user wants sent to foreign subjects: none leaves the user's account.
+"""Requests whose answers would go to another user's subjects: no answer leaves the user's account.
 
-Each attempt is made twice: with the accounts as written, and with one account for all, where each arrives.
+Each attempt is made twice: with the accounts as written, and with one account for all users, in which every
+answer arrives.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 @pytest.fixture(params=["taken at once", "nats-py's own way", "another nats-py"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Let answers come as they do, and as they would with another nats-py; return a name of its own."""
+    """Use the fast path, with that of nats-py, and with a changed nats-py; return a unique name."""
     if request.param == "nats-py's own way":
         monkeypatch.delattr(BatchClient, "_process_msg")
     elif request.param == "another nats-py":

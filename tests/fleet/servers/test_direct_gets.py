@@ -1,4 +1,4 @@
-"""Direct gets: whom they ask when, and which answer counts; on a loop whose time is its own."""
+"""Direct gets: which servers are asked when, and which answer counts, in simulated time."""
 
 from __future__ import annotations
 

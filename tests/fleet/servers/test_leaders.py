@@ -1,4 +1,4 @@
-"""Lease terms: which buckets are handed over while a server is silent, on servers that are not there."""
+"""Lease terms: which buckets are handed over while a server is silent, with fake servers."""
 
 from __future__ import annotations
 

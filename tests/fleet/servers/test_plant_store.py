@@ -1,4 +1,4 @@
-"""A plant in the bucket: each line comes out of its record as the plant file describes it."""
+"""A plant in the bucket: each line read from its record equals the line of the plant file."""
 
 from __future__ import annotations
 

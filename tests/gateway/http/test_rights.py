@@ -1,4 +1,4 @@
-"""The right of every caller for every route, by one table, over HTTP; and pages that are not ours."""
+"""The right of every caller for every route, from one table, over HTTP; requests from foreign pages."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_a_wrong_token_that_comes_again_is_logged_once(
 
 @pytest.fixture(scope="module")
 def open_gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Everybody on this machine may stop."""
+    """A gateway at which every user of this machine may stop drives."""
     with served(tmp_path_factory.mktemp("open"), LOOPBACK_STOPS, names=("plant.example",)) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         yield gateway

@@ -1,4 +1,4 @@
-"""Alarms: trips of every family, lost ports, restarts, who acknowledged what, and a disk that is full."""
+"""Alarms: faults of every family, lost ports, restarts, acknowledgements, and a full disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Identities are checked before the first stop, so a stop is sent at once."""
+"""Identities are checked before the first stop is called, so that a stop is sent at once."""
 
 from __future__ import annotations
 

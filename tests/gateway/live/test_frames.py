@@ -1,4 +1,4 @@
-"""Frames: made once for all viewers, five a second at most, whole or as what changed; none is queued."""
+"""Frames: made once for all viewers, at most five a second, complete or as changes; none is queued."""
 
 from __future__ import annotations
 

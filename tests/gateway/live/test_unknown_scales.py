@@ -1,4 +1,4 @@
-"""Registers whose documents state no scale: raw counts are nowhere given as amperes, volts or hertz."""
+"""Registers whose documents state no scale: raw counts are never reported in amperes, volts or hertz."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Looks at a plant over HTTP: its description, frames, one drive, lines, alarms, and reads past the table."""
+"""Views of a plant over HTTP: its description, frames, one drive, lines, alarms, and unpolled registers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The share of a line that Modbus clients may use: measured, bounded, in turns."""
+"""The share of a line's time that Modbus clients may use: measured, limited, and divided fairly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modbus clients: each has its own answers alone, and its stops wait neither for requests nor for answers."""
+"""Modbus clients: each gets only its own answers; its stops wait for no other request and no answer."""
 
 from __future__ import annotations
 

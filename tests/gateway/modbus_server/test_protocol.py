@@ -1,4 +1,4 @@
-"""MBAP: requests are taken out of bytes however they come."""
+"""MBAP: requests are parsed correctly however their bytes are divided."""
 
 from __future__ import annotations
 

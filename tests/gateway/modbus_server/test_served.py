@@ -1,4 +1,4 @@
-"""The server as a part of the gateway: from `[serve.modbus]` of a plant file to line and audit log."""
+"""The Modbus server as a part of the gateway: from `[serve.modbus]` in a plant file to line and audit log."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Words made again of rows: those that the drive sent, bit for bit, or none.
+"""Words that are computed from rows equal those that the drive sent, bit for bit, or are unknown.
 
-The rows are what the core makes of the bytes; the bytes are drawn here, and no encoder of ours is asked.
+The core makes the rows from random bytes, which are compared with the words. No encoder is involved.
 """
 
 from __future__ import annotations

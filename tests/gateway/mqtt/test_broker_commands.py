@@ -1,4 +1,4 @@
-"""BrokerCommands: how many of a broker's commands are under way, and what that holds up."""
+"""BrokerCommands: how many commands of a broker may be in progress, and what they delay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chromium, a gateway with invented values, and pages of it. Without Chromium these tests are skipped."""
+"""Fixtures: Chromium, a gateway with invented values, and its pages. Without Chromium, tests are skipped."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def few_drives(monkeypatch: pytest.MonkeyPatch) -> int:
 
 @pytest.fixture
 def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
-    """Open a view of the page, and fail at the end where the page broke or broke its CSP."""
+    """Open a view of the page; fail at the end if the page had an error or violated its CSP."""
     contexts, problems = [], []
 
     def open_page(view: str = "#/drives", size: str = "desk", live: bool = True, **options: Any) -> Any:
@@ -80,7 +80,7 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """A page of no gateway yet; it fails at the end where it broke, or broke its CSP."""
+    """A page without a gateway; fail at the end if it had an error or violated its CSP."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_S * 1000)
     page, problems = context.new_page(), []

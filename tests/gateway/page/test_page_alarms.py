@@ -1,4 +1,4 @@
-"""Alarms on the page: the gravest first, one of a lost port, and who acknowledged them."""
+"""Alarms on the page: the most serious first, one for each lost port, and who acknowledged them."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def elsewhere() -> Iterator[int]:
 
 @pytest.fixture
 def strange(browser: Any) -> Iterator[Any]:
-    """A page whose errors are those that it provokes."""
+    """A page whose errors are expected."""
     context = browser.new_context()
     yield context.new_page()
     context.close()

@@ -1,4 +1,4 @@
-"""Words, counts and marks of a single drive, a new plant and a lost gateway."""
+"""Words, counts and marks on the page: a single drive, a new plant, and a lost gateway."""
 
 from __future__ import annotations
 
