@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import logging
 import os
 import re
 import sys
+import threading
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -107,3 +109,9 @@ def test_logs_of_a_fleet_have_time_and_level_also_as_json(
     assert (found["level"], found["logger"]) == ("warning", "multidrop.fleet")
     assert found["message"] == "line hall-1 is lost\x1b"
     assert datetime.fromisoformat(found["time"]).tzinfo is not None
+
+
+def test_closing_a_log_whose_thread_never_started_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C came before the start of the thread; `logging` closes the handler at exit."""
+    monkeypatch.setattr(threading.Thread, "start", lambda thread: None)
+    LogThread(io.StringIO(), FORMAT).close()

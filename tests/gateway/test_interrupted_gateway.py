@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import re
 import signal
 import subprocess
 import sys
@@ -86,6 +87,11 @@ def test_gateway_interrupted_anywhere_ends(drive: Counting, tmp_path: Path, step
 
 # ---- signals ----
 
+# Python reports an interruption of its import system's own callbacks, and continues.
+IN_AN_IMPORT = re.compile(
+    r"Exception ignored in: .*\nTraceback \(most recent call last\):\n  File \"<frozen importlib.*\n"
+    r"KeyboardInterrupt: *\n"
+)
 SIGNALLED = """
 import os, sys, threading, time
 from multidrop.cli import main
@@ -127,5 +133,5 @@ def test_a_signal_at_any_moment_ends_the_command(tmp_path: Path, number: int, ag
             with started(path, number, *delays) as process:
                 _, errors = process.communicate(timeout=PATIENCE)
             assert process.returncode in (0, 130, -number), errors
-            assert "Traceback" not in errors
+            assert "Traceback" not in IN_AN_IMPORT.sub("", errors)
         assert not (tmp_path / "audit.jsonl").exists() or (tmp_path / "audit.jsonl").read_text() == ""

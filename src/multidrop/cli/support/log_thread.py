@@ -49,7 +49,8 @@ class LogThread(logging.Handler):
         """Wait up to ENDING_S for the last lines."""
         with suppress(queue.Full):
             self._waiting.put_nowait(None)
-        self._thread.join(ENDING_S)
+        if self._thread.ident is not None:  # Ctrl-C may have come before its start
+            self._thread.join(ENDING_S)
         super().close()
 
     def _write(self) -> None:
