@@ -246,7 +246,7 @@ static void set_bit(uint8_t *bits, size_t at, int on)
     bits[at / 8] = (uint8_t)(on ? bits[at / 8] | mask : bits[at / 8] & ~mask);
 }
 
-/* Return the status of all fields; MD_OK: each field has its own. */
+/* Return the status that applies to all fields, or MD_OK if each field has its own. */
 static uint16_t status_of(const struct md_completion *completion)
 {
     if (completion->result < 0)

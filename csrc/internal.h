@@ -61,7 +61,7 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
 
 enum {
     MD_MOST_ADDRESS = 247,
-    MD_TCP_HEAD = 6, /* before the unit id, which is the address */
+    MD_TCP_HEAD = 6, /* bytes of the MBAP header before the unit id, which is the address */
     MD_TCP_EXCEPTION = MD_TCP_HEAD + 3
 };
 

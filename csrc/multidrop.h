@@ -164,7 +164,7 @@ struct md_drive {
     uint8_t vain[MD_MOST_PROOFS];      /* failures of each proof; 255: it was answered once */
     uint32_t doubtful;                 /* replies that may have answered another process */
     uint32_t unanswered_count;
-    const struct md_exchange **proofs; /* reads with distinguishable replies */
+    const struct md_exchange **proofs; /* reads whose replies differ from all that are missing */
     struct md_drive *next_late;        /* next drive of the line's list with late replies due */
     struct md_history *history;        /* separate because exchanges seldom need it */
     uint64_t delays[MD_DELAY_BUCKETS]; /* replies by delay: bucket n from md_delay_edge(n) */

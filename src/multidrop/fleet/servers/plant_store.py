@@ -146,4 +146,4 @@ def _toml(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, (int, float)):
         return repr(value)
-    raise ValueError(f"a plant file has no {type(value).__name__} such as {value!r}")
+    raise ValueError(f"a plant file cannot hold {value!r}, a {type(value).__name__}")
