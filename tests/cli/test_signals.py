@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,7 @@ from peers import require_module
 from recordings import recorded
 from terminals import closing_terminal
 
+from multidrop import cli
 from multidrop.cli.support import signals
 from multidrop.cli.support.signals import end_signals_interrupt, noting_signals, on_end_signals
 
@@ -173,3 +174,31 @@ def test_a_closed_terminal_ends_its_foreground_command(
     finally:
         signal.signal(signal.SIGHUP, was)
     assert came == ["reload"] * reloads + ["end"] * (2 - reloads)
+
+
+def interrupted_class(words: list[str]) -> int:
+    """Make a class whose attribute is interrupted, as an import may be; Python 3.11 raises RuntimeError."""
+
+    class Interrupted:
+        def __set_name__(self, owner: type, name: str) -> None:
+            raise KeyboardInterrupt
+
+    type("Imported", (), {"attribute": Interrupted()})
+    return 0
+
+
+def interrupted_parser(words: list[str]) -> int:
+    """Raise as argparse does, whose `finally` fails if its parser is interrupted."""
+    try:
+        raise KeyboardInterrupt
+    finally:
+        raise AttributeError("'_StoreAction' object has no attribute 'save_nargs'")
+
+
+@pytest.mark.parametrize("run", [interrupted_class, interrupted_parser])
+def test_an_interruption_that_python_wraps_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run: Callable[[list[str]], int]
+) -> None:
+    monkeypatch.setattr(cli, "_run_interruptible", run)
+    assert cli.main(["models"]) == 130
+    assert capsys.readouterr().err == "multidrop: interrupted\n"

@@ -11,8 +11,8 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from typing import Any, NoReturn
 
@@ -130,10 +130,26 @@ def _describe_itself(words: list[str]) -> int:
     return DONE if words else MISTAKE
 
 
+@contextmanager
+def _without_wrappers() -> Iterator[None]:
+    """Raise KeyboardInterrupt again that Python or argparse has turned into another exception.
+
+    Python does so in `__set_name__` while a class is made, as in an import.
+    """
+    try:
+        yield
+    except (AttributeError, RuntimeError) as failure:
+        for interruption in (failure.__cause__, failure.__context__):
+            if isinstance(interruption, KeyboardInterrupt):
+                raise interruption from None
+        raise
+
+
 def _guarded(run: Callable[[], int]) -> int:
     """Run a command; print each expected failure as a sentence on stderr."""
     try:
-        status = run()
+        with _without_wrappers():
+            status = run()
         sys.stdout.flush()
     except KeyboardInterrupt as interruption:  # its notes list the requests that were sent
         with suppress(KeyboardInterrupt):  # a second Ctrl-C in quick succession
@@ -215,7 +231,7 @@ def _parsed(
 
     A stop also ignores the word after an unknown option, because that may be the option's value, not a drive.
     """
-    arguments, unknown = _intermixed(parser, words)
+    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may come between positionals
     if not unknown:
         return arguments, []
     if command not in STOPS:
@@ -226,18 +242,8 @@ def _parsed(
     for before, word in zip(["", *words[:-1]], words, strict=True):
         is_value = before in options and "=" not in before and not word.startswith("-")
         (left_out if is_value or word in options else kept).append(word)
-    arguments, surplus = _intermixed(parser, kept)
+    arguments, surplus = parser.parse_known_intermixed_args(kept)
     return arguments, [*left_out, *surplus]
-
-
-def _intermixed(parser: argparse.ArgumentParser, words: list[str]) -> tuple[argparse.Namespace, list[str]]:
-    """Parse words with options between positionals. Raises KeyboardInterrupt, which argparse may replace."""
-    try:
-        return parser.parse_known_intermixed_args(words)
-    except AttributeError as failure:
-        if isinstance(failure.__context__, KeyboardInterrupt):
-            raise failure.__context__ from None
-        raise
 
 
 def _fail(sentences: str, status: int) -> int:
