@@ -20,7 +20,7 @@ from multidrop.fleet.lines import (  # noqa: E402
     line_keeper,
     owner_records,
 )
-from multidrop.fleet.lines.line_keeper import LineKeeper  # noqa: E402
+from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss  # noqa: E402
 from multidrop.fleet.lines.ownership import owner_of, owner_value  # noqa: E402
 from multidrop.fleet.lines.records import ShareRecords  # noqa: E402
 from multidrop.fleet.servers import names  # noqa: E402
@@ -609,5 +609,27 @@ def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: pytest.M
         assert trial.keeper.troubles == {}
         await until(lambda: trial.keeper.is_silent)
         assert trial.owner() == ("", 0)
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("loss", "reported"),
+    [
+        (PortLoss(None, None), None),
+        (PortLoss(None, SECOND), None),
+        (PortLoss(None, 3 * SECOND), "it is being reopened"),
+        (PortLoss("no route to host", SECOND), "no route to host"),
+    ],
+)
+def test_a_lost_port_is_reported_before_a_long_reopening_fails(loss: PortLoss, reported: str | None) -> None:
+    async def main() -> None:
+        trial = Trial()
+        await trial.claim()
+        await until(lambda: "hall" in trial.keeper.polled)
+        await until(lambda: not trial.keeper._at_work)
+        trial.keeper._port_loss = lambda line: loss
+        trial.keeper._look_at_ports()
+        assert trial.keeper.lost.get("hall") == reported
 
     asyncio.run(main())

@@ -21,6 +21,7 @@ from multidrop.fleet.lines.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")
 
+REPORTED_NS = 2_000_000_000  # report a lost port whose newest reply is older, before an attempt has failed
 SILENT_S = 0.5  # close lines this long before the lease expires; the kernel's timer adds guard / 2
 TAKE_AGAIN_S = 2.0  # between attempts to open a line
 WRITTEN_AT_ONCE = 64  # records written together; more would delay renewals of the lease
@@ -43,7 +44,7 @@ class Lines(Protocol):
 class PortLoss(NamedTuple):
     """A polled line's lost port: why it could not be reopened, and how old the newest reply is (ns).
 
-    `why` is None before the first attempt has failed, `silent_ns` is None if no drive ever replied.
+    `why` is None before the first attempt has failed. `silent_ns` is None if no drive ever replied.
     """
 
     why: str | None
@@ -179,10 +180,11 @@ class LineKeeper:
         """Note which ports of polled lines are lost: after a while other gateways should take these lines."""
         for line in self.polled.keys() - self._at_work.keys():
             if loss := self._port_loss(line):
-                if loss.why and line not in self.lost:
-                    _log.warning("line %s is not polled: its port is lost: %s", line, loss.why)
-                if loss.why:
-                    self.lost[line] = loss.why
+                why = loss.why or ("it is being reopened" if (loss.silent_ns or 0) > REPORTED_NS else "")
+                if why and line not in self.lost:
+                    _log.warning("line %s is not polled: its port is lost: %s", line, why)
+                if why:
+                    self.lost[line] = why
                 self._unopened.lost(line, loss.silent_ns)
             else:
                 self._opened(line)
