@@ -89,7 +89,7 @@ class Supervisor:
         return self._kept.pop(name, None)
 
     async def release(self, *names: str) -> None:
-        """End these tasks, and wait for them."""
+        """Cancel these permanent tasks, and wait until they have ended."""
         tasks = [task for name in names if (task := self._kept.pop(name, None))]
         for name in names:
             self.dead.pop(name, None)
@@ -111,7 +111,7 @@ class Supervisor:
         self._watched[name] = is_alive
 
     def look(self) -> None:
-        """Note which watched threads have ended."""
+        """Check the watched threads, and note those that have ended."""
         for name in [name for name, is_alive in self._watched.items() if not is_alive()]:
             del self._watched[name]
             self.note_dead(name, "its thread has ended")
@@ -200,7 +200,7 @@ class Supervisor:
 
     @property
     def under_way(self) -> list[str]:
-        """The names of the threads that have not ended."""
+        """The names of the works whose threads have not ended."""
         return [one.name for one in self._works.values()]
 
 

@@ -1,4 +1,4 @@
-"""Errors of a fleet's servers, each in one sentence."""
+"""Errors of a fleet's servers; the message of each is one sentence."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class MayNotSend(NoRight, NotDelivered):
 
 
 class NobodyThere(NotDelivered):
-    """A request that has no receiver, as the server reports."""
+    """The server reports that a request has no receiver."""
 
 
 class Unsure(FleetError):
@@ -91,7 +91,7 @@ def _words(text: str) -> str:
 
 
 class Denials:
-    """The subjects that one connection may not use, as its server reported; each is logged once."""
+    """The subjects that one connection may not use, as the server reports them; each is logged once."""
 
     def __init__(self) -> None:
         self._said: Counter[tuple[str, str]] = Counter()  # count by kind and subject
@@ -128,7 +128,7 @@ class Denials:
 
     @contextmanager
     def raising(self, subject: str) -> Iterator[None]:
-        """Raise NoRight at the end if subscribing to this subject was denied."""
+        """When the context ends, raise NoRight if the server denied a subscription to this subject."""
         self._raised = subject.lower()
         try:
             yield

@@ -1,4 +1,4 @@
-"""FleetGateway: one process of a fleet. It polls its own lines and forwards their samples."""
+"""FleetGateway: one process of a fleet, which polls its share of the lines and forwards their samples."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class FleetGateway:
-    """A gateway with this name; `folder` holds its lock, spool and logs.
+    """A fleet's gateway called `name`; `folder` holds its lock, spool and logs.
 
     Raises ValueError for an invalid name, FleetError if another process uses the folder.
     """

@@ -128,7 +128,7 @@ class FleetPart:
 
 
 class HasFolder(Protocol):
-    """The gateway, as this part uses it."""
+    """The attributes of the gateway's PartContext that this part uses."""
 
     folder: Path  # base of relative file names
 

@@ -1,7 +1,7 @@
 """Commands: check and carry out everything that is written through the gateway, over every interface.
 
-The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs
-the role alone, and does not wait.
+The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs only
+the role, and waits for no other command.
 """
 
 from __future__ import annotations

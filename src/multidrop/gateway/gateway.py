@@ -310,7 +310,7 @@ class Gateway:
             self.note_failure(name)
 
     def note_failure(self, name: str) -> None:
-        """Count the exception being handled, and log it every LOG_S."""
+        """Count the exception being handled, and log it, at most once in LOG_S."""
         self.count_failure(name)
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()
@@ -337,7 +337,7 @@ class Gateway:
         self.hub.unopened |= {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
-        """Log and remember the lines whose ports are missing, and why."""
+        """Log and remember the lines whose ports could not be opened, with the reasons."""
         for line, failure in failures.items():
             _log.warning("line %s is lost and will be retried: %s", line, failure)
         there = [line.name for line in self.plant.lines]
@@ -381,7 +381,7 @@ class Gateway:
         return list(struct.unpack(f">{count}H", data))
 
     def part_context(self, plant: Plant) -> PartContext:
-        """Return the objects that parts built for this plant may use."""
+        """Return the objects of the gateway that a part built for this plant may use."""
         folder, page = self.settings.folder, self.settings.page
         return PartContext(plant, self.hub, self.commands, self.ask, folder, self.version, page)
 
@@ -395,7 +395,7 @@ class Gateway:
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to the gateway."""
+    """A web server that does not install handlers of signals: the gateway handles these."""
 
     @contextmanager
     def capture_signals(self) -> Any:

@@ -1,4 +1,4 @@
-"""The historian: the part `history`, which records all rows and answers queries about them."""
+"""Historian: the gateway's part `history`, which records all rows and answers queries about them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MOST_BUCKETS = 200_000  # in one answer: enough for the page's 24 series on a sc
 
 @dataclass(frozen=True)
 class HistorySettings:
-    """The table `[serve.history]`. Raises ValueError with a line for each mistake."""
+    """The settings in the table `[serve.history]`. Raises ValueError with a line for each mistake."""
 
     folder: str = "history"
     keep: str = "30 days"
@@ -117,7 +117,7 @@ class Historian:
         return f"nothing is recorded: {trouble}" if trouble else ""
 
     def figures(self) -> list[MetricFamily]:
-        """Return rows written and rows lost since the start."""
+        """Return metrics: rows written and rows lost since the start."""
         state = self.state
         return [
             counter("multidrop_history_rows", "Rows written to the history.", state.rows),

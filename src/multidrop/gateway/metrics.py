@@ -122,5 +122,5 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Metric
 
 
 def counter(name: str, text: str, value: float) -> MetricFamily:
-    """Return a family of one count."""
+    """Return a metric family with a single counter."""
     return MetricFamily(name, "counter", text, [("_total", {}, value)])

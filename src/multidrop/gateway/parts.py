@@ -51,7 +51,7 @@ class PartContext(NamedTuple):
 
 
 class Part(Protocol):
-    """A part that was built.
+    """The methods of a part.
 
     Three more methods are optional: `adopt(plant)` is called after a reload, `health()` returns a problem or
     "", and `figures()` returns metric families.
@@ -78,7 +78,7 @@ class PartHost(Protocol):
 
 
 def build(name: str, settings: object, context: PartContext) -> Part:
-    """Return the part of this table. Raises ValueError if a library is missing, with the extra to install."""
+    """Return the part of this table. If a library is missing, raises ValueError that names the extra."""
     try:
         part: Part = import_module(PARTS[name]).build(settings, context)
     except ImportError as missing:
@@ -144,7 +144,7 @@ class LiveParts:
     # ---- reload ----
 
     async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> Replacement:
-        """Close the parts whose tables changed or are gone, and build the new ones.
+        """Close the parts whose tables were changed or removed, and build the new parts.
 
         Raises ValueError if one cannot be opened; the previous parts run again then.
         """

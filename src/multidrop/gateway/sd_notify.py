@@ -9,7 +9,7 @@ from contextlib import suppress
 
 
 class Notifier:
-    """The service manager's socket; without one all calls do nothing."""
+    """Sends messages to the service manager's socket; without a socket, all calls are ignored."""
 
     def __init__(self, address: str | None = None) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address

@@ -220,7 +220,7 @@ def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> lis
 
 
 def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
-    """Return the rights in the table; `look` is the default of its key `look`."""
+    """Return the rights in [serve.may]; the argument `look` is the default of the key `look`."""
     given = place.check(table, _MAY)
     for key in ("look", "stop"):
         if given.get(key, "anyone") not in ("anyone", "token"):
@@ -237,7 +237,7 @@ def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
 
 
 def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
-    """Return a part's settings; keys and types are those of its dataclass. None after a mistake."""
+    """Return a part's settings, checked by its dataclass of settings; None if there are mistakes."""
     made = import_module(PARTS[name]).Settings
     defaults = {one.name: _default(one) for one in fields(made) if one.init}
     keys = {name: _key_of(name, default) for name, default in defaults.items()}

@@ -102,9 +102,9 @@ class CommandDesk:
         return found._replace(gateway=self.gateway)
 
     async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
-        """Wait for the commands under way on a line that is being released.
+        """Wait for the commands in progress on a line that is being released.
 
-        Waits AWAITED_S at most, and only while `may_wait` returns True.
+        Wait for AWAITED_S at most, and only while `may_wait` returns True.
         """
         loop = asyncio.get_running_loop()
         ends = loop.time() + AWAITED_S
@@ -173,7 +173,7 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Return the checked request. Raises ValueError if the plant does not allow it."""
+    """Check a request, and return the command. Raises ValueError if the plant does not allow it."""
     drive = held.drive(request.drive)
     if request.verb == "stop":
         raise ValueError("a stop needs no offer: it goes to the line's own subject of stops")

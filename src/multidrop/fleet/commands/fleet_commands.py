@@ -1,4 +1,4 @@
-"""FleetCommands: ask the present master of a line for commands and stops, and follow them to their end."""
+"""FleetCommands: send commands and stops to the present master of a line, and wait for their results."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 def _ignore(answer: CommandAnswer) -> None:
-    """Ignore news; the caller only needs the answer at the end."""
+    """Ignore the progress of a stop: the caller needs only the final answer."""
 
 
 class FleetCommands:
@@ -97,7 +97,7 @@ class FleetCommands:
         return await self._offer(await self._line_of(request.drive), request)
 
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
-        """Write a register once; a choice by its name or its raw count.
+        """Write a register once. A named value is given by its name or its raw count.
 
         Raises ValueError if the drive is not in the plant, FleetError if the plant cannot be read.
         """
@@ -153,7 +153,7 @@ class FleetCommands:
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
 
     async def _do(self, offered: Offered) -> CommandAnswer:
-        """Confirm the offer once; from then on only ask for the result."""
+        """Confirm the offer once, and return the result; if no answer comes, only ask for the result."""
         path = self._path()
         try:
             message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
@@ -222,7 +222,7 @@ class FleetCommands:
     async def _lines_of(
         self, drives: Sequence[str] | None, line: str
     ) -> tuple[dict[str, list[str] | None], list[CommandAnswer]]:
-        """Return the drives to stop by line, and an answer for each that is not in the plant."""
+        """Return the drives to stop by line, and an answer for each drive that is not in the plant."""
         if line:
             return {line: None if drives is None else list(drives)}, []
         await self._read_plant(f"the stop was NOT sent; {HARD_WIRED}")
@@ -245,7 +245,7 @@ class FleetCommands:
         return found, unknown
 
     async def _stop(self, line: str, drives: list[str] | None, on_news: News, by: str) -> CommandAnswer:
-        """Send a stop until a gateway answers, and follow it to its end."""
+        """Send a stop until a gateway answers, and return the result when the stop has ended."""
         request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": by}
@@ -277,7 +277,7 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read changes of the plant; an older copy is good enough, because the line's master checks."""
+        """Read changes of the plant. If that fails, an older copy is enough: the line's master checks."""
         try:
             await self._plant.look()
         except FleetError as failure:

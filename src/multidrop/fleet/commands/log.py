@@ -32,7 +32,7 @@ class CommandLog:
         self._is_closed = False
 
     async def note(self, record: Mapping[str, Any]) -> None:
-        """Append a record with the time of day (UTC), and return when the disk has it.
+        """Append a record with the time of day (UTC), and return once it is synced to the disk.
 
         Raises OSError, also if the log is closed or the system has no thread left.
         """
@@ -61,7 +61,7 @@ class CommandLog:
 
 
 class UnopenedLog:
-    """A log that could not be opened: each record raises the reason."""
+    """A log that could not be opened: each `note` raises the reason."""
 
     def __init__(self, path: Path, failure: OSError) -> None:
         self.path = path

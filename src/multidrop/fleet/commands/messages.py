@@ -67,7 +67,7 @@ class CommandRequest(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the request as text."""
+        """Return the request as text, for logs and answers."""
         if self.register:
             return f"{self.entry} = {self.value}"
         options = ", ".join(f"{name} = {value}" for name, value in self.options.items())
@@ -97,7 +97,7 @@ def encode(message: NamedTuple) -> bytes:
 
 
 def read_json(data: bytes) -> dict[str, Any]:
-    """Return the JSON object of a message. Raises ValueError for any other."""
+    """Return the JSON object in a message. Raises ValueError if the message has none."""
     if len(data) > MOST_BYTES:
         raise ValueError(f"the message is longer than {MOST_BYTES} bytes")
     try:

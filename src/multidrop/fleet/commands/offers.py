@@ -36,14 +36,14 @@ class Prepared(NamedTuple):
 
 
 def commands_of(drive: Drive) -> list[str]:
-    """Return the verbs that a command may ask for; a stop needs no offer."""
+    """Return the verbs for which an offer can be made; a stop needs none."""
     return [verb for verb in verbs_of(drive) if verb != "stop"]
 
 
 def prepare(drive: Drive, request: CommandRequest) -> Prepared:
-    """Return the checked request; sends no frame.
+    """Check a request, and return the command, without sending a frame.
 
-    Raises ValueError (WriteForbidden is one), TypeError or Unsupported if it must not be sent.
+    Raises ValueError (WriteForbidden is one), TypeError or Unsupported if the command must not be sent.
     """
     return _prepare_write(drive, request) if request.register else _prepare_verb(drive, request)
 
@@ -112,7 +112,7 @@ class Offers:
         return len(self._by_token)
 
     def make(self, request: CommandRequest, prepared: Prepared, held: HeldLine) -> Offer:
-        """Return a new offer; for a copy of a request, the earlier one."""
+        """Return a new offer; for a copy of an earlier request, return the earlier offer."""
         known = self._by_request.get((held.name, request.id))
         if known is not None and known.request == request:
             return known
@@ -152,7 +152,7 @@ class Offers:
                 offer.why_void = offer.why_void or why
 
     def withdraw(self, offer: Offer, why: str) -> None:
-        """Withdraw an offer unless it was already taken."""
+        """Withdraw an offer, unless its command was started already."""
         if self.take(offer):
             self.end(
                 offer, CommandAnswer(CommandOutcome.NOT_SENT, f"{offer.request.words} was not sent: {why}")

@@ -102,16 +102,16 @@ class Lease:
 
     @property
     def is_over(self) -> bool:
-        """Return True if too few paths are left for this session to send again."""
+        """Return True if this session holds too few records to be renewed."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property
     def is_weak(self) -> bool:
-        """Return True if others have ended one of its paths: the loss of another path ends the session."""
+        """Return True if others have ended one of our records: the loss of another one ends the session."""
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
-        """Return True if all paths answer, so that a new session would have all three."""
+        """Return True if all paths answer, so that a new session would have three records."""
         records = await asyncio.gather(*(self._read(path) for path in range(len(self._buckets))))
         return None not in records
 
@@ -160,7 +160,7 @@ class Lease:
             return None
 
     def _is_free(self, path: int, record: Record) -> bool:
-        """Return True if the session in this record is over, or may be ended at this revision."""
+        """Return True if the session in this record has ended, or may be ended as stale or dead."""
         value = record.value
         if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
@@ -297,12 +297,12 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return a number that is at least that of every earlier session, also for an invalid record."""
+    """Return a number that is not less than any earlier session's number, even for an invalid record."""
     return int(record.value["session"]) if record.value else record.revision
 
 
 async def put_end(bucket: Bucket, end: Record) -> None:
-    """Replace our own record by the end of its session. Raises Conflict and FleetError as `put` does.
+    """Replace our own record by one that ends its session. Raises Conflict and FleetError as `put` does.
 
     A renewal that was cancelled may have been stored in the meantime. Replace that one too.
     """

@@ -188,7 +188,7 @@ class Member:
 
     @property
     def wanted(self) -> Mapping[str, str]:
-        """Return the gateway that each line is assigned to."""
+        """Return the name of the gateway that each line is assigned to."""
         return self._shares.wanted
 
     @property
@@ -248,7 +248,7 @@ class Member:
             raise Ended(f"{task.get_name()} has ended: {supervisor().dead[task.get_name()]}") from failure
 
     def end(self) -> None:
-        """Let `run` return; further calls have no effect."""
+        """Make `run` end and return; further calls have no effect."""
         self._over.set()
 
     def _works(self) -> dict[str, Coroutine[Any, Any, None]]:
@@ -319,7 +319,7 @@ class Member:
             await asyncio.sleep(GUARD_LOOK_S)
 
     def _keeps_leaders(self) -> bool:
-        """Return True if this gateway manages the buckets' leaders: the first one by name does."""
+        """Return True if this gateway manages the buckets' leaders: the first gateway by name does."""
         return self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name
 
     # ---- one step ----

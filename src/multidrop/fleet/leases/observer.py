@@ -45,9 +45,9 @@ class Observer:
         self._clock = clock
 
     def begin_anew(self) -> None:
-        """Restart all waiting times: while this gateway was cut off it saw no renewals.
+        """Restart all waiting times, because this gateway saw no renewals while it was cut off.
 
-        A session that was over before stays over, because it cannot be renewed.
+        A session that was over already stays over, because it cannot be renewed.
         """
         now = self._clock()
         for seen in self._watched:
@@ -107,7 +107,7 @@ class Observer:
         return found
 
     def missing(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway that others have ended and that did not leave by itself, with its record."""
+        """Return each gateway that did not end its session itself, but others did, with its record."""
         present = self.sessions()
         found = {}
         for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
@@ -120,7 +120,7 @@ class Observer:
         return found
 
     def weak(self) -> list[str]:
-        """Return the gateways whose session lost one path to others and continues on the rest."""
+        """Return the gateways whose session continues although others have ended one of its records."""
         return [
             name
             for name, value in self.sessions().items()

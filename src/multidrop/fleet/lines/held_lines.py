@@ -81,7 +81,7 @@ class HeldLines:
 
 
 def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:
-    """Return the permission lists of a line's record; an invalid list is empty: it allows no command."""
+    """Return the permission lists of a line's record; an invalid list counts as empty."""
     may = description.get("may")
     given = may if isinstance(may, dict) else {}
     return {key: _entries(given.get(key)) for key in LISTS}

@@ -120,7 +120,7 @@ class LineKeeper:
         return self._owners.is_mine(line)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return the records to write for the line to become ours; None if that is not possible now."""
+        """Return the records to write in order to claim the line; None if it cannot be claimed now."""
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
@@ -134,7 +134,7 @@ class LineKeeper:
         return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
-        """Wait for a line that cannot be closed, and raise its error: the process must end."""
+        """Wait forever; if a line cannot be closed, raise its error, so that the process ends."""
         await self._has_failed.wait()
         assert self._failure is not None
         raise self._failure
@@ -150,7 +150,7 @@ class LineKeeper:
     def reconcile(self) -> None:
         """Close lines that are no longer ours, open those that are, and release those that are closed.
 
-        If a line is to stay after all, but its release may have been stored, claim it again.
+        If a line should stay ours after all, but its release may have been stored, claim it again.
         """
         valid = self.may_poll
         kept = {
@@ -177,7 +177,7 @@ class LineKeeper:
             self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
 
     def _look_at_ports(self) -> None:
-        """Note which ports of polled lines are lost: after a while other gateways should take these lines."""
+        """Note which ports of polled lines are lost, because other gateways should take such lines later."""
         for line in self.polled.keys() - self._at_work.keys():
             if loss := self._port_loss(line):
                 why = loss.why or ("it is being reopened" if (loss.silent_ns or 0) > REPORTED_NS else "")

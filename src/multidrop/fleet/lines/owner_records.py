@@ -87,7 +87,7 @@ class OwnerRecords:
         return self._records.owned_by(*self._me)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return the records to write for the line to become ours; None if that is not possible."""
+        """Return the records to write in order to claim the line; None if it cannot be claimed."""
         is_over = self._records.observer.is_over
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
@@ -164,7 +164,7 @@ class OwnerRecords:
         self.moves += sum(not self._naming_us(line) for line in lines)
 
     def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
-        """Start to replace records, each in its bucket. Each bucket's task returns the refused lines."""
+        """Start a task for each bucket that replaces its records and returns the refused lines."""
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)

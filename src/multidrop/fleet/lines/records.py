@@ -57,7 +57,7 @@ class FleetRecords:
         }
 
     def _owner_follower(self, bucket: Bucket, on_take: OnTake) -> Follower:
-        """Return the follower of one bucket of masters; here it follows all lines."""
+        """Return the follower of one bucket of masters. In this class it reads the records of all lines."""
         return Follower(bucket, on_take)
 
     def of(self, line: str) -> LineRecords:
@@ -69,7 +69,7 @@ class FleetRecords:
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
-        """Return the plant's lines in order of name; the same tuple until one comes or goes."""
+        """Return the plant's lines in order of name; the same tuple until a line is added or removed."""
         return self._lines
 
     def is_in_plant(self, line: str) -> bool:
@@ -77,7 +77,7 @@ class FleetRecords:
         return bool(record and record.value and "line" in record.value)
 
     def owned_by(self, gateway: str, session: int) -> set[str]:
-        """Return the lines that at least one record names this session for."""
+        """Return the lines with at least one record that names this session."""
         return set(self._owned.get((gateway, session), ()))
 
     async def look(self) -> None:
@@ -88,7 +88,7 @@ class FleetRecords:
                 raise failure
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
-        """Return one coroutine for each bucket, which reads it forever: none waits for another."""
+        """Return one coroutine for each bucket, which reads it forever, so no bucket waits for another."""
         rests = {name: follower.rest for name, follower in {**self.owners, names.PLANT: self.plant}.items()}
         rests |= {name: partial(self.observer.rest, at) for at, name in enumerate(names.LEASES)}
         return [self._follow(name, rests[name]) for name in self._looks]
@@ -130,7 +130,7 @@ class FleetRecords:
             self._note_move(line)
 
     def _note_move(self, line: str) -> None:
-        """Note the line's master if it has changed, and its former master if no turn was missed."""
+        """Note a change of the line's master; the former one is known if the turn has increased by one."""
         record = self.owner(line)
         if not record:
             return
@@ -180,7 +180,7 @@ class ShareFollower(Follower):
         self._asked = None
 
     async def look(self) -> list[Record]:
-        """Read the unknown and changeable lines of the share, and return the changed records."""
+        """Read the records that are unknown or may change, and return those that have changed."""
         self._is_urgent.clear()
         asked = self._to_ask()
         changed: list[Record] = []

@@ -73,7 +73,7 @@ class UnopenedLines:
         self._lost_since.pop(line, None)
 
     def named(self) -> frozenset[str]:
-        """Return the lines that others should take. Call it often: it also starts trials."""
+        """Return the lines that others should take. Call this often, because it also starts trials."""
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:
             self._tried = ""

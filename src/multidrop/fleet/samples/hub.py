@@ -74,11 +74,11 @@ T = TypeVar("T")
 
 
 class SinkError(OSError):
-    """A sink that cannot be written now, or belongs to another hub. One sentence."""
+    """A sink cannot be written now, or belongs to another hub. The message is one sentence."""
 
 
 class NotThisHubs(SinkError):
-    """A sink of another stream or of another hub: a retry is useless."""
+    """The sink belongs to another stream or another hub, so a retry is useless."""
 
 
 class KeptPlace(NamedTuple):
@@ -89,7 +89,7 @@ class KeptPlace(NamedTuple):
 
 
 class Commit(NamedTuple):
-    """Rows to store together with their position, or not at all."""
+    """Rows and the position after them, which a sink must store together."""
 
     stream: str  # identity of the stream
     first: int  # position of the first message in the stream

@@ -151,7 +151,7 @@ _KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(),
 
 
 class MessageError(ValueError):
-    """Bytes that are not a message."""
+    """Raised for bytes that are not a valid message."""
 
 
 class Packed(NamedTuple):
@@ -170,7 +170,7 @@ class RowBuffer:
         self._columns = {name: bytearray() for name in _KINDS}
 
     def add(self, columns: BatchColumns) -> bool:
-        """Copy the rows; False if they are of another poller, whose codes have other meanings."""
+        """Copy the rows; return False if they are of another poller, whose codes have other meanings."""
         names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
         if any(not _continues(names[of], known) for of, known in self._names.items()):
             return False

@@ -169,7 +169,7 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
-    """Merge the files of past hours, and create tens for plots, until cancelled. Needs duckdb.
+    """Merge the files of past hours and create the files in `tens` for plots, until cancelled; needs duckdb.
 
     The work is done by a child process of low priority, which may be killed at any time.
     """

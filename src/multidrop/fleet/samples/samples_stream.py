@@ -47,7 +47,7 @@ SENTENCES = {  # error messages by code
 
 
 class StreamError(OSError):
-    """NATS cannot be reached, refuses a request, or has no such stream. One sentence."""
+    """NATS cannot be reached, refuses a request, or has no such stream. The message is one sentence."""
 
 
 class StreamAbout(NamedTuple):

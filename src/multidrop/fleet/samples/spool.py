@@ -44,7 +44,7 @@ class SpoolError(ValueError):
 
 
 class StoredMessage(NamedTuple):
-    """A message in a file."""
+    """A message in the spool's folder, and its file."""
 
     sequence: int
     rows: int
@@ -91,7 +91,7 @@ class SpoolFolder:
             self._lock = -1
 
     def _head(self, wanted: dict[str, str]) -> str:
-        """Return the log's id: the folder's, or a new one for an empty folder."""
+        """Return the log's id from the folder's `spool.json`; create both in an empty folder."""
         path = self.path / HEAD
         if not path.exists():
             others = sorted(one.name for one in self.path.iterdir() if not one.name.startswith("."))
@@ -310,7 +310,7 @@ class Spool:
             return SpoolState(self.log, *counts, self._acknowledged, self._stored, self._trouble)
 
     def close(self) -> None:
-        """Write the waiting rows, and end; wait for the disk for at most 10 s."""
+        """Write the waiting rows and stop the thread; wait at most 10 s for the disk."""
         with self._changing:
             self._over = True
             self._changing.notify_all()

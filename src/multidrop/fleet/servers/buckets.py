@@ -125,7 +125,7 @@ class Bucket:
         self._strange: set[str] = set()  # keys with an invalid record that was logged
 
     async def put(self, key: str, value: Any, revision: int) -> int:
-        """Replace the record at exactly this revision, and return the new one.
+        """Replace the record if it has exactly this revision, and return the new revision.
 
         Raises Conflict if it has another revision, Unsure if the outcome is unknown.
         """

@@ -139,7 +139,7 @@ class ServerPath:
             self._client, self.url = None, ""
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Call a coroutine function with each message, whichever server this path moves to."""
+        """Call a coroutine function with each message of a subject, even after a move to another server."""
         self._wanted[subject] = called
         await self._follow_wanted()
 
@@ -233,7 +233,7 @@ class ServerPath:
 
 
 async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> BatchClient:
-    """Connect to exactly this server. Raises FleetError, in one sentence."""
+    """Connect to this server, and to no other of its cluster. Raises FleetError with one sentence."""
     refusals: list[Exception] = []
     noted = denials or Denials()
 
@@ -286,7 +286,7 @@ def _cut(client: BatchClient) -> None:
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
-    """Return three paths, each with another server as its home if there are enough."""
+    """Return three paths. Each has a different home server if there are three URLs."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
         path.others, path.spare = [other for other in paths if other is not path], paths[0].spare

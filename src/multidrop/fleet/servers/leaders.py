@@ -55,7 +55,7 @@ class Cluster(NamedTuple):
     followers: tuple[Replica, ...] = ()
 
     def home_of(self, place: int) -> str:
-        """Return the server that should lead bucket number `place`: servers take turns in order of name."""
+        """Return the server that should lead bucket number `place`; servers take turns in order of name."""
         servers = sorted([self.leader, *(follower.name for follower in self.followers)])
         return servers[place % len(servers)]
 
@@ -202,7 +202,7 @@ class LeaseTerms:
 
 
 async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
-    """Hand a bucket over, and return True once this server leads it."""
+    """Hand a bucket over to this server; return True once the server leads it, False after HANDED_S."""
     await hand_over(path, bucket, server)
     with suppress(TimeoutError):
         async with asyncio.timeout(HANDED_S):

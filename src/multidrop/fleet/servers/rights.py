@@ -172,7 +172,7 @@ def accounts(rights: Mapping[str, UserRights], public: Mapping[str, str]) -> Ite
 
 
 def account_of(user: str) -> str:
-    """Return the name of a user's account, never that of the store."""
+    """Return the name of a user's account, which always differs from the store's."""
     return f"{STORE}-{user}"
 
 
@@ -190,7 +190,7 @@ def _import(kind: str, account: str, subject: str) -> str:
 
 
 def _shared(some: Iterable[str], others: Iterable[str]) -> Iterator[str]:
-    """Yield the subjects that match both lists; * matches any one word."""
+    """Yield each subject that matches an entry of both lists; * matches one word."""
     for one in some:
         for other in others:
             words = list(zip(one.split("."), other.split("."), strict=False))

@@ -27,7 +27,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
-    """Create missing buckets, and return a summary. Raises FleetError, in one sentence.
+    """Create missing buckets, and return a summary. Raises FleetError with one sentence.
 
     Existing buckets stay as they are. Creating some requires all servers to answer.
     """
@@ -79,7 +79,7 @@ async def check_buckets(path: ServerPath) -> None:
 
 
 async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
-    """Return the state of a bucket once it has a leader: it has none while it moves or is elected."""
+    """Return the state of a bucket once it has a leader. It has none during a move or an election."""
     while True:
         try:
             info = await ask(path, f"STREAM.INFO.KV_{bucket}")
@@ -110,7 +110,7 @@ def check_clock(path: ServerPath, server_time: Any) -> None:
 
 
 def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
-    """Return the error for servers that cannot decide anything."""
+    """Return the error for servers without a quorum."""
     if isinstance(failure, NobodyThere):
         return FleetError(
             f"no JetStream answers at {path.url}: the configuration of each server needs "
@@ -123,7 +123,7 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
 
 
 async def _kept_on(path: ServerPath) -> int:
-    """Return the least number of servers that keep a bucket; 0 if one is missing."""
+    """Return the least number of servers that store one of the buckets; 0 if a bucket is missing."""
     kept = []
     for bucket in names.BUCKETS:
         info = await _info(path, f"KV_{bucket}")
@@ -182,7 +182,7 @@ async def _try(
 
 
 async def _wait_for_plant(path: ServerPath) -> None:
-    """Wait until the plant can be read: for a moment no server answers for a new bucket."""
+    """Wait until the plant can be read: just after a bucket's creation no server answers for it."""
     ends = asyncio.get_running_loop().time() + WAIT_S
     while True:
         try:

@@ -41,7 +41,7 @@ _WHY = {
 
 
 class Rank(IntEnum):
-    """The order in which connections are closed at the limit; within a rank the oldest goes first."""
+    """The order in which connections are closed at MOST_OPEN; within a rank, the oldest is closed first."""
 
     GREEDY = 0  # the client sends requests ahead of its answers, or reads none
     IDLE = 1
@@ -108,14 +108,14 @@ class Connections:
                 self._end(client)
 
     def begin(self, client: tuple[str, int] | None) -> None:
-        """Note that a request is complete."""
+        """Note that a request has arrived completely."""
         if client in self._open:
             self._open[client].is_busy = True
 
     def is_stop(self, client: tuple[str, int] | None, path: str) -> bool:
-        """Return, and note, whether a new request may be a stop.
+        """Note and return whether a new request may be a stop.
 
-        A verb does not count while its client sends requests ahead of its answers.
+        A verb does not count as one while its client sends requests without waiting for answers.
         """
         found = self._open.get(client) if client else None
         is_stop = path in STOP_PATHS or (path == VERB_PATH and not (found and found.is_greedy))
@@ -124,7 +124,7 @@ class Connections:
         return is_stop
 
     def note_greed(self, client: tuple[str, int] | None, *, is_greedy: bool) -> None:
-        """Note whether the client sends requests ahead of its answers."""
+        """Note whether the client sends requests without waiting for answers."""
         if client in self._open:
             self._open[client].is_greedy = is_greedy
 
@@ -177,7 +177,7 @@ class Turns:
         self._is_taken = False  # a request was started in this round
 
     async def wait(self, waiting: deque[asyncio.Future[None]]) -> None:
-        """Wait for a turn in this queue."""
+        """Wait until a request in the queue `waiting` may start."""
         loop = asyncio.get_running_loop()
         if self._is_taken:
             turn: asyncio.Future[None] = loop.create_future()
@@ -198,7 +198,7 @@ class Turns:
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that notes if its client sends requests ahead of its answers, or does not read them."""
+    """A connection that notes whether its client waits for answers between requests, and reads them."""
 
     @property
     def _connections(self) -> Connections:

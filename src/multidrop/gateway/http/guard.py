@@ -52,7 +52,7 @@ class Needed(NamedTuple):
 
 
 class Guard:
-    """Lets a request through to `app` with its caller in the scope's `caller`, or answers it."""
+    """Passes an allowed request to `app`, with its caller in the scope's `caller`; refuses any other."""
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class Guard:
         return self._admit(scope, headers, needed.right)
 
     def _find(self, path: str) -> Needed:
-        """Return the requirement of the longest listed prefix of a path."""
+        """Return what a path needs: the entry of its longest prefix in `needed`."""
         while path not in self._needed:
             head, slash, _ = path.rstrip("/").rpartition("/")
             if not slash:
@@ -192,7 +192,7 @@ def _length(scope: Scope) -> int:
 
 
 def _secret(headers: Headers) -> tuple[str, str]:
-    """Return the token in a request, and its sender: "http" for a program, "page" for the page."""
+    """Return the token in a request, and the way of its sender: "http" for a program, or "page"."""
     scheme, _, secret = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return secret.strip(), "http"

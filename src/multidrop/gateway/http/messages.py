@@ -21,7 +21,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Denied(Exception):
-    """A refused request: HTTP status and a sentence."""
+    """Raised to refuse a request, with the HTTP status and a sentence for the answer."""
 
     def __init__(self, status: int, sentence: str) -> None:
         super().__init__(sentence)
@@ -43,7 +43,7 @@ def caller_of(request: Request) -> Caller:
 
 
 async def body_of(request: Request, seconds: float | None = None) -> dict[str, Any]:
-    """Return the JSON object in the body. Raises Denied if it is another type, too long or late."""
+    """Return the JSON object in the body. Raises Denied if it is invalid, too long or too late."""
     data = bytearray()
     seconds = BODY_S if seconds is None else seconds
     try:

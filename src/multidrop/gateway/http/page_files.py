@@ -40,7 +40,7 @@ class PageFiles:
         self._files: dict[str, PageFile] = {}
 
     async def index(self, request: Request) -> Response:
-        """Return the page itself. Raises Denied if this installation has none, Hung if the disk hangs."""
+        """Return index.html. Raises Denied if this installation has no page, Hung if the disk hangs."""
         return await self._respond(request, INDEX)
 
     async def file(self, request: Request) -> Response:

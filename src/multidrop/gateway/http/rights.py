@@ -142,7 +142,7 @@ class Tokens:
 
 
 class May(NamedTuple):
-    """The table [serve.may]: the right of callers without a token, and which writes and verbs are allowed."""
+    """The table [serve.may]: the rights of callers without a token, and the allowed writes and verbs."""
 
     look: str = "anyone"  # who may look: "anyone", or "token" for callers with a token
     on_loopback: Right = Right.LOOK  # right of callers on this computer without a token
@@ -173,7 +173,7 @@ def is_loopback(host: str) -> bool:
 
 
 class OwnNames:
-    """The host names of the gateway; a page under any other name is foreign."""
+    """The host names of the gateway; requests to other names, or from pages of other names, are refused."""
 
     def __init__(self, names: Iterable[str], listen: str, port: int) -> None:
         self._always = {"localhost", "127.0.0.1", "[::1]"}

@@ -76,7 +76,7 @@ _GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
 
 
 def make_app(gateway: Gateway) -> ASGIApp:
-    """Return the whole application."""
+    """Return the ASGI application of all routes, behind the guard."""
     pages, files = _Pages(gateway), PageFiles()
     routes = [
         Route("/", files.index),
@@ -110,7 +110,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
     frames = FrameRoute(gateway.frames)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer requests for frames without the router: they are by far the most frequent."""
+        """Answer requests for frames without the router, because they are by far the most frequent."""
         await (frames if scope["path"] == "/api/frame" else others)(scope, receive, send)
 
     return Guard(
@@ -159,7 +159,7 @@ async def _body_of(task: asyncio.Task[Response]) -> AsyncIterator[bytes]:
 
 
 class _Pages:
-    """The routes' functions."""
+    """The functions that answer the routes."""
 
     def __init__(self, gateway: Gateway) -> None:
         self._gateway = gateway
@@ -278,7 +278,7 @@ class _Pages:
     async def _answer_stop(self, work: Coroutine[Any, Any, Response]) -> Response:
         """Return the answer to a stop, which continues even if its client disconnects.
 
-        If the stop takes longer than HEAD_S, the answer starts before its end. A client that receives no head
+        If the stop takes longer than HEAD_S, the answer starts before its end. A client that gets no head
         knows that its stop was not accepted.
         """
         task = supervisor().start("stop", work)
@@ -328,7 +328,7 @@ class _Pages:
     async def token(self, request: Request) -> Response:
         """Store a token in a cookie that scripts cannot read.
 
-        After several wrong tokens an address must wait, except to send a stop.
+        After several wrong tokens, an address must wait before the next, except for a token for a stop.
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)
@@ -355,7 +355,7 @@ class _Pages:
 
 
 class FrameRoute:
-    """Answers `/api/frame?after=N` as soon as there is a frame other than the N-th."""
+    """Answers `/api/frame?after=N` as soon as the newest frame is not the N-th."""
 
     def __init__(self, frames: Frames) -> None:
         self._frames = frames

@@ -110,7 +110,7 @@ class Alarms:
         self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
-        """Note why a line's port is lost; None: it is present."""
+        """Note why a line's port is lost; None means that it is present."""
         if lost is None:
             self._end(time, line, "", PORT)
         else:
@@ -162,7 +162,7 @@ class Alarms:
                 self._take_up(alarm, time, names)
 
     def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
-        """Continue an alarm of an earlier run unless it is known to be over."""
+        """Continue an alarm of an earlier run, or end it if it is over or its drive or line is gone."""
         key = _key(alarm)
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
@@ -182,7 +182,7 @@ class Alarms:
         return [*self.lasting, *sorted(ended, key=lambda alarm: -alarm.time)]
 
     def between(self, begin: int, end: int) -> list[Alarm]:
-        """Return the alarms between two times, newest first."""
+        """Return the alarms that were active between two times (UTC, ms), newest first."""
         found = [one for one in (*self._lasting.values(), *self._ended) if one.time <= end]
         return sorted(
             (one for one in found if one.ended is None or one.ended >= begin), key=lambda alarm: -alarm.time

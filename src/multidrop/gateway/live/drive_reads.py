@@ -66,7 +66,7 @@ class SideReads:
         return len(self._tasks)
 
     def begin_anew(self) -> None:
-        """Cancel all reads: names may mean other drives now."""
+        """Cancel all reads after a reload, because names may mean other drives now."""
         for task in self._tasks.values():
             task.cancel()
         self._tasks.clear()

@@ -35,7 +35,7 @@ ANOTHER_PLANT = "the plant was read anew"
 
 
 class Encoded(NamedTuple):
-    """A frame as it is sent: whole, or the changes since another one."""
+    """A frame as it is sent: the whole frame, or only its changes since an earlier one."""
 
     n: int
     plain: bytes
@@ -124,7 +124,7 @@ def _finite(value: float) -> float | None:
 
 
 def lost_of(hub: Hub, line: str) -> str | None:
-    """Return why a line's port is lost, if all its newest rows say so; None otherwise.
+    """Return why a line's port is lost; None unless the newest rows of all its registers have that status.
 
     If the port could not be opened, the reason is the system's message.
     """
@@ -141,7 +141,7 @@ def lost_of(hub: Hub, line: str) -> str | None:
 
 
 def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of `now` whose values differ from `before`, which has the same keys.
+    """Return the entries of `now` whose values differ from those of `before`, which has the same keys.
 
     Nested objects are compared in the same way.
     """
@@ -224,7 +224,7 @@ class Frames:
         return self._since(n)
 
     def close(self) -> None:
-        """Answer all waiting viewers without a frame."""
+        """Answer all waiting viewers now, without a frame."""
         self._is_closed = True
         self._wake()
 

@@ -37,7 +37,7 @@ _ANSWERED = ("exception ", "no valid value")  # prefixes of the status of a miss
 
 
 class RegisterRows:
-    """One register of one drive."""
+    """The newest rows of one register of one drive."""
 
     __slots__ = ("good", "intervals_ns", "least_ns", "newest", "since_ns")
 
@@ -127,7 +127,7 @@ class _Trip(NamedTuple):
 
 
 class _Watched:
-    """One drive of the plant."""
+    """One drive of the plant, with its registers' rows and its fault record."""
 
     def __init__(self, polled: PolledDrive, cycle_ns: int, since_ns: int) -> None:
         self.polled = polled
@@ -140,7 +140,7 @@ class _Watched:
         self.cells: dict[str, RegisterRows] = {}
 
     def cell(self, register: str) -> RegisterRows:
-        """Return the cell of a register; make it if it is new."""
+        """Return the rows of a register; add an empty object for a new register."""
         if register not in self.cells:
             every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
             least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
@@ -313,7 +313,7 @@ class Hub:
         return self.seen(drive).state
 
     def seen(self, drive: str) -> Shown:
-        """Return a drive's state with its fault or the reason of its silence."""
+        """Return a drive's state, with the text of its fault or the reason of its silence."""
         watched = self._watched.get(drive)
         return Shown(UNKNOWN, None) if watched is None else self._look(watched)
 
@@ -385,7 +385,7 @@ def _lack(watched: _Watched) -> str:
 
 
 def _look_for_trip(watched: _Watched) -> None:
-    """Note a fault shown by a change of the fault record; a record from before polling may be old."""
+    """Note a fault that a change of the fault record shows. The first record read may be of an old fault."""
     name = next((name for name in FAULT_RECORDS if name in watched.names), "")
     cell = watched.cells.get(name)
     if cell is None or cell.good is None:

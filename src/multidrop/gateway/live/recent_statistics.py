@@ -125,7 +125,7 @@ class RecentStatistics:
 
 
 def _counts_on(before: PlantLine, line: PlantLine) -> bool:
-    """Return True if port and drives are the same: their counters continue."""
+    """Return True if a line has the same port and drives as before, so its counters continue."""
     drives = [[polled.drive for polled in one.drives] for one in (before, line)]
     is_same = len(drives[0]) == len(drives[1]) and all(a is b for a, b in zip(*drives, strict=True))
     return is_same and replace(before, drives=()) == replace(line, drives=())

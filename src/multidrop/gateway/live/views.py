@@ -64,7 +64,7 @@ def _usual_delays(statistics: Statistics) -> dict[str, float | None]:
 
 
 async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
-    """Return the EEPROM wear; an empty list if the ledger's file is locked or its disk hangs."""
+    """Return a drive's EEPROM wear; an empty list if the ledger's file is locked or its disk hangs."""
     with contextlib.suppress(Hung):
         return await supervisor().within("ledger", LEDGER_S, partial(_wear, ledger, port, drive))
     return []
@@ -163,7 +163,7 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 
 def troubles_of(gateway: Gateway) -> list[str]:
-    """Return a sentence for each problem other than a lost line, for the page."""
+    """Return a sentence for the page about each problem other than a lost line."""
     said = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
     said |= supervisor().hung | supervisor().dead
     said |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}

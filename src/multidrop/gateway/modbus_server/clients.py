@@ -1,7 +1,7 @@
 """Connections of Modbus TCP clients.
 
-Requests are always read, even if a client does not take its answers: a stop waits neither for earlier
-requests nor until its client reads.
+Requests are always received, even from a client that does not read its answers. So a stop waits neither for
+earlier requests nor until its client reads.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class ModbusClient(asyncio.Protocol):
 
     @property
     def is_full(self) -> bool:
-        """True while MOST_UNDER_WAY of its requests wait for lines."""
+        """True while MOST_UNDER_WAY of this client's requests wait for lines."""
         return len(self._under_way) >= MOST_UNDER_WAY
 
     @property
@@ -163,7 +163,7 @@ class ModbusClient(asyncio.Protocol):
         self._came.clear()
 
     def _answer_some(self) -> bool:
-        """Answer pending requests; return True if more of them could be answered."""
+        """Answer queued requests until the turn ends; return True if more of them can be answered."""
         begun = self._port.clock()
         answers: list[bytes] = []
         for _ in range(SLICE):
@@ -233,7 +233,7 @@ class ModbusClient(asyncio.Protocol):
 
 
 class RoundShare:
-    """The time of one round of the loop, divided among the busy clients of all ports."""
+    """Divides the time of one round of the event loop among the busy clients of all ports."""
 
     def __init__(self) -> None:
         self._busy: set[ModbusClient] = set()
@@ -309,7 +309,7 @@ class ModbusPort:
         self.clients.discard(client)
 
     def sweep(self) -> None:
-        """Close clients that are idle too long or do not read their answers."""
+        """Close clients that are idle for too long, or do not read their answers."""
         now = self.clock()
         for client in list(self.clients):
             if client.stalled_for(now) >= STALLED_S:

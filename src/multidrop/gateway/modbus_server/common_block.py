@@ -44,7 +44,7 @@ class CommonBlock:
         )
 
     def words(self, hub: CommonSource, now_ns: int) -> list[int]:
-        """Return the present words."""
+        """Return the words of the block at the monotonic time `now_ns`."""
         state, woke_ns = hub.state(self._name), hub.woke_ns()
         words = [0] * COMMON_LENGTH
         words[STATE] = STATES.get(state, 0)

@@ -90,7 +90,7 @@ class LineShare:
     # ---- turns ----
 
     def _step(self) -> None:
-        """Start the next request, now or when line time is available."""
+        """Start the next request now, or as soon as line time is available."""
         if self._running is not None or not self._waiting:
             return
         now = self._loop.time()

@@ -49,11 +49,11 @@ class MbapRequest(NamedTuple):
     data: bytes  # after the function code
 
     def reply(self, data: bytes) -> bytes:
-        """Return the frame of a good reply."""
+        """Return the frame of a normal reply."""
         return _HEADER.pack(self.transaction, 0, 2 + len(data), self.unit) + bytes([self.function]) + data
 
     def exception(self, code: int) -> bytes:
-        """Return the frame of an exception."""
+        """Return the frame of an exception reply."""
         return _HEADER.pack(self.transaction, 0, 3, self.unit) + bytes([self.function | 0x80, code])
 
 
@@ -198,7 +198,7 @@ def _one_word(request: MbapRequest) -> WriteRequest:
 
 
 def _several(carrier: Carrier, request: MbapRequest) -> WriteRequest:
-    """Return the words or bits that functions 15 and 16 write."""
+    """Return the words or bits that a request of function 15 or 16 writes."""
     if len(request.data) < 5:
         raise Declined(ModbusCode.ILLEGAL_VALUE)
     address, count, size = struct.unpack_from(">HHB", request.data)

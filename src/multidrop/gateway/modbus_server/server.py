@@ -92,7 +92,7 @@ class ModbusServer:
     # ---- start and end ----
 
     def listen(self) -> None:
-        """Open all ports, or none. Raises OSError for the first that cannot be opened."""
+        """Open all ports, or none. Raises OSError for the first port that cannot be opened."""
         for line, number in {MAIN: self.settings.port, **self.settings.ports}.items():
             try:
                 self._sockets[line] = listen(self.settings.host, number)
@@ -203,7 +203,7 @@ class ModbusServer:
     def _pass(
         self, unit: Unit, request: MbapRequest, addresses: range, lack: Lack, client: ModbusClient
     ) -> Awaitable[bytes]:
-        """Read from the drive itself, if the settings allow it."""
+        """Pass a read on to the drive itself, if the settings allow it."""
         passing = self.settings.passing
         if passing == "off" and lack is Lack.UNPOLLED:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)

@@ -21,7 +21,7 @@ _STOPS = ("stop", "coast", "emergency_stop")
 
 
 class StopWrite(NamedTuple):
-    """A write by which the drive's own verbs stop the motor: register name and raw count."""
+    """A register's name and a raw count: writing that count is how a verb of the drive stops the motor."""
 
     register: str
     raw: float

@@ -100,7 +100,7 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
-    """Return the next counts below and above."""
+    """Return the counts just below and above a count."""
     if number_format not in _FLOATS:
         return (raw - 1, raw + 1)
     as_float, as_bits = _FLOATS[number_format]
@@ -110,7 +110,7 @@ def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
 
 
 class _Place:
-    """A register with the words of its latest value."""
+    """A polled register, with the words computed from its latest value."""
 
     __slots__ = ("_data", "_register", "_value", "name")
 

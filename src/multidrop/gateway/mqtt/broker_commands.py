@@ -39,7 +39,7 @@ class BrokerCommands:
         self._under_way = 0
 
     def stop(self, drives: Sequence[str] | None) -> None:
-        """Stop these drives, or all."""
+        """Stop these drives, or all drives if None."""
         self._begin(self._stop(drives))
 
     def stop_by(self, drive: str, verb: str, options: Mapping[str, object]) -> None:

@@ -55,7 +55,7 @@ class RetainedTopics:
         self.begin()
 
     def begin(self) -> None:
-        """Start again on a new connection."""
+        """Forget what the previous connection showed; called on a new connection."""
         self._is_alone = False  # no other gateway is online with this prefix
         self._found: list[KeptTopic] = []
         self._looked_at = 0

@@ -117,7 +117,7 @@ class SparkplugNode:
                 self._put(drive, "DDATA", self._data)
 
     def pass_over(self) -> int:
-        """Return how many drives have changed since the last call."""
+        """Return how many drives have changed values since the last call, without publishing them."""
         values = {drive: self._values(drive) for drive in self._hub.drives}
         changed = [drive for drive, found in values.items() if self._said.get(drive) != found]
         self._said = values
@@ -207,7 +207,7 @@ class SparkplugNode:
         return register.value_unit if register and register.values is None else ""
 
     def _register(self, drive: str, name: str) -> Register[Any] | None:
-        """Return the register of a metric; None for the metrics of every drive."""
+        """Return the register of a metric; None for "state" and "fault", which every drive has."""
         return None if name in OWN else self._registers(drive)[name.removeprefix(REGISTERS)]
 
     def _alias(self, drive: str, name: str) -> int:
