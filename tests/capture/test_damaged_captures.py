@@ -78,7 +78,7 @@ def block(kind: int, body: bytes) -> bytes:
 
 
 def packet(interface: int, content: bytes, told: int | None = None) -> bytes:
-    """An enhanced packet block; `told` is its length as it says itself."""
+    """An enhanced packet block; `told` is the length in its header."""
     length = len(content) if told is None else told
     return block(6, struct.pack("<5I", interface, 0, 0, length, length) + content + bytes(-len(content) % 4))
 
@@ -199,7 +199,7 @@ OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024
 
 @pytest.mark.slow
 def test_a_capture_that_is_cut_short_while_it_is_read_is_a_sentence(tmp_path: Path) -> None:
-    """In a process of its own: where the file is mapped, the end of its bytes is the end of the process."""
+    """In a separate process: if the file were mapped, reading past its new end would kill the process."""
     path = write(tmp_path / "it.pcapng", RTU * 20)
     code = (
         "import os, sys\nfrom multidrop.capture import Capture, CaptureError\n"

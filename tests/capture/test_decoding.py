@@ -130,7 +130,7 @@ def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> No
 
 
 def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -> Path:
-    """A capture of them, one in every 2 ns."""
+    """Return a capture of these frames, one every 2 ns."""
     with CaptureWriter(path) as capture:
         for number, (asked, reply) in enumerate(exchanges):
             capture.write(build_request(Framing.RTU, asked), Side.ASKING, 2 * number, "hall-1")

@@ -57,7 +57,7 @@ class RoughWire(LateWire):
 
 
 class EchoingWire(RoughWire):
-    """And behind an adapter that echoes what it sends."""
+    """The same line behind an adapter that echoes each request."""
 
     _echo = b""
 

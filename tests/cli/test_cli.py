@@ -577,7 +577,7 @@ def test_a_closed_standard_stream_is_not_a_failure(closed: int, words: list[str]
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [0, 1, 2])
 def test_no_file_is_opened_in_the_place_of_a_closed_stream(closed: int) -> None:
-    """A serial port there would get what is printed."""
+    """A serial port with that descriptor would receive the printed output."""
     code = (
         "import os, multidrop.cli as cli; cli.main(['--version']); os._exit(os.open(os.devnull, os.O_RDONLY))"
     )

@@ -47,7 +47,7 @@ DOG = "watchdog: The document names no watchdog: the motor runs on when the clie
 
 
 class Stubborn(SimulatedDrive):
-    """Never takes more than 20 s of acceleration, and does not tell its fault."""
+    """Limits acceleration times to 20 s, and does not report its fault."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         return min(raw, 200) if cell.name == "acceleration_time" else super().accept(cell, raw)
@@ -218,7 +218,7 @@ def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
 def test_a_value_between_two_steps_is_rounded_with_a_warning(
     run: Run, port: str, toy: SimulatedDrive
 ) -> None:
-    """Before it is sent, and in what is said to be done."""
+    """The rounded value is sent and reported."""
     note = "multidrop: frequency has steps of 0.01 Hz: 12.345 becomes 12.34 Hz\n"
     assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
         0,
@@ -468,7 +468,7 @@ def test_an_interrupted_start_reports_requests_and_the_stop_command(run: Run, ch
 
 
 def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have Ctrl-C pressed where a bus is opened or closed."""
+    """Press Ctrl-C when a bus is opened or closed."""
     carry_out = getattr(Bus, place)
 
     def pressed(*args: Any, **details: Any) -> None:

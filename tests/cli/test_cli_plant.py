@@ -322,7 +322,7 @@ def test_a_simulated_plant_of_another_family_resolves_models_from_the_plant_file
 
 
 def test_every_guard_is_the_one_of_port_model_address(run: Run, plant: Path, at: str, port: str) -> None:
-    """The two ways to name a drive differ in nothing but its name."""
+    """Both ways to name a drive have the same guards."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),
         ("write", ("sealed", "1", "--yes")),

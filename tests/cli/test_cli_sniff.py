@@ -134,7 +134,7 @@ def test_bytes_that_came_while_the_machine_was_busy_are_no_silence(
         port, stream = "line", Stream()
 
         def receive(self) -> int:
-            """A request after 2 s, nothing for 0.05 s, and its reply."""
+            """Return a request after 2 s, no bytes for 0.05 s, and then the reply."""
             nonlocal now
             said, seconds = next(coming, (b"", 1.0))
             now += seconds
@@ -153,7 +153,7 @@ def test_bytes_that_came_while_the_machine_was_busy_are_no_silence(
 
 
 class ResponderLine:
-    """A line at the far end of a connection: says the same again and again, and keeps what it is told."""
+    """A far end that sends the same bytes again and again, and stores the bytes that it receives."""
 
     def __init__(self, said: bytes) -> None:
         self._said = said
@@ -286,7 +286,7 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
-    """Return what `decode` says of a capture of these, one in every ms, without its times of day."""
+    """Return the output of `decode` for a capture of these frames, one every ms, without times of day."""
     with CaptureWriter(path) as writer:
         for number, (raw, side) in enumerate(frames):
             writer.write(raw, side, number * 1_000_000, "hall-1")
@@ -403,7 +403,7 @@ def test_a_port_in_use_is_one_sentence(run: Run) -> None:
 
 
 def test_missing_permission_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever is root has every permission: the system's refusal is played."""
+    """Root has every permission, so the system's refusal is simulated."""
 
     def refuse(path: str, flags: int) -> int:
         raise PermissionError(13, "Permission denied", path)

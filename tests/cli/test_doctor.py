@@ -51,7 +51,7 @@ REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 
 
 def ended(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
-    """Return the result of the request that nobody should answer."""
+    """Return the result of the request that no drive should answer."""
     reply = Message(0xF7, 3, exception=exception)
     return completed(result, reply, raw, at_ns=1, skipped=skipped)
 
@@ -388,7 +388,7 @@ def test_an_echo_is_looked_for_with_the_line_s_settings(run: Run, port: str) -> 
 
 
 class Responder:
-    """A line of which every request is noted, and answered or not."""
+    """A line that records every request and answers with `answer`, which may return no bytes."""
 
     def __init__(self, answer: Callable[[bytes], bytes]) -> None:
         self.requests: list[bytes] = []
@@ -500,7 +500,7 @@ def test_a_refusing_drive_is_present_and_its_code_is_printed(run: Run, responder
 
 @pytest.mark.slow
 def test_only_sent_requests_are_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A silent drive is not asked again while its late answer may come; that was no request."""
+    """A silent drive gets no request while a late reply may come; a skipped request does not count."""
     end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")

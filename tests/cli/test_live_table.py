@@ -26,7 +26,7 @@ def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> list[str]:
-    """Return what is written at each width in turn."""
+    """Return the output for each width in turn."""
     path = tmp_path / "plant.toml"
     drive = f'[[line.drive]]\nname = "{WIDE_NAME}"\nmodel = "invt-che"\naddress = 1\n'
     path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{drive}poll = ["output_frequency"]\n', "utf-8")

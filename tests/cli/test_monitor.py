@@ -82,7 +82,7 @@ def row(drive: str, register: str, value: float | None, status: str = "ok", ago:
 
 
 def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) -> dict[str, LineStatistics]:
-    """All of it is that of the first drive."""
+    """Return statistics of a line on which only the first drive has counts."""
     busy = Counters(
         sent=exchanges,
         ideal_ns=round(utilisation * seconds * SECOND),
@@ -405,7 +405,7 @@ def test_a_key_whose_bytes_come_apart_is_one_key(
 
 
 class Poller:
-    """Notes what is asked of its bus."""
+    """A poller that records the calls of its bus."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
@@ -502,7 +502,7 @@ def test_all_lines_are_sent_their_stops_before_one_is_waited_for_without_threads
 
 
 def seen(monitor: Any) -> str:
-    """All that stands on the screen."""
+    """Return the text on the screen."""
     return "\n".join(line.rstrip() for line in monitor._picture().plain.split("\n"))
 
 
@@ -629,7 +629,7 @@ def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_terminal_that_is_gone_is_not_read_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its reads end at once, with nothing or a failure; no signal need come."""
+    """Its reads return at once, without bytes or with an error; there may be no signal."""
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)
         monkeypatch.setattr(sys, "stdin", stdin)

@@ -155,7 +155,7 @@ class Damage:
         return bytes(damaged)
 
     def exchanges(self) -> list[tuple[bool, tuple[str, ...]]]:
-        """Return each exchange's frames, and True where it is whole."""
+        """Return each exchange's frames, and True if it is undamaged."""
         stream = Stream()
         stream.put(bytes(self.said), 0)
         stream.end(True)

@@ -42,7 +42,7 @@ def test_printable_text_stays_unchanged() -> None:
 
 @pytest.mark.parametrize("form", ["text", "json"])
 def test_a_gateway_s_log_has_one_line_for_whoever_asks(capfd: pytest.CaptureFixture[str], form: str) -> None:
-    """A caller's address may be told by a proxy, and a drive's name by a topic of MQTT."""
+    """A caller's address may come from a proxy, and a drive's name from an MQTT topic."""
     with _logging(form, logging.INFO):
         logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")
     (line,) = capfd.readouterr().err.removesuffix("\n").split("\n")

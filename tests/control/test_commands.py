@@ -151,7 +151,7 @@ def threads(monkeypatch: pytest.MonkeyPatch) -> Threads:
 
 
 class Motors:
-    """Motors whose stops are noted; each is seen to stand once it was sent so many of them."""
+    """Motors that record their stops; each is at rest after the given number of stops."""
 
     def __init__(self, **stops: int) -> None:
         self.stops = stops
@@ -256,7 +256,7 @@ async def until_met(met: Callable[[], bool]) -> None:
 
 
 class NotedStops:
-    """A drive that notes its stops, each of which lasts until it is let go."""
+    """A drive that records its stops; each lasts until the test releases it."""
 
     name = "pump"
 

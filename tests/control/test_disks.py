@@ -191,7 +191,7 @@ def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(
 def test_a_stop_is_two_lines_however_often_it_is_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """One when it is called, before its first frame: a process that is killed meanwhile leaves that."""
+    """One line is written at the call, before the first frame, so a killed process leaves it."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
     drives = [line.attach(InvtCHE(address)) for address in (1, 2)]

@@ -143,7 +143,7 @@ def test_a_third_signal_cuts_the_stops_short_with_stderr_closed(
 
 
 def test_hang_ups_cut_nothing_short(caught: list[int]) -> None:
-    """The kernel and the shell may each send one, and more where several terminals go."""
+    """The kernel and the shell may each send one, and several terminals may close."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         hook, act = ExitHook(), Act()

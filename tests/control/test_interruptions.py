@@ -31,12 +31,12 @@ CODE = of_a_port.Line.carry_out.__code__
 
 
 def counts(frame: FrameType) -> bool:
-    """Say whether a signal comes before this line: not before the last one, after which nothing is left."""
+    """Return True if a signal is raised before this line; not before the last line, which ends the work."""
     return frame.f_code is CODE and "discard" not in getline(CODE.co_filename, frame.f_lineno)
 
 
 def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
-    """Call it, and raise before the nth line of the exchanges that it makes; None where there are fewer."""
+    """Call a function and raise before the nth line of its exchanges; return None if it has fewer."""
     try:
         with interrupted_at(nth, counts):
             call()

@@ -23,7 +23,7 @@ Make = Callable[[], Drive]
 
 
 def told(monkeypatch: pytest.MonkeyPatch, make: Make) -> tuple[SimulatedBus, Drive]:
-    """Return a bus and its drive, which was told 20 Hz."""
+    """Return a bus and its drive, whose setpoint was set to 20 Hz."""
     bus, drive, _ = one(monkeypatch, make())
     drive.set_frequency(20)
     assert drive.commanded is not None
@@ -97,7 +97,7 @@ def test_a_clamped_setpoint_is_not_the_requested_one(monkeypatch: pytest.MonkeyP
     take = type(sim).answer
 
     def held_back(sim: object, request: Message, seconds: float) -> Message | None:
-        """Confirm a write and hold what was held before."""
+        """Confirm a write, but keep the previous value."""
         if not is_write(request):
             return take(sim, request, seconds)  # type: ignore[arg-type]
         return request

@@ -33,7 +33,7 @@ def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch:
 def test_a_drive_attached_after_leaving_is_not_moved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its process ends, and nobody would stop it; the drives from before are not moved either."""
+    """The process is ending and could not stop it; drives that were attached before are not moved either."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.leave()
     line.bus.detach(drive)

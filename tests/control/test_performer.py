@@ -37,7 +37,7 @@ from multidrop.sim import MotorDrive, simulated
 
 
 class Stubborn(Drive):
-    """A drive of a user's own, whose start tries again whatever it is told."""
+    """A user's drive whose start retries after any exception."""
 
     model = "stubborn"
     title = "OWN 4"

@@ -86,7 +86,7 @@ class Ramped(Toy):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write nothing where it is held already."""
+        """Write no setpoint that the drive already has."""
         if (yield from read(self.frequency)) != hz:
             yield from self._hold(self.frequency, hz)
 
@@ -130,7 +130,7 @@ def test_a_drive_without_a_slope_of_its_own_needs_a_rate(
 
 
 class Nameless(Ramped):
-    """Nothing says that a drive is one."""
+    """A drive whose family cannot be verified."""
 
     model = "nameless"
     identify = Drive.identify
@@ -217,7 +217,7 @@ class NotedStop:
             act(self._seconds)
 
     def interrupted(self, interruption: BaseException) -> None:
-        """There is nothing left to send."""
+        """No step is left to send."""
 
     def result(self) -> None:
         """It stands."""

@@ -360,7 +360,7 @@ def test_an_expired_write_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Tidy(Drive):
-    """A drive of a user's own whose start looks at the motor, whatever became of its write."""
+    """A user's drive whose start reads the motor's state, whatever the result of its write."""
 
     current = reading(0x0F, "A")  # read before the first write
     speed = reading(0x10, "rpm")
@@ -902,7 +902,7 @@ def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.
 
 
 class ShareToy(Toy):
-    """Its setpoint is a share of what its class does not tell."""
+    """Its setpoint is a share of a frequency that its class does not state."""
 
     share = setting(0x16, "%", step=0.01, span=(0, 100), kept=Kept.RAM)
     setpoint_name = "share"
@@ -1156,7 +1156,7 @@ def test_an_identity_check_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_identity_check_that_writes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     class Meddler(Toy):
-        """Its author took a write for a look."""
+        """Its author used a write as a read."""
 
         @verb
         def identify(self) -> Script[None]:

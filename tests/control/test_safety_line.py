@@ -33,7 +33,7 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, MotorDrive, ReceivedRequests]]:
-    """The drive as its bus knows it; what is there in truth, `other` or the same; and what that hears."""
+    """Yield the drive as declared, the simulated drive (`other` or the same), and its received requests."""
     drive.response_timeout = PATIENCE
     sim = simulated(other or drive)
     assert isinstance(sim, MotorDrive)
@@ -59,7 +59,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "lost"), in_turn(MAKE, [3, 2, 7]))
 def test_a_stop_whose_replies_are_lost(model: str, lost: int) -> None:
-    """It is sent until it is confirmed, and nothing is written but the stop's own words."""
+    """The stop is repeated until it is confirmed, and only its own words are written."""
     with line(MAKE[model](1)) as (drive, sim, received):
         drive.set_frequency(20)
         drive.start()

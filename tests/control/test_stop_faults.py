@@ -80,7 +80,7 @@ def is_ours(frame: FrameType) -> bool:
 def check_failing(
     monkeypatch: pytest.MonkeyPatch, nth: int, failure: type[BaseException], all_of_them: bool
 ) -> bool:
-    """Raise this at an opcode of a stop; return whether it has one. Nothing may turn or be left behind."""
+    """Raise this at an opcode of a stop; return True if it has one. No motor may turn, no state leak."""
     line, drives, sims = running(monkeypatch, 2 if all_of_them else 1)
     begun_before = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
     stop, told, place = line.bus.stop_all if all_of_them else drives[0].stop, "", []
@@ -189,7 +189,7 @@ def test_a_failed_staggered_start_that_is_interrupted_stops_each_all_the_same(
             self.run()
 
         def join(self, timeout: float | None = None) -> None:
-            """There is nothing to wait for."""
+            """Return at once."""
 
     monkeypatch.setattr(threading, "Thread", OwnThread)
 

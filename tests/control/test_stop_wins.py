@@ -137,7 +137,7 @@ class Stops(RuleBasedStateMachine):
         after=st.integers(0, 12),
     )
     def start_and_hold(self, number: int, name: str, after: int) -> None:
-        """A thread starts a motor; from some request on there is no reply until a stop is called.
+        """Start a motor in a thread; after `after` requests, replies are held until a stop is called.
 
         A staggered start that fails is a stop too, and ends the starts of this episode.
         """

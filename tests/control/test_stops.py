@@ -644,7 +644,7 @@ def test_a_hung_log_prevents_no_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def noting(line: SimulatedBus) -> list[str]:
-    """Note what is told at each request; a text that is the same as before is noted once."""
+    """Record the report at each request; a repeated text is recorded once."""
     told: list[str] = []
 
     def note(request: Message) -> bool:

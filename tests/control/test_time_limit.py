@@ -84,7 +84,7 @@ def test_the_machine_s_sleep_within_the_block_counts_and_no_other(
 
 
 class Slow(Drive):
-    """A drive that is looked at for long before it is started, and in between."""
+    """A drive whose state is read for a long time before its start and in between."""
 
     model = "slow"
     title = "SLOW 1"

@@ -282,7 +282,7 @@ def test_a_block_that_no_chunk_can_hold_is_counted() -> None:
 
 
 def test_chunks_that_were_taken_can_all_be_given_back() -> None:
-    """More of them than are kept for later."""
+    """There are more chunks than the queue keeps for later."""
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
         for due in range(100):

@@ -99,7 +99,7 @@ def test_an_exception_is_not_waited_past(line: LineDriver, drive: Peer) -> None:
 
 
 def test_a_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Peer) -> None:
-    """Its reply is whole long before it is looked at; each look comes a little earlier."""
+    """Its reply is complete long before the port is read; each read comes a little earlier."""
     for _ in range(40):
         answer(line, drive, 40 * MS)
     for _ in range(120):
@@ -212,7 +212,7 @@ def test_an_echo_does_not_count_as_the_start_of_a_reply(line: LineDriver, drive:
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
 def test_an_adapter_that_gathers_replies_is_waited_for(line: LineDriver, drive: Peer, asked: Message) -> None:
-    """Nothing of a reply is seen before its end."""
+    """No byte of a reply is visible before its end."""
     for _ in range(20):
         gathered(line, drive, asked)
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER

@@ -785,7 +785,7 @@ def make_steady(line: LineDriver, peer: Peer) -> None:
 
 
 def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
-    """Give the line the characters that have come when it looks, until the exchange is over."""
+    """Give the line the characters that have arrived at each read, until the exchange is over."""
     came = 0
     while (want := line.want) != "done":
         there = min(max(0, (line.now - begin) // CHARACTER), len(frame))

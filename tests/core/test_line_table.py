@@ -110,7 +110,7 @@ class Walk:
         self.line.receive(bytes(self.chance.choices(range(256), k=self.chance.choice([1, 9, 600]))))
 
     def answer(self) -> None:
-        """In one piece or in two, of which the second may come late, or never."""
+        """Answer in one piece or in two; the second piece may come late or never."""
         self.rest = self.rest or build_reply(Framing.RTU, Message(1, 3, data=words(1, 2)))
         piece = self.chance.choice([3, len(self.rest)])
         self.line.receive(self.rest[:piece])

@@ -61,7 +61,7 @@ def has_room(file: BinaryIO) -> bool:
 
 
 def health(gateway: Served) -> tuple[str, str, str]:
-    """Return the status, and what is said of history and audit log."""
+    """Return the status in /health, and its entries about history and audit log."""
     found = gateway.get("/health").json
     return found["status"], found["parts"]["history"], found["audit"]
 

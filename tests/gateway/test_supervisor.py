@@ -72,7 +72,7 @@ def in_loop(loop: asyncio.AbstractEventLoop, work: Callable[[Supervisor], Any]) 
 
 
 def dead(gateway: Served) -> Any:
-    """Return what /health says is dead, where it says that the gateway has failed."""
+    """Return `dead` of /health if its status is failed."""
     answer = gateway.get("/health")
     assert (answer.status == 503) == (answer.json["status"] == "failed") == bool(answer.json["dead"])
     return answer.json["dead"]

@@ -49,7 +49,7 @@ class Two:
         )
 
     def until(self, *wanted: tuple[str, str]) -> None:
-        """Take new rows until each of these (drive, status) pairs has come."""
+        """Take new rows until each of these (drive, status) pairs has appeared."""
         self.rows()
         missing = set(wanted)
 

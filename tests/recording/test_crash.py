@@ -67,7 +67,7 @@ class Nursery:
         )
 
     def live(self, life: str, number: int, lines: int, seconds: float) -> int:
-        """Let one live until it has told so much, and a little longer; kill it, and say what it died of."""
+        """Run a client until it has reported `lines` lines, and `seconds` longer; kill it; return its status."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(f"{self._port} {self._directory} {life} {number}\n")
@@ -97,7 +97,7 @@ def nursery(counting: Counting, tmp_path: Path) -> Iterator[Nursery]:
 
 
 def told(directory: Path, life: str) -> list[str]:
-    """Return what it said; a line that is cut off was not said."""
+    """Return the lines that a client has reported; a truncated last line does not count."""
     path = directory / f"{life}.told"
     return path.read_text().rpartition("\n")[0].splitlines() if path.exists() else []
 
@@ -119,7 +119,7 @@ def check_rows(rows: Sequence[Row]) -> None:
 
 
 def check_recordings(directory: Path, life: str, acknowledged: int | None) -> int:
-    """Both open, and hold at least the rows that were told of; how many that were."""
+    """Check that both recordings open and have at least the acknowledged rows; return their number."""
     for suffix in (".arrows", ".csv"):
         path = directory / f"{life}{suffix}"
         if acknowledged is None and (not path.exists() or not path.stat().st_size):

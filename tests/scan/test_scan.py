@@ -45,7 +45,7 @@ ALL_EIGHT = (
 
 
 class Pair(Wire):
-    """A line on which a drive hears only what is sent in its own format, as on a real one.
+    """A line on which a drive receives only bytes in its own format, as on a real one.
 
     A second stop bit is silence to the other side: it does not matter.
     """
@@ -194,7 +194,7 @@ def test_the_progress_counts_down_to_zero() -> None:
 
 
 class Echo(Line):
-    """An adapter that hears what it sends."""
+    """An adapter that echoes each request."""
 
     def send(self, frame: bytes, exchange: Exchange) -> None:
         super().send(frame, exchange)
@@ -252,7 +252,7 @@ def test_a_line_that_is_never_quiet_is_called_noisy() -> None:
 
 
 class Shared(Pair):
-    """Another drive has the address of one of them and answers too: the pair is low where either is."""
+    """A line where two drives have one address and both answer: a bit is 0 if either drive sends 0."""
 
     def __init__(self, drives: Sequence[SimulatedDrive], twin: SimulatedDrive) -> None:
         super().__init__(drives)
@@ -411,7 +411,7 @@ def test_who_holds_another_address_is_of_another_family(
 
 
 class Meddler(Toy):
-    """A family of one's own, whose author took a write for a look."""
+    """A user's family, whose author used a write as a read."""
 
     model = "meddler"
 
@@ -433,7 +433,7 @@ def test_an_identification_that_would_write_is_skipped() -> None:
 
 
 class Commanded(Drive):
-    """A family of one's own, of which nothing can be read."""
+    """A user's family without readable registers."""
 
     model = "commanded"
     speed = command(1, "rpm")

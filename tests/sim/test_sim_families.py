@@ -37,7 +37,7 @@ class Bench:
         self.now = 100.0
 
     def hear(self, frame: bytes) -> bytes:
-        """Return the reply; nothing is silence."""
+        """Return the reply; empty if the drive is silent."""
         self.wire.receive(frame, self.now)
         self.now += 0.1
         return self.wire.advance(self.now)

@@ -40,7 +40,7 @@ class Said:
 
 
 class ScriptedPath:
-    """A path with answers by what is asked: "cmd", "do", "ask" or "stop"; the last one stays."""
+    """A path with answers by kind of request: "cmd", "do", "ask" or "stop"; the last one is repeated."""
 
     is_open = True
 
@@ -60,7 +60,7 @@ class ScriptedPath:
         return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
 
     async def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing."""
 
 
 class Plant:
@@ -86,7 +86,7 @@ def asked(
     plant: Plant | None = None,
     nobody_s: float = 0.01,
 ) -> CommandAnswer:
-    """Return what an asker was told who has this one path."""
+    """Return the result of a sender that has only this path."""
 
     async def main() -> CommandAnswer:
         asker = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
@@ -245,7 +245,7 @@ def test_a_stop_without_answers_is_reported_before_giving_up(tmp_path: Path) -> 
 
 
 class HangingPath(ScriptedPath):
-    """A path whose server stands still."""
+    """A path whose server hangs."""
 
     async def request(self, subject: str, data: bytes) -> Said:
         self.asked.append(subject)

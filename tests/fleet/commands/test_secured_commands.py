@@ -83,7 +83,7 @@ def test_a_commander_may_and_a_viewer_may_not(servers: SecuredCluster, tmp_path:
 
 
 async def nobody_is_asked(asker: Client) -> bool:
-    """Say whether a server tells that it has nobody to ask, once it has heard so itself."""
+    """Return True if a server reports that no gateway subscribes to the line's commands."""
     while True:
         try:
             await asker.request(names.command_subject(LINE), b"{}", 1.0)

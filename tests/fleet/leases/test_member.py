@@ -95,7 +95,7 @@ class Gateways:
         return member
 
     async def die(self, name: str) -> None:
-        """End it as SIGKILL does: it sends nothing, and its sockets are closed."""
+        """End the gateway as SIGKILL does: it sends no more bytes, and its sockets are closed."""
         member, task = self.members.pop(name), self.tasks.pop(name)
         member._leave = _do_nothing  # type: ignore[method-assign]
         task.cancel()

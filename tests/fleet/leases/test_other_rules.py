@@ -31,7 +31,7 @@ class Story:
         self._monkeypatch = monkeypatch
 
     def begin(self, name: str, rules: int) -> Lease:
-        """Begin the session of a gateway with these rules."""
+        """Start the session of a gateway with these rules."""
         lease = Lease(name, self.buckets, RecordingMastership(self.clock), clock=self.clock)
         with self._monkeypatch.context() as patch:
             patch.setattr(lease_rules, "RULES", rules)

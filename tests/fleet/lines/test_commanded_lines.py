@@ -60,7 +60,7 @@ class SlowLines:
         self.is_going = False
 
     async def take(self, line: str, description: Any) -> None:
-        """Open nothing."""
+        """Open no line."""
 
     async def let_go(self, line: str) -> None:
         self.is_going = True

@@ -116,7 +116,7 @@ def test_old_frames_take_no_memory(times: Times) -> None:
 
 @contextmanager
 def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]:
-    """A request of which the last byte has not come yet."""
+    """Send a request without its last byte, which follows later."""
     data = json.dumps(body).encode()
     head = (
         f"POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
@@ -147,7 +147,7 @@ def pass_time(gateway: Served, ns: int) -> None:
 
 
 def commands(gateway: Served) -> list[tuple[str, float]]:
-    """Return what was written to the drive so far."""
+    """Return the writes that the drive has received so far."""
     return [(write.name, write.raw) for write in gateway.sims["pump-1"].counters.writes]
 
 

@@ -28,7 +28,7 @@ UNREAD = 150_000  # requests whose answers are more than the sockets of both sid
 
 
 class FakeTransport(asyncio.Transport):
-    """A connection that keeps what is written to it."""
+    """A connection that stores all written bytes."""
 
     def __init__(self, address: str = "127.0.0.1") -> None:
         super().__init__({"peername": (address, 40000)})
@@ -462,7 +462,7 @@ def value(unit: int, address: int) -> int:
 
 
 class SlowLine(FakeLine):
-    """Answers with the registers' numbers, some of them after others that came later."""
+    """A line that answers with the registers' numbers, some of them later than those to later requests."""
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         await asyncio.sleep(0.001 * (start % 5))

@@ -52,7 +52,7 @@ def declared(**details: Any) -> Register[Any]:
 
 
 def value_of(register: Register[Any], data: bytes) -> float | None:
-    """Return the value that the core's row has of these bytes; None for a miss."""
+    """Return the value in the core's row for these bytes; None for a miss."""
     words = struct.unpack(f">{len(data) // 2}H", data)
     columns = Columns(1)
     assert add_rows(
@@ -167,7 +167,7 @@ class Status(IntEnum):
 
 
 class Meter(Drive):
-    """A device with all that may stand beside each other."""
+    """A device with all kinds of registers that may be neighbours."""
 
     speed = reading(0, "rpm")
     energy = reading(1, "kWh", number_format=NumberFormat.U32, order="CDAB", step=0.1)

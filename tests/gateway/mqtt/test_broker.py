@@ -135,7 +135,7 @@ def test_no_more_topics_wait_than_the_bound_and_the_others_are_counted() -> None
 
 
 class Silent:
-    """A speaker that says nothing."""
+    """A publisher without messages."""
 
     def will(self) -> Publication:
         return Publication("gone", bytes)
@@ -152,7 +152,7 @@ class Silent:
 
 
 class Loop:
-    """An event loop that carries out what it is called for when the test says so."""
+    """An event loop that runs its scheduled calls when the test says so."""
 
     def __init__(self) -> None:
         self.calls: list[Callable[[], None]] = []
@@ -196,7 +196,7 @@ class Slot(NamedTuple):
 
 
 class Slots:
-    """A part that notes every slot of each drive, and how late it is told of it."""
+    """A part that records every slot of each drive, and how late it is called for it."""
 
     def __init__(self) -> None:
         self._found: dict[str, list[Slot]] = defaultdict(list)

@@ -831,7 +831,7 @@ def test_metrics_say_in_words_what_they_count(broker: Broker, tmp_path: Path) ->
 
 
 class PutMessages:
-    """An outbox that keeps what is put into it."""
+    """An outbox that records its messages."""
 
     def __init__(self) -> None:
         self.put_in: list[Any] = []

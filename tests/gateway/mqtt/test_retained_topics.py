@@ -29,7 +29,7 @@ THERE = {"pump-1"}
 
 
 def heard(*messages: tuple[str, bytes], prefix: str = "works") -> list[str]:
-    """Return what is taken back after these were kept, by a gateway of one pump."""
+    """Return the retained topics that a gateway with one pump deletes if the broker has these."""
     left_behind = RetainedTopics(prefix, home_assistant=True)
     return [topic for message in messages for topic in left_behind.hear(*message, THERE)]
 
@@ -121,7 +121,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 def kept_at(broker: Broker) -> set[str]:
-    """Return the topics of which the broker keeps something."""
+    """Return the topics with a retained message."""
     listener = Listener(broker)
     publish(broker, "the/end", b"x", "-q", "1")
     listener.wait_for(lambda received: received.topic == "the/end")

@@ -35,7 +35,7 @@ AT_ITS_PLACE = """() => {
 
 
 def until(page: Any, expression: str) -> None:
-    """Wait until this is true on the page, which may load itself anew meanwhile. Raises AssertionError."""
+    """Wait until this expression is true on the page, which may reload in between. Raises AssertionError."""
 
     def met() -> object:
         try:
@@ -60,7 +60,7 @@ def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
 
 
 def until_still(page: Any) -> None:
-    """Wait until nothing moves or fades any more, but for what does so without end."""
+    """Wait until all animations have ended, except endless ones."""
     until(
         page,
         "document.getAnimations().every(a => a.effect.getTiming().iterations === Infinity"
