@@ -37,7 +37,7 @@ from multidrop.sim import MotorDrive, simulated
 
 
 class Stubborn(Drive):
-    """A user's drive whose start retries after any exception."""
+    """A user's drive whose start retries after each BusError."""
 
     model = "stubborn"
     title = "OWN 4"

@@ -67,7 +67,7 @@ class Nursery:
         )
 
     def live(self, life: str, number: int, lines: int, seconds: float) -> int:
-        """Run a client until it has reported `lines` lines, and `seconds` longer; kill it; return its status."""
+        """Kill a client `seconds` after it has reported `lines` lines; return its exit status."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(f"{self._port} {self._directory} {life} {number}\n")
