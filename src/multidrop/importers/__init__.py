@@ -1,4 +1,4 @@
-"""Importers: register tables of other programs become family files, with gaps marked and no verb."""
+"""Importers convert register tables of other programs into family files: unknown facts are marked as gaps."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from multidrop.toml_check import parse_document
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
 MOST_BYTES = 5_000_000
-MOST_REASONS = 3  # in an error
+MOST_REASONS = 3  # reasons listed in an error
 
 
 def read_devices(path: Path) -> list[ImportedDevice]:
     """Return the devices in another program's file; its format follows from its suffix and contents.
 
-    The family file of each device loads. Raises ValueError if the file has another format or no importable
-    register, ImportError for YAML without PyYAML.
+    The family file of each device is loadable. Raises ValueError if the format is unknown or no register can
+    be imported, and ImportError for YAML if PyYAML is missing.
     """
     devices = all_devices(path)
     found = [device for device in devices if device.registers or device.texts]
@@ -44,7 +44,7 @@ def read_devices(path: Path) -> list[ImportedDevice]:
 
 
 def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
-    """Make the devices' titles unique, together with their addresses."""
+    """Make each device's pair of title and address unique, by changing titles."""
     for device in devices:
         device.title = device.title or stem
     addresses = Counter(device.address for device in devices)
@@ -58,7 +58,7 @@ def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
 
 
 def all_devices(path: Path) -> list[ImportedDevice]:
-    """Return all devices, also those without an importable register. Raises as `read_devices` does."""
+    """Return all devices, including those without an importable register. Raises as `read_devices` does."""
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")

@@ -1,6 +1,6 @@
-"""CSV and TSV tables: ioBroker's, modpoll's and Neuron's layouts, and any with columns of known names.
+"""CSV and TSV tables: layouts of ioBroker, modpoll and Neuron, and any table whose column names are known.
 
-A column whose name has several conventions is read by the most frequent one, with a gap that says which.
+If programs use a column name in different meanings, the most frequent one is assumed, and a gap says which.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ GAPS = frozenset(
     }
 )
 _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in CARRIED[key])
-# Beside the first column of a key, a second one may contradict it.
+# A second column for the same key may contradict the first.
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
@@ -91,7 +91,7 @@ _ORDERS = {
 _STEP_COLUMNS = ("factor", "scale", "divisor", "gain", "decimal")
 _WHOLE = re.compile(r"(?:(u|unsigned)|signed)?int(?:eger)?(\d*)(?:t|bits?)?")
 _BIT_TYPES = frozenset({"bit", "bool", "boolean", "binary", "coil", "flag"})
-_NAMED_TABLES = (  # the first prefix that matches a cell
+_NAMED_TABLES = (  # the first matching prefix of a cell decides
     *(("holding", "holding"), ("hr", "holding"), ("4x", "holding")),
     *(("discrete", "discrete"), ("input status", "discrete"), ("input contact", "discrete")),
     *(("input coil", "discrete"), ("di", "discrete"), ("1x", "discrete"), ("contact", "discrete")),
@@ -101,8 +101,8 @@ _NAMED_TABLES = (  # the first prefix that matches a cell
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
-_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # 40001 or 400001: a table's digit, and a number from 1
-_ACCESS = {  # is it read, is it written
+_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # such as 40001 or 400001: table digit, number from 1
+_ACCESS = {  # whether the register is read, and written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
     **dict.fromkeys(
@@ -112,8 +112,8 @@ _ACCESS = {  # is it read, is it written
 _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
 
-MOST_TITLES = 20  # lines above the one that names the columns
-MOST_UNKNOWN = 20  # columns that are named
+MOST_TITLES = 20  # lines before the header of the columns
+MOST_UNKNOWN = 20  # unknown columns named in a message
 
 Cells = Mapping[str, str]
 
@@ -163,7 +163,7 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
 
 
 class _Layout:
-    """The columns of a table, by its first line. Raises ValueError if none is an address."""
+    """The columns of a table, from its header line. Raises ValueError if no column is an address."""
 
     def __init__(self, rows: list[list[str]]) -> None:
         header = [_plain_name(cell) for cell in rows[0]]
@@ -183,21 +183,21 @@ class _Layout:
         }
 
     def cells(self, row: list[str]) -> dict[str, str]:
-        """Return the cells of a row that are carried over, by key."""
+        """Return a row's imported cells, by key."""
         found = {key: row[place].strip() for key, place in self._at.items() if place < len(row)}
         if self._is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", found.get("at", "")):
             found["at"] = f"0x{found['at']}"
         return found
 
     def further(self, row: list[str]) -> set[str]:
-        """Return the names of the other columns with a cell in this row."""
+        """Return the names of the other columns that have a value in this row."""
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return the gaps in a row: columns that may change the value and are not carried over."""
+        """Return the gaps in a row: columns that may affect the value and are not imported."""
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
-            columns -= {"precision"}  # number of digits shown
+            columns -= {"precision"}  # only the number of digits shown
         found = [f"the column {name} was not carried over" for name in sorted(columns)]
         is_text = cells.get("type", "").lower().startswith("str")
         if cells.get("length") and is_text and self._length in ("length", "size"):
@@ -212,14 +212,14 @@ def _names(row: list[str]) -> list[str]:
 
 
 def _plain_name(cell: str) -> tuple[str, str]:
-    """Return a column's name, and what its brackets say: `Address (hex)` is the address in hex."""
+    """Return a column's name and the text in its brackets, such as those of `Address (hex)`."""
     name = re.sub(r"[_\s]+", " ", cell).strip().lower()
     match = re.fullmatch(r"([^(\[]*[^(\[ ])\s*[(\[]([^)\]]*)[)\]].*", name)
     return (match[1], match[2].strip()) if match else (name, "")
 
 
 def _places(header: list[str]) -> dict[str, int]:
-    """Return the places of the columns that are carried, by key; one that two keys name is the first's."""
+    """Return the indexes of the imported columns, by key. If a column fits two keys, the first gets it."""
     found: dict[str, int] = {}
     for key, aliases in CARRIED.items():
         for alias in aliases:
@@ -269,7 +269,7 @@ def _assume_number(register: ImportedRegister, stated: str | None) -> None:
 
 
 def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
-    """Return the address and table of 40001's kind, or of the number itself if other cells contradict it."""
+    """Return address and table of a number such as 40001; a plain address if other cells contradict that."""
     address, table = Counting(None).address_in_cell(given, None, "holding")
     is_bit = table in ("coil", "discrete")
     if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
@@ -286,7 +286,7 @@ def _referred(register: ImportedRegister, given: str, stated: str | None, cells:
 
 
 def _is_number(cells: Cells) -> bool:
-    """Return True if a row describes a number, and no bit."""
+    """Return True if a row describes a number, not a bit."""
     kind = cells.get("type", "").lower()
     if kind:
         return kind not in _BIT_TYPES
@@ -294,7 +294,7 @@ def _is_number(cells: Cells) -> bool:
 
 
 def _steps(cells: Cells) -> list[tuple[str, str]]:
-    """Return the non-trivial cells that state the value of one count, with their columns."""
+    """Return the columns and cells that state the value of one count, except those with trivial values."""
     stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
     return [(key, cell) for key, cell in stated if cell and (cell != "1" or key == "decimal")]
 
@@ -332,7 +332,7 @@ def _named_table(given: str) -> str | None:
 
 
 def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: _Tag | None) -> None:
-    """Add the register, a text or a number, as its cells say."""
+    """Add the register as a text or a number, depending on its cells."""
     kind = cells.get("type", "").lower()
     if note := cells.get("note"):
         register.details["note"] = note
@@ -354,7 +354,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Note whether it is read and written; a word that is not known is a gap."""
+    """Set whether the register is read and written; an unknown word is a gap."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -415,7 +415,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 
 
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
-    """Return the bits of the word that it is; "" for all. A bit that is not stated is a gap."""
+    """Return the register's bits of its word, or "" for all. A missing bit number is a gap."""
     if tag and tag.part:
         return tag.part
     stated = re.fullmatch(r"([0-9]{1,2})(?:\s*(?:-|\.\.|:|to)\s*([0-9]{1,2}))?", cells.get("bit", ""))
@@ -431,7 +431,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row; a type or a width that is not stated is a gap."""
+    """Return the number format of a row; a missing type or width is a gap."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -461,7 +461,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the order that a cell states; notes a gap if it states none."""
+    """Return the byte order that a cell states; add a gap if it states none."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -471,7 +471,7 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Add step and offset of a row; a column with several conventions is a gap that says which was taken."""
+    """Add a row's step and offset. If a column's meaning varies, add a gap that says which was assumed."""
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")

@@ -1,4 +1,4 @@
-"""An imported device: its registers, its line settings, the gaps, and the entries that were lost."""
+"""An imported device: its registers, line settings, gaps, and the entries that could not be imported."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from multidrop.families.files.registers import OF_ENUMERATIONS, unusable
 
 UNKNOWN_HOST = "HOST"
 _HOST = re.compile(r"[A-Za-z0-9_.:-]{1,200}|\[[0-9A-Fa-f:.]{1,100}\]")
-_PORT = re.compile(r"[^!${}\s][^${}]*")  # no tag, and no variable that is substituted elsewhere
+_PORT = re.compile(r"[^!${}\s][^${}]*")  # neither a YAML tag nor a variable
 _PARITIES = {"n": "N", "none": "N", "e": "E", "even": "E", "o": "O", "odd": "O"}
-# Formats of a family that states none; an ASCII frame may have 7 bits.
+# Formats of a family that states none; ASCII frames may have 7 data bits.
 _FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", "8N1", "8E1", "8O1", "8N2")}
 
 
@@ -32,7 +32,7 @@ class LineSettings:
     framing: str = "rtu"
 
     def drive_keys(self) -> dict[str, Any]:
-        """Return the keys of a drive in a plant file; on a network line only its framing."""
+        """Return the keys for a drive in a plant file; on a network line only the framing."""
         found: dict[str, Any] = {"framing": self.framing} if self.framing != "rtu" else {}
         if self.is_network:
             return found
@@ -89,7 +89,7 @@ def _whole(given: Any) -> int:
 
 WRITTEN = "it is written there; what a write does is not known here"
 ONLY_WRITTEN = "is only written: a command is never imported"
-MOST_ENTRIES = 20_000  # of one file
+MOST_ENTRIES = 20_000  # in one file
 _LONGEST_NAME = 50
 _DECIMAL = re.compile(r"-?[0-9]{1,19}")
 _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
@@ -116,9 +116,9 @@ def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyT
 
 
 def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
-    """Return a sentence for each key of an entry that may change its value and is not carried over.
+    """Return a sentence for each key of an entry that may affect the value and is not imported.
 
-    A key that is not in the table may change the value too. Keys with empty or false values are ignored.
+    Keys that are not in the table count, too. Keys with empty or false values are ignored.
     """
     known = {
         Treatment.GAP: "{} was not carried over",
@@ -129,7 +129,7 @@ def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
 
 
 def is_empty(value: Any) -> bool:
-    """Return True for a value that leaves its key unset; 0 sets it."""
+    """Return True for a value that means the key is not set; 0 means it is set."""
     return value is None or value is False or value in ("", [], {})
 
 
@@ -137,8 +137,8 @@ def is_empty(value: Any) -> bool:
 class ImportedRegister:
     """One register, with its address on the wire. `gaps` are sentences about unknown facts.
 
-    `lacks` is a fact that its value needs and a register cannot declare; then only the raw count is carried
-    over. A family file gets only readings; `is_written` and `of_writes` serve coverage reports.
+    `lacks` is a fact that the value depends on but a register cannot declare. If there is one, only the raw
+    count is imported. A family file gets only readings; `is_written` and `of_writes` serve coverage reports.
     """
 
     name: str
@@ -152,13 +152,13 @@ class ImportedRegister:
     of_writes: dict[str, Any] = field(default_factory=dict)  # further details of a written register
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Mark a gap if the other program writes the register, because the effect is unknown."""
+        """Record whether the other program writes the register; if so, add a gap: the effect is unknown."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of its values or bits; mark a gap for names that it cannot have.
+        """Add names of the register's values or bits; add a gap for names that a register cannot have.
 
         If a number has several names, the first is used.
         """
@@ -177,7 +177,7 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry, or with `is_entry` false another fact, that could not be carried over, with the reason."""
+    """An entry (with `is_entry` False another fact) that could not be imported, with the reason."""
 
     name: str
     reason: str
@@ -189,7 +189,7 @@ class Lost:
 
 @dataclass
 class ImportedDevice:
-    """A device: its readable registers, its commands, and the entries that could not be carried over."""
+    """A device: its readable registers, its commands, and the entries that could not be imported."""
 
     title: str = ""
     address: int | None = None
@@ -220,7 +220,7 @@ class ImportedDevice:
         (self.texts if is_text else self.registers).append(found)
 
     def lose(self, name: str, reason: str, *, is_entry: bool = True) -> None:
-        """Record an entry or fact that could not be carried over, with the reason."""
+        """Record an entry or fact that could not be imported, with the reason."""
         self.lost.append(Lost(name, reason, is_entry))
 
     @contextmanager
@@ -238,7 +238,7 @@ class ImportedDevice:
             self.lose(name, f"it is not laid out as an entry: {type(failure).__name__} {str(failure)[:100]}")
 
     def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
-        """Record the keys of a device or line that are not carried over."""
+        """Record the keys of a device or line that are not imported."""
         for sentence in uncarried(given, table):
             self.lose(place, sentence, is_entry=False)
 

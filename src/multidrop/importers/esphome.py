@@ -1,6 +1,6 @@
 """ESPHome's `modbus_controller`: entities of that platform in a node's YAML, or in a package of one.
 
-The tables of keys are those of its documentation and of its components' schemas.
+The tables of keys follow its documentation and its components' schemas.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SHOWN = (
     "response_size "
     "on_value on_state qos retain discovery availability state_topic command_topic"
 )
-_TIMES = "skip_updates custom_command"  # custom_command has bytes of its own; the entry is lost
+_TIMES = "skip_updates custom_command"  # an entry with custom_command (raw bytes) is not imported
 _WRITES = "write_lambda"
 KEYS = {  # by kind of entity
     "sensor": key_table(
@@ -93,7 +93,7 @@ def is_esphome(document: Any) -> bool:
 
 
 def read_esphome(document: Any) -> list[ImportedDevice]:
-    """Return a device for each address on each bus. Raises ValueError if it has no entity."""
+    """Return a device for each address on each bus. Raises ValueError if the document has no entity."""
     parts = [_substituted(part, _substitutions(document), 0) for part in _parts(document)]
     nodes = [part["esphome"] for part in parts if isinstance(part.get("esphome"), dict)]
     devices = _Devices(str(nodes[0].get("name") or "") if nodes else "", parts)
@@ -134,7 +134,7 @@ def _substitutions(document: Any) -> dict[str, str]:
 
 
 def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
-    """Return a value with each ${name} that the document itself substitutes."""
+    """Return a value with each ${name} replaced that the document itself defines."""
     if isinstance(value, str) and "$" in value and not isinstance(value, YamlTag):
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
     if depth < 5 and known:
@@ -157,7 +157,7 @@ def _entries(part: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]
 
 
 class _Devices:
-    """The devices of a node: controllers of one address on one bus are one."""
+    """The devices of a node. Controllers with the same address on the same bus are one device."""
 
     def __init__(self, title: str, parts: list[dict[str, Any]]) -> None:
         self._title = title
@@ -198,7 +198,7 @@ class _Devices:
             _add(device, kind, name, entry)
 
     def _device_of(self, given: Any) -> ImportedDevice:
-        """Return the device of a controller's id; one that another file declares has no known address."""
+        """Return the device of a controller's id; its address is unknown if another file declares it."""
         if given is None and self._by_controller:
             return next(iter(self._by_controller.values()))
         return self._by_controller.setdefault(
@@ -300,8 +300,8 @@ def _text(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str
 
 
 def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> bool:
-    """Give the register its number; False if it is lost."""
-    is_flag = kind in ("binary_sensor", "switch")  # of one word, whatever else it says
+    """Set the register's number format; return False if the register cannot be imported."""
+    is_flag = kind in ("binary_sensor", "switch")  # always one word, whatever other keys say
     given = "U_WORD" if is_flag else str(entry.get("value_type", "U_WORD"))
     found = _FORMATS.get(given.removesuffix("_R"))
     if found is None:
@@ -309,8 +309,8 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
         return False
     every = (1 << 16 * words_of(found)) - 1
     mask = whole(entry, "bitmask", every) & every
-    if words_of(found) < 4 and mask != every:  # the mask of 64 bits is ignored there
-        found = found.replace("I", "U")  # a masked number has no sign there
+    if words_of(found) < 4 and mask != every:  # ESPHome ignores the mask of 64-bit numbers
+        found = found.replace("I", "U")  # in ESPHome a masked number is unsigned
         _part(register, found, mask)
     elif is_flag:
         register.gaps.append("it is true where its count is not 0")
@@ -319,7 +319,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
         register.gaps.append("it is true where one of its bits is")
     if entry.get("multiply") is not None:
         factor = Fraction(str(number(entry["multiply"], 1, "multiply"))) or Fraction(1)
-        scaled(register.details, float(1 / factor))  # a read count is divided there
+        scaled(register.details, float(1 / factor))  # ESPHome divides the raw count when reading
     if (options := entry.get("optionsmap")) is not None:
         if isinstance(options, dict):
             register.put_names("values", options)

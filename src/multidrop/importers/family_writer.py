@@ -22,7 +22,7 @@ from multidrop.toml_check import TomlPlace, parse_document
 MOST_LOST = 500  # listed in the file
 UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"
 _LONGEST = 200  # characters of a text
-_MOST_POINTS = 20  # in a text; TOML's parser is slow on a line with very many
+_MOST_POINTS = 20  # dots in a text; TOML's parser is slow on a line with very many
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
@@ -165,7 +165,7 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Keep the entries that one family can hold; return their declarations by name."""
+    """Keep the entries of `listed` that one family can hold; return their declarations by name."""
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:
@@ -229,7 +229,7 @@ def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> 
 
 
 def _refused_together(members: dict[str, Any]) -> dict[str, str]:
-    """Return the errors of a class with these members, by register; empty if there are none."""
+    """Return the errors, by register, of a class with these members; an empty dict if it is valid."""
     try:
         type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:

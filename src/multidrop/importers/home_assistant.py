@@ -1,6 +1,6 @@
-"""Home Assistant's `modbus:` in configuration.yaml, and the layouts that it had before and has in packages.
+"""Home Assistant's `modbus:` in configuration.yaml and in packages, also in the layouts of former versions.
 
-The tables of keys are those of its documentation and of its integration's schemas, also of former versions.
+The tables of keys follow the documentation and schemas of its integration, including former versions.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _TYPES = {
     **{"int16": "I16", "int32": "I32", "int64": "I64", "uint16": "U16", "uint32": "U32", "uint64": "U64"},
     **{"float16": "F16", "float32": "F32", "float64": "F64"},
 }
-_LEGACY_TYPES = {  # of before 2022: `count` has the registers
+_LEGACY_TYPES = {  # before 2022: `count` states the number of registers
     "int": {1: "I16", 2: "I32", 4: "I64"},
     "uint": {1: "U16", 2: "U32", 4: "U64"},
     "float": {1: "F16", 2: "F32", 4: "F64"},
@@ -66,9 +66,9 @@ VERIFY_KEYS = key_table(carried="address input_type state_on state_off", irrelev
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # with the table of their entries
-MOST_REPEATED = 1000  # of virtual_count
-_DEEPEST = 4  # packages in packages
+_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # and the table of their entries
+MOST_REPEATED = 1000  # limit of virtual_count
+_DEEPEST = 4  # limit of nested packages
 
 
 def read_home_assistant(document: Any) -> list[ImportedDevice]:
@@ -228,7 +228,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
         _sensor(device, register, entry)
         return
     if register.table in ("holding", "input") and kind == "binary_sensors":
-        register.details["part"] = "0"  # its other bits are never used
+        register.details["part"] = "0"  # the word's other bits are never used
     _repeat(device, register, entry, 1)
 
 
@@ -277,7 +277,7 @@ def _sensor(device: ImportedDevice, register: ImportedRegister, entry: Mapping[s
 
 
 def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
-    """Return the order that `swap` says, or before 2021 `reverse_order`."""
+    """Return the byte order that `swap` states, or before 2021 `reverse_order`."""
     given = str(entry.get("swap") or "none")
     if given not in _SWAPS:
         register.lacks = f"its swap {given[:40]}"
@@ -308,7 +308,7 @@ def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> 
 
 
 def _nan(given: Any) -> int | str:
-    """Return a nan_value, whose text may be hex without 0x."""
+    """Return the count of a nan_value, which may be a text in hex without 0x."""
     text = str(given).strip()
     return int(text, 16) if re.fullmatch(r"[0-9]*[a-fA-F][0-9a-fA-F]*", text) else count(given, "nan_value")
 
@@ -322,7 +322,7 @@ def _more(entry: Mapping[str, Any]) -> int:
 
 
 def _repeat(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str, Any], words: int) -> None:
-    """Add the register, and as many behind it as `slave_count` or `virtual_count` says."""
+    """Add the register, and as many after it as `slave_count` or `virtual_count` states."""
     first = replace(register, details=dict(register.details), gaps=list(register.gaps))
     for at in range(_more(entry) + 1):
         name = f"{first.name}_{at}" if at else first.name

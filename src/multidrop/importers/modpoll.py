@@ -11,7 +11,7 @@ _TABLES = {
     **{"coil": "coil", "discrete_input": "discrete"},
     **{"holding_register": "holding", "input_register": "input"},
 }
-_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # bytes, words
+_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # order of bytes_words
 _CELLS = 7  # a row's word, and name, address, type, access, unit and scale
 _FLAGS = re.compile(r"bool(8|16)?")
 _STRING = re.compile(r"string([0-9]{1,4})")
@@ -57,7 +57,7 @@ def _reference(device: ImportedDevice, cells: list[str], table: str, order: str)
         device.lose(name, f"which bits {kind} means is not known")
         return
     if text := _STRING.fullmatch(kind):
-        register.details = {"length": (int(text[1]) + 1) // 2}  # as it comes, whatever the poll's order
+        register.details = {"length": (int(text[1]) + 1) // 2}  # bytes as received, whatever the poll's order
         device.add(register, is_text=True)
         return
     kind = kind.lower()

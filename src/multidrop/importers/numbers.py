@@ -37,7 +37,7 @@ def number_format(kind: str) -> str | None:
 
 
 def format_of_width(kind: str, words: int) -> str | None:
-    """Return the format that a type without a width has in so many words; None if it has a width."""
+    """Return the number format of a type without a width, for `words` words; None for other types."""
     letter = _ANY_WIDTH.get(kind.strip().lower())
     return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
@@ -52,7 +52,7 @@ def bits_text(low: int, high: int) -> str:
 
 
 def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
-    """Add the number format and the order of its bytes, of ABCD's kind for any width."""
+    """Add the number format and its byte order, which is given for four bytes, such as "CDAB"."""
     if number != "U16":
         details["number_format"] = number
     if words_of(number) == 1:
@@ -64,7 +64,7 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 def scaled(
     details: dict[str, Any], step: Any, offset: Any = 0, keys: tuple[str, str] = ("scale", "offset")
 ) -> None:
-    """Add step and offset unless they change nothing; a step of 0 is ignored. Raises as `number` does."""
+    """Add step and offset unless they have no effect; ignore a step of 0. Raises as `number` does."""
     found = number(step, 1, keys[0]), number(offset, 0, keys[1])
     if found[0] not in (0, 1):
         details["step"] = found[0]

@@ -1,4 +1,4 @@
-"""SunSpec models as JSON: a block of registers whose place in a device is found by walking its models."""
+"""SunSpec models as JSON: a model is a block of registers, whose address depends on the device."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ GROUP_KEYS = key_table(
     carried="name label points groups", irrelevant="type count desc detail notes comments standards"
 )
 MODEL_KEYS = key_table(carried="id group", irrelevant="label desc detail notes comments standards")
-MOST_REPEATED = 1000  # of a point
+MOST_REPEATED = 1000  # limit of a point's repetitions
 FIRST = 40000  # assumed: a model's place is not in its file
 # Counts that mean "not implemented" (SunSpec information model specification, data types).
 _INVALID = {
     **{"int16": 0x8000, "uint16": 0xFFFF, "acc16": 0, "enum16": 0xFFFF, "bitfield16": 0xFFFF},
     **{"int32": 0x80000000, "uint32": 0xFFFFFFFF, "acc32": 0, "enum32": 0xFFFFFFFF, "bitfield32": 0xFFFFFFFF},
-    # As signed numbers: those of 64 bits do not fit into TOML otherwise.
+    # As signed numbers, because unsigned 64-bit numbers do not fit into TOML.
     **{"int64": -(1 << 63), "uint64": -1, "acc64": 0, "bitfield64": -1},
     **{"float32": math.nan, "float64": math.nan, "sunssf": 0x8000},
 }
@@ -65,7 +65,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return a point's registers. Raises ValueError if it has none: the next ones have no place then."""
+    """Return a point's number of registers. Raises ValueError without it: later addresses depend on it."""
     try:
         return whole(point, "size")
     except KeyError:
@@ -73,7 +73,7 @@ def _size(point: Mapping[str, Any]) -> int:
 
 
 def _lose_group(device: ImportedDevice, group: Mapping[str, Any]) -> None:
-    """Lose a group's points, and those of the groups in it."""
+    """Record the points of a group, and of the groups in it, as not imported."""
     for point in group.get("points", []):
         with device.entry(str(group.get("name"))):
             device.lose(
@@ -124,7 +124,7 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Make the point's scale a step, or the name of the register that holds it."""
+    """Turn the point's scale factor into a step, or into the name of the register that holds it."""
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

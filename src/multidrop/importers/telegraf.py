@@ -1,6 +1,6 @@
 """Telegraf's inputs.modbus in its three styles: register, request and metric.
 
-The tables of keys are those of the plugin's README and of its configuration's structures.
+The tables of keys follow the plugin's README and the structures of its configuration.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _REGISTER_STYLE = {
     "coils": "coil",
     "discrete_inputs": "discrete",
 }
-_ORDERS = {  # for any width: the plugin takes ABCD's four for 16 and 64 bits as well
+_ORDERS = {  # the plugin uses the four orders of ABCD also for 16 and 64 bits
     **dict.fromkeys(("ABCD", "AB", "ABCDEFGH", "MSW", "MSW-BE"), ""),
     **dict.fromkeys(("BADC", "BADCFEHG", "MSW-LE"), "BADC"),
     **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
@@ -121,7 +121,7 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
             parts = urlsplit(controller)
             host, port = parts.hostname, parts.port or 502
         except ValueError as mistake:
-            if "$" in controller:  # a variable of its environment
+            if "$" in controller:  # an environment variable
                 return network_settings(None, 502)
             raise ValueError(f"controller = {controller[:200]!r} is not an address: {mistake}") from mistake
         framing = mode.lower().removesuffix("overtcp")
@@ -213,8 +213,8 @@ def _number(
 def _plain_type(style: str, kind: str, words: int) -> str:
     """Return a type that means the same in every style.
 
-    In the register style, FLOAT32 is a whole number of as many registers as there are addresses; IEEE's
-    floats end in -IEEE there.
+    In the register style, FLOAT32 is a whole number whose width is the number of addresses; IEEE floats have
+    names that end in -IEEE.
     """
     if style != "register":
         return kind.removesuffix("-IEEE")
@@ -224,7 +224,7 @@ def _plain_type(style: str, kind: str, words: int) -> str:
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the bits of a word that a type of less than 16 bits is, and the number's type."""
+    """Return the bits of the word for a type of less than 16 bits, and the type of the number."""
     if kind == "BIT":
         return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):

@@ -24,12 +24,12 @@ from multidrop.importers.device import (
 )
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
-# Comments, and a comma before the end of a list, which JSON does not allow. Strings are kept. An unclosed
+# Matches comments and trailing commas of lists, which JSON forbids; and strings, which are kept. An unclosed
 # string or comment extends to the end, so that each character is scanned once.
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
-_DEEPEST = 8  # subdevices in subdevices
-PART = "its place in a larger channel"  # an extra key of a channel's part
+_DEEPEST = 8  # limit of nested subdevices
+PART = "its place in a larger channel"  # an additional key, for a channel's part
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -83,7 +83,7 @@ def json_without_comments(text: str) -> str:
 
 
 def read_wb(document: Any) -> list[ImportedDevice]:
-    """Return the device of a template, or all devices of a configuration. Raises ValueError for neither."""
+    """Return a template's device, or all devices of a configuration. Raises ValueError for anything else."""
     if not isinstance(document, dict):
         kind = type(document).__name__
         raise ValueError(f"is no wb-mqtt-serial template and no SunSpec model: it is a {kind}")
@@ -117,7 +117,7 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
     for template in port.get("devices") or ():
         title = str(template.get("name") or template.get("device_type") or "device")
         try:
-            # Its other keys are values of its template's parameters.
+            # The device's other keys are values for parameters of its template.
             known = {key: value for key, value in template.items() if key in DEVICE_KEYS}
             device = _device(known, title, unit_address(template.get("slave_id"), "slave_id"), line)
         except ValueError as mistake:
@@ -201,7 +201,7 @@ def _listed(found: Any) -> list[tuple[str, Any]]:
 
 
 def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield entries, and the parts of composite ones."""
+    """Yield the entries; of a composite entry, yield its parts."""
     for key, entry in listed:
         if isinstance(entry, dict):
             name = str(entry.get("name") or key or entry.get("id") or entry.get("title") or "channel")
@@ -281,17 +281,17 @@ def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, in
         return number, ""
     shift, width = bits or (0, own)
     width = width or own
-    words = -(-max(own, shift + width) // 16)  # as many registers as the bits reach
+    words = -(-max(own, shift + width) // 16)  # as many registers as the bits span
     if number[0] not in "UI" or words not in (1, 2, 4):
         register.lacks = f"its bits {shift} to {shift + width - 1} of the format {format}"
         return number, ""
-    sign = number[0] if width == own else "U"  # a part has no sign there
+    sign = number[0] if width == own else "U"  # a part of a number is unsigned
     part = "" if (shift, width) == (0, 16 * words) else bits_text(shift, shift + width - 1)
     return f"{sign}{16 * words}", part
 
 
 def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Add the counts that mean no value; those of a float are its bits."""
+    """Add the raw counts that mean "no value"; for a float a count is its bit pattern."""
     number = str(register.details.get("number_format", ""))
     bits = 8 if number == "I8" else 16 * words_of(number)
     found: list[float | str] = []
@@ -304,13 +304,13 @@ def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
         elif isinstance(given, str) or given >> bits:
             register.gaps.append(f"{key} {entry[key]} is no count of {bits} bits, and was not carried over")
         else:
-            found.append(given - (1 << 64) if given >> 63 else given)  # TOML has signed numbers
+            found.append(given - (1 << 64) if given >> 63 else given)  # TOML numbers are signed
     if found:
         register.details["invalid"] = found if len(found) > 1 else found[0]
 
 
 def _is_plain(register: ImportedRegister) -> bool:
-    """Return True for a number whose counts may have names."""
+    """Return True if the register's counts may have names."""
     is_float = str(register.details.get("number_format", "")).startswith("F")
     return not is_float and not {"step", "offset"} & register.details.keys()
 
@@ -333,7 +333,7 @@ def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry
 
 
 def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
-    """Return the address, and of "register:shift:width" the shift and the width, which is 0 without one."""
+    """Split "register:shift:width": return the address, and shift and width or None (width 0: not stated)."""
     register, *bits = str(address).split(":")
     at = whole({"address": register}, "address")
     if not bits:

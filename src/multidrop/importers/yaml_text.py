@@ -1,4 +1,4 @@
-"""Read YAML of unknown origin: safe types alone, within bounds of size, time and memory. Needs PyYAML."""
+"""Read untrusted YAML: only safe types, with limits of size, time and memory. Needs PyYAML."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 MOST_CHARACTERS = 1_000_000
-MOST_NODES = 50_000  # an alias counts as its expansion
+MOST_NODES = 50_000  # an alias counts as all nodes of its expansion
 
 
 class YamlTag(str):
@@ -16,7 +16,8 @@ class YamlTag(str):
 def parse_yaml(text: str) -> Any:
     """Return the document; a value with a tag such as !secret is a `YamlTag`.
 
-    Raises ImportError without PyYAML, ValueError if it is not YAML, too long, or too large with its aliases.
+    Raises ImportError if PyYAML is missing, ValueError if the text is no YAML, too long, or its expansion too
+    large.
     """
     try:
         yaml: Any = import_module("yaml")

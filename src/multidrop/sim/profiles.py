@@ -33,11 +33,11 @@ _RUN = (
 
 
 class SimulatedProfidrive(ProfileDrive):
-    """PROFIdrive: inhibited after power-up, a trip, OFF2 and OFF3, until a word with OFF1 and without these.
+    """PROFIdrive: inhibited after power-up, a trip, OFF2 or OFF3, until a word has only OFF1 active.
 
-    `off2` and `off3` are active from elsewhere, such as a terminal. In local control, and if the remote
-    bit is 0, the word is ignored, except its OFF bits. A word that clears bit 3 lets the motor coast.
-    Whether the ramp bits stop a motor that runs is not simulated: all three at 1 let it run.
+    `off2` and `off3` are commands from another source, such as a terminal. In local control, and if the
+    remote bit is 0, all bits of the word except the OFF bits are ignored. A word that clears bit 3 lets the
+    motor coast. The three ramp bits are simulated only in part: the motor runs if all three are 1.
     """
 
     def prepare(self) -> None:
@@ -47,7 +47,7 @@ class SimulatedProfidrive(ProfileDrive):
 
     def powered_up(self) -> None:
         self._is_inhibited = True
-        self._is_on = False  # OFF1 is not active
+        self._is_on = False  # True: OFF1 is not active
         self._is_enabled = False
 
     def trip(self, code: int) -> None:
@@ -116,10 +116,10 @@ _STATES = {DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27}
 
 
 class SimulatedCiA402(ProfileDrive):
-    """CiA 402: one step up for each word, none over a step; "disable voltage" and a trip go to the bottom.
+    """CiA 402: each word moves up one state at most; "disable voltage" and a trip go to the lowest state.
 
-    A shutdown coasts here, as the standard's factory setting does, and "disable operation" ramps. A drive in
-    local control takes no word. `stays_off` keeps it from being switched on, as lacking mains do.
+    With the standard's factory settings, as here, a shutdown coasts and "disable operation" ramps down. A
+    drive in local control ignores all words. `stays_off` prevents switching on, as missing mains do.
     """
 
     def prepare(self) -> None:
@@ -178,9 +178,9 @@ class SimulatedCiA402(ProfileDrive):
 
 
 class SimulatedDanfossFC(ProfileDrive):
-    """Danfoss FC: a word without bit 10 is ignored; bit 6 runs by its level, so also after a reset.
+    """Danfoss FC: a word without bit 10 is ignored. The motor runs while bit 6 is set, even after a reset.
 
-    `is_locked` is a trip that no reset ends.
+    `is_locked`: the present trip cannot be reset.
     """
 
     def prepare(self) -> None:
@@ -226,9 +226,9 @@ EXTERNAL_FAULT = 49  # EF
 
 
 class SimulatedDelta(ProfileDrive):
-    """Delta: a run that comes in a fault is forgotten. The reset bit resets for as long as it is set.
+    """Delta: a run command during a fault is dropped. While the reset bit is set, it resets every fault.
 
-    The manuals do not say so; it is simulated to find a client that leaves the bit set.
+    The manuals do not state the latter. It is simulated to detect a client that leaves the bit set.
     """
 
     def pass_time(self, now: float) -> None:
@@ -264,7 +264,7 @@ _STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, In
 
 
 class SimulatedInvt(ProfileDrive):
-    """INVT: a start in a fault is refused. `jog_needs_own_stop`: a jog goes on through a stop."""
+    """INVT: a start during a fault is refused. `jog_needs_own_stop`: a normal stop does not end a jog."""
 
     def prepare(self) -> None:
         super().prepare()
@@ -277,7 +277,7 @@ class SimulatedInvt(ProfileDrive):
         return super().accept(cell, raw)
 
     def _canonical(self, raw: int) -> InvtControl | None:
-        """Return the profile's word for a raw count, which the family may number itself."""
+        """Return the profile's control word for a raw count of this family, which may differ."""
         values: Any = self.drive.register("control").values
         return next((InvtControl[member.name] for member in values if member == raw), None)
 
@@ -314,10 +314,10 @@ class SimulatedInvt(ProfileDrive):
 
 
 class SimulatedOptidrive(ProfileDrive):
-    """Optidrive E3: bit 0 runs by its level, so also after a reset, while digital input 1 enables it.
+    """Optidrive E3: the motor runs while bit 0 is set and digital input 1 is on, also right after a reset.
 
-    `is_enabled` is that input. `is_first_reading` shows register 6 as the first guide prints it: code low,
-    state high.
+    `is_enabled` is that input. `is_first_reading`: register 6 has the layout of the first guide, with the
+    fault code in the low byte and the state in the high byte.
     """
 
     def prepare(self) -> None:

@@ -23,7 +23,7 @@ NO_DATA = bytes(4)  # D3..D0 if unused
 
 
 class Reason(Enum):
-    """A reason to refuse; each family has its own code for it, or keeps silent."""
+    """A reason to refuse a request. Each family has its own code for it, or stays silent."""
 
     FUNCTION = "no such function"
     READ_ADDRESS = "nothing to be read there"
@@ -46,11 +46,11 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class DriveProtocol:
-    """A protocol's functions, and its usual codes of refusal; without a code a drive keeps silent."""
+    """A protocol's functions and usual exception codes. If a reason has no code, a drive stays silent."""
 
     answers: Mapping[int, Callable[[SimulatedDrive, Message], Message]]
     codes: Mapping[Reason, int]
-    octets: int  # of a request that reads or writes one register, without its checksum
+    octets: int  # length of a request for one register, without checksum
     no_data: bytes = b""  # the data of a refusal
 
 
@@ -92,7 +92,7 @@ def _write_coils(sim: SimulatedDrive, request: Message) -> Message:
 
 
 def _write_several(sim: SimulatedDrive, request: Message, raws: list[int]) -> Message:
-    sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)  # as many as in a read
+    sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)  # the limit is that of a read
     sim.write(request.function, request.start, raws)
     return Message(request.address, request.function, request.start, request.count)
 

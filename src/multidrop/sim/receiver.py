@@ -1,7 +1,8 @@
-"""Cut received bytes into requests, as a drive does: bytes and times in, frames out.
+"""Split received bytes into requests, as a drive does. Input: bytes with times; output: frames.
 
-Garbage costs only the frames that it damages, and buffers are bounded. An RTU frame ends with silence: a
-request that is followed at once by other bytes, unless these start a request, is damaged too.
+Invalid bytes affect only the frames that they damage, and buffers are bounded. An RTU frame ends with
+silence. Therefore a request is damaged if other bytes follow without a pause, unless these start another
+request.
 """
 
 from __future__ import annotations
@@ -12,18 +13,18 @@ from dataclasses import dataclass, replace
 from multidrop.core import Framing, Message, crc16, lrc, parse_request, sum8
 
 MOST_RTU = 256
-TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id, and of a frame
+TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id; most bytes of a frame
 MOST_TEXT = 513
 LEAST_RTU = 4  # address, function, CRC
-# Function codes of requests: a byte without one behind it cannot start a request.
+# Function codes of requests: a byte starts a request only if one of these follows.
 _REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame; `message` is None unless it is a request.
+    """A frame; `message` is its request, or None if it is none.
 
-    `body` is without start, end and checksum; `intact` says whether the checksum was right.
+    `body` has no start, end or checksum. `intact`: the checksum is correct.
     """
 
     body: bytes
@@ -43,9 +44,9 @@ class Frame:
 
 
 class Receiver:
-    """The receiver of one framing and baud rate; `most_gap` s of silence end a frame.
+    """A receiver for one framing and baud rate. A silence of `most_gap` s ends a frame.
 
-    One character takes `character` s; 0 if the line is not paced.
+    `character` is the time of one character in s, or 0 if the line has no timing.
     """
 
     def __init__(self, framing: Framing, character: float, most_gap: float) -> None:
@@ -53,7 +54,7 @@ class Receiver:
         self.character = character
         self.most_gap = most_gap
         self._buffer = bytearray()
-        self._end = float("-inf")  # of the last bit received
+        self._end = float("-inf")  # time of the last bit received
         cuts = {Framing.RTU: self._cut_rtu, Framing.TCP: self._cut_tcp}
         self._cut = cuts.get(framing, self._cut_text)
 
@@ -63,7 +64,7 @@ class Receiver:
         return self._end + self.most_gap if self._buffer else None
 
     def feed(self, chunk: bytes, now: float) -> list[Frame]:
-        """Return the frames that this chunk completes; its first bit came at `now` or after."""
+        """Return the frames that this chunk completes. The chunk's first bit came at `now` or later."""
         frames = self.silence(now)
         self._end = max(now, self._end) + len(chunk) * self.character
         self._buffer += chunk
@@ -72,14 +73,14 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return the frame that silence has ended by `now`: no request, or a part of one."""
+        """Return the frame that a silence up to `now` has ended, if any; it is not a complete request."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
         self._buffer.clear()
         if self.framing is not Framing.RTU or not LEAST_RTU <= len(rest) <= MOST_RTU:
             return []
-        if _first_request(rest) is not None:  # with more behind it
+        if _first_request(rest) is not None:  # a request with further bytes after it
             return []
         intact = crc16(rest[:-2], len(rest) - 2) == int.from_bytes(rest[-2:], "little")
         return [self._frame(rest[:-2], None, intact, 0, len(rest))]
@@ -88,12 +89,12 @@ class Receiver:
         self._buffer.clear()
 
     def _frame(self, body: bytes, message: Message | None, intact: bool, after: int, length: int) -> Frame:
-        """Return a frame of `length` characters that ended `after` characters before the last one."""
+        """Return a frame of `length` characters; `after` further characters came after it."""
         end = self._end - after * self.character
         return Frame(body, message, intact, end - length * self.character, end)
 
     def _cut_rtu(self) -> Frame | None:
-        """Return the next request, unless it is followed by bytes that may still become a request."""
+        """Return the next request; None while the bytes after it may still become a request."""
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:
             at, used, message = found
@@ -154,9 +155,10 @@ class Receiver:
 
 
 def _first_request(data: bytes) -> tuple[int, int, Message] | None:
-    """Return place, length and content of the first good request.
+    """Return index, length and content of the first valid request; None if there is none.
 
-    While one may still be incomplete, a later one counts only if it ends with the last byte.
+    If an earlier byte may start a request that is still incomplete, a later request counts only if it ends
+    with the last byte.
     """
     pending = False
     for at, code in enumerate(data[1:]):

@@ -1,4 +1,4 @@
-"""Simulator: run any number of wires in one thread; no other file here reads a clock."""
+"""Simulator: runs any number of wires in one thread. No other file of this package reads a clock."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ _log = logging.getLogger("multidrop.sim")
 
 
 class Simulator:
-    """Run wires while the context lasts: `with Simulator([wire]) as sim: sim.wires[0].path`."""
+    """Runs wires during a `with` block: `with Simulator([wire]) as sim: sim.wires[0].path`."""
 
     def __init__(self, wires: Sequence[Wire]) -> None:
         self.wires = tuple(wires)
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
         self.failure: BaseException | None = None
         """The first exception of a simulated drive, or of the thread itself; None: there was none."""
-        self._failed: set[int] = set()  # wires whose failure is in the log
+        self._failed: set[int] = set()  # wires with a logged failure
         self._changing = threading.Lock()
         self._is_over = False
         self._is_open = False
         self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
-        self._planned: dict[int, float] = {}  # of each wire, the wake-up that counts
-        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # of each wire, the port that is waited for
+        self._planned: dict[int, float] = {}  # each wire's valid wake-up; others in the heap are outdated
+        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # each wire's registered port
 
     def __enter__(self) -> Self:
         try:
             self._start()
-        except BaseException:  # __exit__ is not called then
+        except BaseException:  # in this case __exit__ is not called
             self._end()
             raise
         return self
@@ -73,12 +73,12 @@ class Simulator:
     def _run_in_thread(self) -> None:
         try:
             self.run()
-        except BaseException as failure:  # of all wires, which are silent from now on
+        except BaseException as failure:  # the simulator failed: all wires are silent now
             self.failure = self.failure or failure
             _log.critical("the simulator has ended: no drive answers any more", exc_info=failure)
 
     def open(self) -> None:
-        """Open every wire's port, or none; then the paths are known."""
+        """Open all ports, which makes their paths known; if one fails, close all again."""
         self._selector = selectors.DefaultSelector()
         self._interrupted, self._interrupter = socket.socketpair()
         self._interrupter.setblocking(False)
@@ -93,7 +93,7 @@ class Simulator:
             raise
 
     def forked(self) -> None:
-        """Give a forked child its own pair: it must not interrupt its parent's simulator."""
+        """Give a forked child its own wake-up pair, so that it cannot interrupt its parent's simulator."""
         self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
@@ -104,12 +104,12 @@ class Simulator:
         self._interrupter.close()
 
     def interrupt(self) -> None:
-        """Make `run` return; from any thread."""
+        """Make `run` return. May be called from any thread."""
         self._interrupter.send(b"!")
 
     @property
     def wakeup(self) -> int:
-        """A descriptor to which a byte is written to make `run` return."""
+        """A descriptor: writing a byte to it makes `run` return."""
         return self._interrupter.fileno()
 
     def run(self) -> None:
@@ -134,8 +134,8 @@ class Simulator:
     def _sleep(self) -> None:
         """Wait for bytes or the next wake-up.
 
-        The selector itself is waited for: select() keeps time to the microsecond, epoll_wait() only to
-        the millisecond.
+        Uses select() on the selector's own descriptor, because select() is exact to the microsecond and
+        epoll_wait() only to the millisecond.
         """
         limit = max(0.0, self._wakes[0][0] - monotonic()) if self._wakes else None
         if isinstance(self._selector, selectors.SelectSelector):
@@ -144,7 +144,7 @@ class Simulator:
             select.select([self._selector], [], [], limit)
 
     def _note(self, number: int, failure: Exception) -> None:
-        """Note a failure of one wire: all wires continue."""
+        """Log the first failure of a wire; all wires continue."""
         self.failure = self.failure or failure
         if number not in self._failed:
             self._failed.add(number)
@@ -179,7 +179,7 @@ class Simulator:
             heapq.heappush(self._wakes, (wake, number))
 
     def _attend(self, number: int) -> None:
-        """Wait for the wire's port as it is now: closed, reopened, or with another client."""
+        """Let the selector wait for the wire's current port, which may have been closed or reopened."""
         port, before = self.wires[number].port, self._attended.get(number)
         now = (port, port.fileno()) if port else None
         if now == before:
@@ -200,7 +200,7 @@ def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda 
     simulator = Simulator(wires)
     simulator.open()
     before = signal.signal(signal.SIGTERM, lambda *_: None)
-    # A signal just before the sleep runs no handler until the sleep ends: its byte on this pipe ends it.
+    # Python runs no handler of a signal that comes just before the sleep: the signal's byte ends the sleep.
     wakeup = signal.set_wakeup_fd(simulator.wakeup)
     try:
         announce(simulator)

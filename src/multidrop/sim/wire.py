@@ -1,6 +1,6 @@
-"""Wire: the two wires of a line with its drives, and the time that everything takes on them.
+"""Wire: a line with its drives, and the time that transmission takes.
 
-Bytes and times come in, bytes and times come out; the port at its end is in port.py.
+Input and output are bytes with times; the port at the line's end is in port.py.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
 
-CHUNK = 1e-3  # s; characters that end within it are sent to the client together
-ROUNDING = 1e-6  # of a character: a wake-up finds the byte that it was planned for
-UNPACED_GAP = 20e-3  # s of silence that end a frame where characters take no time
+CHUNK = 1e-3  # s; characters that end within this time are sent to the client together
+ROUNDING = 1e-6  # part of a character; lets a wake-up find its byte despite rounding errors
+UNPACED_GAP = 20e-3  # s of silence that end a frame if characters take no time
 
 
 @dataclass
 class Transmission:
-    """A reply on its way: the last bit of its n-th character ends n characters after `begin`."""
+    """A reply in transmission: the n-th character ends n character times after `begin`."""
 
     data: bytes
     begin: float
@@ -40,7 +40,7 @@ class Transmission:
         return self.begin + min(len(self.data), self.sent + group) * self.character
 
     def take(self, now: float) -> bytes:
-        """Return the characters that have ended by now and were not taken yet."""
+        """Return the characters that have ended by `now` and were not returned before."""
         if now < self.begin:
             return b""
         passed = len(self.data)
@@ -52,7 +52,7 @@ class Transmission:
 
 
 class ReceiverGroup:
-    """Drives that share a receiver: of one framing, one baud rate and one longest gap in a frame."""
+    """Drives that share a receiver, because framing, baud rate and longest gap in a frame are equal."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
         self.receiver = receiver
@@ -69,8 +69,8 @@ class Wire:
     """One line of simulated drives.
 
     `port` is "pty", a path for a link to the pty, "socket://host:port" (port 0: any free one), or
-    "tcp://host:port" for drives behind a gateway of Modbus TCP. A client opens `path`. An `unpaced` wire
-    has no waits at all.
+    "tcp://host:port" for drives behind a gateway of Modbus TCP. A client opens `path`. On an `unpaced` wire
+    nothing takes time.
     """
 
     def __init__(
@@ -91,8 +91,8 @@ class Wire:
         self.port: SimulatedEnd | None = None  # None while it is closed
         self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
         self._groups = self._group()
-        self._outgoing: list[Transmission] = []  # by their start
-        self._quiet_since = -math.inf  # the end of the last reply
+        self._outgoing: list[Transmission] = []  # ordered by start
+        self._quiet_since = -math.inf  # end of the last reply
         self._baudrate: int | None = None
 
     def _group(self) -> list[ReceiverGroup]:
@@ -115,7 +115,7 @@ class Wire:
         return f"<Wire {self.name} of {len(self.drives)} drives>"
 
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        """Take bytes of the client, at its baud rate if it is visible."""
+        """Receive bytes from the client; `baudrate` None: the client's baud rate is unknown."""
         if baudrate != self._baudrate:
             for group in self._groups:
                 group.receiver.forget()
@@ -143,21 +143,21 @@ class Wire:
 
     @property
     def wake(self) -> float | None:
-        """The time of the next call to `advance`; None: when the next bytes have come."""
+        """The time at which to call `advance` next; None: not before the next bytes come."""
         times = [at for group in self._groups if (at := group.receiver.silent_at) is not None]
         if self._outgoing:
             times.append(self._outgoing[0].next_at)
         return min(times, default=None)
 
     def distort(self, reply: bytes) -> bytes:
-        """Return the reply as it reaches the client; tests of noise replace this."""
+        """Return the reply as it reaches the client. Tests with noise override this."""
         return reply
 
     def _deliver(self, group: ReceiverGroup, frames: Sequence[Frame]) -> None:
         for frame in frames:
             for sim in group.addressed(frame):
                 if self._keeps_silence(sim, frame) and (reply := sim.receive(frame)) is not None:
-                    if frame.transaction:  # of Modbus TCP alone
+                    if frame.transaction:  # only Modbus TCP has a transaction
                         reply = replace(reply, transaction=frame.transaction)
                     data = self.distort(build_reply(sim.drive.framing, reply))
                     self._send(data, frame.end + sim.delay * self._pace, group.receiver.character)
@@ -166,10 +166,11 @@ class Wire:
         bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda reply: reply.begin)
 
     def _keeps_silence(self, sim: SimulatedDrive, frame: Frame) -> bool:
-        """Tell whether a drive takes a frame; count one that came before the drive's silence was over.
+        """Return whether a drive accepts a frame; count it if it came before the drive's silence was over.
 
-        A frame that starts within a reply is lost. Silence is counted only from the end of a reply, which is
-        known to the bit here: a client is never blamed for a late wake-up of this process.
+        A frame that starts during a reply is lost. Silence is measured only from the end of a reply, because
+        the simulator knows that time exactly. So a late wake-up of this process is never counted against a
+        client.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
         silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)

@@ -15,27 +15,27 @@ TIMEOUT_SETTING = 0x0803
 COMMANDED, BY_FREQUENCY, RESET, EMERGENCY_STOP, COAST, RUN, REVERSE, JOG, DC_BRAKE, SECOND_RAMP = (
     1 << bit for bit in range(15, 5, -1)
 )
-PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # of the preset speed's number
+PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # their part of the preset speed's number
 PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # Sr1 to Sr7
 PANEL_ONLY = (0x0001, 0x0007, 0x0015)
 BAUDRATES = (1200, 2400, 4800, 9600)  # by the codes of F800
-RESTART_TIME = 2.0  # s after a reset, in which the line is ignored
+RESTART_TIME = 2.0  # s after a reset during which the line is ignored
 EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18
 HELD = (0x1200, 0x1201)  # frozen at a trip until the reset
 
 
 class SimulatedYD1000(MotorDrive):
-    """YD1000. Without bit 15 the panel is in command: it runs the motor while `panel_runs` is set.
+    """YD1000. Without bit 15 the panel is in control: the motor runs while `panel_runs` is set.
 
-    A value outside its limits in section 6 is refused, also where such a limit is another parameter. A
-    parameter that works from the panel only is confirmed and not kept (6.1; section 8.1 has 0007H
-    initialise).
+    A value outside its limits in section 6 is refused, also if the limit is another parameter. A write to a
+    parameter that works only from the panel is confirmed but not stored (6.1; by section 8.1, 0007H
+    initialises).
 
-    Not in the notes, and taken from relatives: the exception codes, which are Modbus's (VF-S15); the codes
-    of faults, that an emergency stop is one, and that a reset restarts the drive, which ignores the line
-    for 2 s and forgets its commands (VF-S11); that the preset speeds' bits are those of a number. The
-    second ramp has the times of the first. That the brake takes the frequency to 0 at once, and goes
-    before run, is this simulator's own.
+    The notes leave some facts open, which are taken from related drives. From the VF-S15: exception codes are
+    those of Modbus. From the VF-S11: the fault codes; an emergency stop is a fault; a reset restarts the
+    drive, which then ignores the line for 2 s and drops its commands. Also assumed: the bits of the preset
+    speeds form a number, the second ramp has the times of the first, and the brake has priority over run and
+    sets the frequency to 0 immediately.
     """
 
     functions = (0x03, 0x06)
@@ -49,7 +49,7 @@ class SimulatedYD1000(MotorDrive):
 
     @property
     def panel_runs(self) -> bool:
-        """True while its panel says run, which has an effect only while the line is not in command."""
+        """True while the panel commands run. This has an effect only while the line is not in control."""
         return self._panel_runs
 
     @panel_runs.setter
@@ -130,7 +130,7 @@ class SimulatedYD1000(MotorDrive):
         self._in_force = word if word & COMMANDED else 0
 
     def _restart(self) -> None:
-        """Forget all that is not in the EEPROM, and ignore the line for a while."""
+        """Lose everything that is not in the EEPROM, and ignore the line for RESTART_TIME."""
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + RESTART_TIME
