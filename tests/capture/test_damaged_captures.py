@@ -131,7 +131,7 @@ def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tm
     "tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"]
 )
 def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes) -> None:
-    """A frame that somebody exported begins behind tags that say what it is; here none does."""
+    """An exported frame follows tags that describe it; this packet has no frame after them."""
     path = tmp_path / "a.pcapng"
     interface = block(1, struct.pack("<HHI", 252, 0, 0))
     path.write_bytes(SECTION + interface + packet(0, tags) + packet(0, b"\0\0\0\0" + READ))

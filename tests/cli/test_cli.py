@@ -316,7 +316,7 @@ def test_advice_for_a_program_becomes_a_command_s() -> None:
 
 
 def test_a_family_s_advice_stands_in_its_sentence() -> None:
-    """Else nothing of it would be replaced on the command line."""
+    """Otherwise the command line could not replace its parts."""
     erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
     for script, command in (

@@ -387,7 +387,7 @@ def test_keys_that_come_together_are_separated(pressed: bytes, told: list[str]) 
 def test_a_key_whose_bytes_come_apart_is_one_key(
     monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], pressed: list[str]
 ) -> None:
-    """A network sends them so: F4 is no stop of all drives, though it ends in S."""
+    """A network may divide them: F4 ends in S, but must not stop all drives."""
     terminal, end = os.openpty()
     left = iter(pieces)
 

@@ -445,7 +445,7 @@ def test_a_stop_whose_reply_is_always_lost_is_unconfirmed(
 def test_a_drive_that_is_heard_no_more_after_its_command(
     monkeypatch: pytest.MonkeyPatch, model: str, verb: str
 ) -> None:
-    """An effect that cannot be seen is unconfirmed: NoReply would say that nothing was sent."""
+    """An unseen effect is unconfirmed; NoReply would mean that no write was sent."""
     line, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     if verb == "stop":

@@ -344,7 +344,7 @@ def test_another_clients_frames_confirm_no_stop(says: str) -> None:
 
 @patient
 def test_the_same_stop_of_another_client_is_one_too() -> None:
-    """It looks like the drive's confirmation of ours, and the motor stops all the same."""
+    """It looks like the drive's confirmation of our stop, and the motor stops anyway."""
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])
         pair.says = rtu(STOP)

@@ -162,7 +162,7 @@ def test_noise_between_a_request_and_its_reply_does_no_harm() -> None:
 
 @pytest.mark.parametrize("first", ["", "FF"])
 def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
-    """The junk looks like the begin of a long write, which the next frames would fill up."""
+    """The junk looks like the start of a long write, which the next frames would complete."""
     junk = bytes.fromhex(first + "01 10 00 00 00 7B F6")
     stream, splitter = Stream(), Splitter()
     stream.put(READ + ANSWER[:2], 0)

@@ -220,7 +220,7 @@ def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Pat
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 @pytest.mark.parametrize("options", [None, [], "now", {"direction": "forward"}])
 def test_wrong_options_do_not_prevent_a_stop_verb(tmp_path: Path, verb: str, options: object) -> None:
-    """Programs write null where they have none."""
+    """Programs write null if they have no options."""
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")
         body = {"drive": "pump-1", "verb": verb, "options": options}
@@ -337,7 +337,7 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_commands_from_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> None:
-    """A command whose thread begins only after the stop was called finds that out."""
+    """A command whose thread starts after the call of the stop notices the stop."""
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -402,7 +402,7 @@ def test_stop_of_a_silent_drive_says_so_and_delays_no_other(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_many_stops_of_a_silent_drive_delay_no_other(tmp_path: Path) -> None:
-    """Each of them was repeated for 30 s, and the stop of another drive waited for its turn among them."""
+    """Formerly each was repeated for 30 s, and the stop of another drive waited for them."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(40) as callers:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")

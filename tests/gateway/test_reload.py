@@ -223,7 +223,7 @@ def test_local_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
 
 
 def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: Path) -> None:
-    """Whoever renews it finds out from the reload, and not from browsers a month later."""
+    """The reload reports the need for a restart, so that browsers need not a month later."""
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
     with served(tmp_path, serve, tls=None) as gateway:
@@ -271,7 +271,7 @@ def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path
 def test_reads_before_a_reload_are_not_shown_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The name may be another drive's now, and this one answers no more."""
+    """The name may belong to another drive now, and the old drive may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")

@@ -194,7 +194,7 @@ def test_a_certificate_without_its_key(tmp_path: Path, certificates: Path) -> No
 
 
 def test_no_rights_on_the_folder(tmp_path: Path) -> None:
-    """Nobody may make a file in /sys, root neither."""
+    """Not even root may create a file in /sys."""
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path), {"STATE_DIRECTORY": "/sys"})
     (only,) = wrong.value.mistakes

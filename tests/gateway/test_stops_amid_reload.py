@@ -128,7 +128,7 @@ CASES: dict[str, tuple[Iterable[Drive], Iterable[Drive], list[str], Names]] = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_stop_reaches_what_is_about_to_have_the_name_too(case: str) -> None:
-    """Nobody knows which of the two was meant; the one on the other line has another name so far."""
+    """Either drive may be meant; the one on the other line still has another name."""
     before, after, names, stopped = CASES[case]
     lines = Lines(plant_of(*before), plant_of(*after))
 

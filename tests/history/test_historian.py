@@ -36,7 +36,7 @@ def test_all_mistakes_of_its_table_at_once() -> None:
 
 
 def test_a_folder_that_cannot_be_is_one_sentence(tmp_path: Path) -> None:
-    """Nobody may make a folder in /sys, root neither."""
+    """Not even root may create a folder in /sys."""
     inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
     with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
         build(HistorySettings(folder="/sys/history"), inside)
@@ -79,7 +79,7 @@ def test_a_great_answer_is_refused_and_none_is_made_in_the_loop(
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
-    """Thousands of files say of their rows what they are: to read that takes seconds."""
+    """Reading the metadata of thousands of files takes seconds."""
     readers: list[int] = []
 
     class Noted(History):

@@ -75,7 +75,7 @@ def test_all_that_it_took_is_there_after_it_closed(
 
 
 def test_batches_of_two_pollers(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
-    """Their codes stand for other names."""
+    """The two pollers use the same codes for different names."""
     writer = writers(tmp_path)
     taken = [
         batch(Names([name]), 0, range(20), NOON, SECOND) for name in ("pump-1", "fan", "pump-1", "mixer")

@@ -254,7 +254,7 @@ def test_utilisation_of_a_line(tmp_path: Path) -> None:
 
 
 def test_utilisation_of_a_port_without_a_wire_is_at_most_1(tmp_path: Path) -> None:
-    """Requests follow each other by 2 ms, where a wire would take 32."""
+    """Requests follow each other after 2 ms; a wire would need 32 ms."""
     rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
     planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
     (line,) = line_uses(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
@@ -483,7 +483,7 @@ def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
 
 
 def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> None:
-    """3 is decelerating on one of them and standby on the other."""
+    """3 means decelerating on one drive and standby on the other."""
     rows = [row(at, "erman", "status", value) for at, value in enumerate((0, 2, 1, 3, 3, 3))]
     rows += [row(at, "che", "status", value) for at, value in enumerate((3, 3, 1, None, 3, 7))]
     (axes,) = plot(states(tmp_path, rows))[0].axes

@@ -96,7 +96,7 @@ def test_a_late_do_is_not_sent(desk: Desks, seconds: float, outcome: CommandOutc
 
 
 def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
-    """The library has the rest of the second, and no more."""
+    """The library may use only the rest of the second."""
     with desks(tmp_path, patience_s=0) as desk:
         _is_held_up(desk)
 
@@ -272,7 +272,7 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
 
 @pytest.mark.slow
 def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
-    """Its asker is told that it was sent long before the motor stands; this one stands when that was told."""
+    """Long before the motor is at rest, the sender learns that the stop was sent."""
     desk.sim["output_frequency"] = 10.0
     data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
     sentence = "pump: the stop was confirmed, but the motor is not yet seen to stand"

@@ -120,7 +120,7 @@ def test_once_a_trial_ended_well_the_others_are_tried_without_a_wait() -> None:
 
 
 def test_a_trial_takes_a_line_of_our_own_share_and_its_success_forgets_the_others() -> None:
-    """A line of another gateway's share would not come back: a trial of it proves nothing."""
+    """Another gateway's line would not stay here after a trial."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abcd":

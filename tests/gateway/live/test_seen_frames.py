@@ -176,7 +176,7 @@ def test_a_stop_that_was_held_up_as_long_is_sent(tmp_path: Path) -> None:
 
 
 def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
-    """A proxy that sends a start again, or lets a stop overtake it, starts nothing."""
+    """A proxy that repeats a start, or lets a stop overtake it, starts no motor."""
     writer = {}
     with served(tmp_path, MAY) as gateway:
         writer["authorization"] = gateway.bearer(Right.WRITE)

@@ -133,7 +133,7 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
 
 
 def test_many_clients_share_the_time_that_one_of_them_had() -> None:
-    """A stop, by whichever way it comes, waits until all of them had their turn."""
+    """A stop through any interface waits until each client had its turn."""
 
     async def main() -> None:
         share = modbus_clients.RoundShare()
@@ -546,7 +546,7 @@ def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -
 
 @pytest.mark.long
 def test_a_reader_that_is_slower_than_its_requests_gets_all_answers(gateway: Gateway) -> None:
-    """All is sent before anything is read: what is asked waits while the answers before are not taken."""
+    """The client sends all requests before it reads; requests wait while earlier answers are unread."""
     requests = 20_000
     with gateway.client() as client:
         frames = b"".join(request(number, 1, 3, 0, 120) for number in range(requests))

@@ -117,7 +117,7 @@ def test_messages_that_arrive_together_make_room_at_once() -> None:
 
 
 def test_no_more_topics_wait_than_the_bound_and_the_others_are_counted() -> None:
-    """Whoever sends commands names the topics of their answers."""
+    """The senders of commands name the topics of the answers."""
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     wire.is_open = False

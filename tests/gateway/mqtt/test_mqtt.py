@@ -307,7 +307,7 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
 def test_no_payload_keeps_a_stop_back(
     broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
 ) -> None:
-    """Neither one of any length, nor one that was cut off or is no text."""
+    """The payloads are long, truncated, or not text."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, f"multidrop/{topic}", payload)

@@ -336,7 +336,7 @@ def test_a_stop_waits_for_no_other_tab(
 def test_nothing_that_comes_later_takes_the_place_of_a_stop_s_question(
     opened: Opener, gateway: FakeGateway, case: str
 ) -> None:
-    """The answer to what was asked before comes while a person is about to press the stop."""
+    """The answer to an earlier request arrives while the user is about to confirm the stop."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []
     if case == "a reload":
@@ -410,7 +410,7 @@ def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> 
 def test_the_page_waits_for_longer_than_a_stop_is_repeated(
     opened: Opener, gateway: FakeGateway, verb: str
 ) -> None:
-    """Else it would never say which drives stand where one of them is dead."""
+    """Otherwise, with one dead drive, it would never report which drives have stopped."""
     page = opened("#/drives/pump-1")
     page.evaluate("""() => {
         const make = AbortSignal.timeout;

@@ -302,7 +302,7 @@ def test_no_more_drives_are_chosen_than_there_are_lines_to_tell_apart(opened: Op
 def test_time_before_the_gateway_started_is_not_shown_as_fault_free(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """It began in the middle of the hour that is shown."""
+    """The gateway started in the middle of the displayed hour."""
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     lanes = page.locator("#lane .bars")
     until_met(page, lambda: lanes.all_inner_texts() == ["none"] * 2)

@@ -145,7 +145,7 @@ def test_a_fault_that_finds_no_room_colours_the_strip(opened: Opener, gateway: F
 
 
 def test_the_hour_ends_with_its_newest_minute(opened: Opener, gateway: FakeGateway) -> None:
-    """A plant that began two minutes ago has two bars at the right, not at the left of an hour."""
+    """Two minutes after the start there are two bars at the right of the hour, not at its left."""
     newest = 1_764_115_200_000  # 00:00 UTC
     minutes = [
         {"time": newest - MINUTE_MS, "asked": 90, "misses": {"no reply": 2}},

@@ -118,7 +118,7 @@ def test_a_key_that_is_held_down_is_one_press(opened: Opener, gateway: FakeGatew
 
 @pytest.mark.parametrize("size", ["desk", "phone"])
 def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway, size: str) -> None:
-    """The dialog's button is put where the button of the panel is, as a scrolled phone may have it."""
+    """The dialog's button covers the panel's button, as on a scrolled phone."""
     page = opened("#/drives/pump-1", size)
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
