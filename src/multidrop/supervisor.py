@@ -80,7 +80,7 @@ class Supervisor:
     def _note_end(self, name: str, task: asyncio.Task[Any]) -> None:
         failure = None if task.cancelled() else task.exception()
         if self._kept.get(name) is not task:
-            return  # it was released
+            return  # the task was released
         del self._kept[name]
         self.note_dead(name, "it was cancelled" if task.cancelled() else reason_of(failure), failure)
 
@@ -100,7 +100,7 @@ class Supervisor:
     def start(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
         """Start a task that ends by itself. Its failure is logged unless it is awaited."""
         task = asyncio.get_running_loop().create_task(work, name=name)
-        self._short.add(task)  # the loop keeps no reference
+        self._short.add(task)  # the event loop keeps no reference to tasks
         task.add_done_callback(self._short.discard)
         return task
 

@@ -49,7 +49,7 @@ class Conflict(Exception):
 
 
 MOST_DENIALS = 1000
-REFUSALS = (  # part of a failure's text, and its meaning
+REFUSALS = (  # part of an error's text, and the sentence for users
     (
         "authorization violation",
         "{} refuses these credentials, or the lack of any: see --credentials",

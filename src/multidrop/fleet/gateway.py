@@ -116,7 +116,7 @@ class FleetGateway:
                 await self._until_the_end()
                 for name in ("look", "member"):
                     supervisor().let_go(name)
-                self.member.end()  # no effect if it is already leaving
+                self.member.end()  # no effect if the member is ending already
                 await asyncio.wait([member])
                 await end_tasks(looking)
                 with suppress(Ended, PollingFailed, asyncio.CancelledError):  # the supervisor reports them

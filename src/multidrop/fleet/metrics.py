@@ -136,7 +136,7 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
                     writer.write(_answer(await reader.readuntil(b"\r\n\r\n"), metrics))
                     await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # gone, too slow, or too much data
+            pass  # the client is gone or too slow, or sent too much
         finally:
             clients.discard(writer)
             writer.close()

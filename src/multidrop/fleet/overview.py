@@ -22,7 +22,7 @@ from multidrop.printable import masked
 
 MOVES_SHOWN = 20
 MISSED_MS = 30 * 24 * 3600 * 1000  # how long a gateway that did not come back is reported
-_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # in the spool part of a gateway's answer
+_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # types of entries in the spool part of a gateway's answer
     "behind": (int, NoneType),
     "lag_s": (int, float, NoneType),
     "trouble": (str, NoneType),

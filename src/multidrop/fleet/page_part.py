@@ -107,7 +107,7 @@ class FleetPart:
         except (OSError, ValueError) as failure:
             return {"the fleet": (False, masked(str(failure)))}
         found = {name: (one.is_done, one.text) for name, one in answer.drives.items()}
-        if not found or not answer.is_done:  # a line without a master has no drives here
+        if not found or not answer.is_done:  # the answer has no drives of a line without a master
             found["the fleet"] = answer.is_done, answer.text
         return found
 

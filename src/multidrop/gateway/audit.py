@@ -13,7 +13,7 @@ from multidrop.gateway.http.messages import Denied
 
 MOST_RECORDS = 200  # limit of an answer
 
-_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # or a prefix, such as a day
+_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # or a prefix, as of a day
 
 
 def time_asked(query: Mapping[str, str]) -> str:

@@ -47,7 +47,8 @@ UNAUDITED = "the audit log cannot be written"  # a `rule` of WriteForbidden
 OVERTAKEN = "a stop was called"  # a `rule` of WriteForbidden
 WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
-# Takes the command's text and returns until when it may be sent (CLOCK_BOOTTIME, ns); raises WriteForbidden.
+# Called with a command's text; returns until when it may be sent (CLOCK_BOOTTIME, ns) or raises
+# WriteForbidden.
 Admit = Callable[[str], float]
 
 _CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>\(\)|`)?")
@@ -93,8 +94,8 @@ class Commands:
         self.may = may
         self.withheld = ""  # why only stops are sent
         self._on_reset = on_reset
-        self._halts: Counter[str] = Counter()  # by drive: commands besides stops that end a run
-        self._jogging: Counter[str] = Counter()  # by drive: jogs under way
+        self._halts: Counter[str] = Counter()  # by drive: commands other than stops that end a run
+        self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
         self._lines = lines
         self.called = 0  # commands that passed all rights, so far
         self._under_way: Counter[str] = Counter()  # by line: writes in progress

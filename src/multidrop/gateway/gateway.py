@@ -67,7 +67,7 @@ class Gateway:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
-        self.revision = secrets.randbits(32)  # of the plant; random, to differ from other processes
+        self.revision = secrets.randbits(32)  # number of the plant's version; starts at random
         self.failures: dict[str, int] = {}
         self.audit = settings.audit
         self.unaudited = ""  # why the audit log is not written
@@ -80,7 +80,7 @@ class Gateway:
         self._has_news = False  # a frame is due
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None  # None before polling starts
-        self._made: Poller | None = None  # the same object, set before it polls
+        self._made: Poller | None = None  # the same object as `poller`, but set before polling starts
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
@@ -115,7 +115,7 @@ class Gateway:
         except BaseException:
             self.listener.close()
             if self._made is not None:
-                with suppress(Exception):  # logged already
+                with suppress(Exception):  # any failure is logged already
                     in_time("polling", END_S, self._made.close)
             raise
 
@@ -191,7 +191,7 @@ class Gateway:
             await asyncio.wait_for(work, seconds)
         except TimeoutError:
             _log.error("%s did not end in time", name)
-        except Exception:  # the others are ended nevertheless
+        except Exception:  # the other parts of the gateway are ended nevertheless
             _log.exception("ending %s failed", name)
 
     async def _find_audit(self) -> None:
@@ -216,7 +216,7 @@ class Gateway:
             Watched(make_app(self), self.connections),
             backlog=BACKLOG,
             http=WatchedProtocol,
-            h11_max_incomplete_event_size=MOST_HEAD,  # limit of a head that arrives in pieces
+            h11_max_incomplete_event_size=MOST_HEAD,  # limit of a request's head that arrives in pieces
             ws="none",
             lifespan="off",
             log_config=None,

@@ -24,7 +24,7 @@ class Figures(NamedTuple):
     viewers: int
     frames: int
     dropped: int  # number of rows
-    failures: Mapping[str, int]  # of parts, by name
+    failures: Mapping[str, int]  # number of failures of each part, by name
     parts: Sequence[MetricFamily]  # the parts' own metrics
 
 

@@ -116,7 +116,7 @@ class LiveParts:
         self.pending: dict[str, Building] = {}
         self._host = host
         self._settings: dict[str, Any] = {}
-        self._built: dict[str, Building] = {}  # not started yet
+        self._built: dict[str, Building] = {}  # parts that are not started yet
 
     async def build(self, wanted: Mapping[str, Any]) -> dict[str, Building]:
         """Build the parts of a starting gateway. Raises ValueError if one cannot be opened."""
@@ -163,7 +163,7 @@ class LiveParts:
         for name, settings in replacement.before.items():
             try:
                 self.take_up(await self._build({name: settings}, self._host.plant))
-            except Exception as failure:  # another program may have taken its port
+            except Exception as failure:  # such as a port that another program uses now
                 self.dead[name] = str(failure)
                 _log.error("%s did not start again: %s", name, failure)
 
@@ -249,5 +249,5 @@ async def _close_built(name: str, building: Building) -> None:
 async def _close(name: str, part: Part, seconds: float) -> None:
     try:
         await asyncio.wait_for(part.close(), seconds)
-    except Exception:  # the others are closed nevertheless
+    except Exception:  # the other parts are closed nevertheless
         _log.exception("closing %s failed", name)

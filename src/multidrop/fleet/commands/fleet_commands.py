@@ -161,7 +161,7 @@ class FleetCommands:
         except NotDelivered:
             why = f"{offered.text} was not sent: {offered.gateway} is gone since its offer"
             return CommandAnswer(CommandOutcome.NOT_SENT, why)
-        except (FleetError, ValueError):  # it may have been delivered
+        except (FleetError, ValueError):  # the confirmation may have been delivered
             answer = CommandAnswer(CommandOutcome.UNDER_WAY, "")
         asked = json.dumps({"ask": offered.token}).encode()
         lost = f"{offered.text}: it is not known whether it was sent: {offered.gateway} no longer answers"
@@ -210,7 +210,7 @@ class FleetCommands:
         """
         drives = [drives] if isinstance(drives, str) else drives
         wanted, unknown = await self._lines_of(drives, line)
-        asked = spelt(by or self.by) or UNNAMED  # a stop is sent under any name
+        asked = spelt(by or self.by) or UNNAMED  # a stop is sent even without a valid name
         answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news, asked) for one in wanted))
         answers += unknown
         if len(answers) == 1:

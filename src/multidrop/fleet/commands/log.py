@@ -27,7 +27,7 @@ class CommandLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self._log = AuditLog(path)
-        self._turn = asyncio.Lock()  # records are in the order of the calls
+        self._turn = asyncio.Lock()  # keeps records in the order of the calls
         self._writing = threading.Lock()
         self._is_closed = False
 

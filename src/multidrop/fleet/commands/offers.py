@@ -56,7 +56,7 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     arguments = verb_arguments(verb, request.options)
     if verb in _MOVING:
         drive.check_confirmed(verb)
-    next(getattr(drive, verb).script(**arguments), None)  # raises if the family forbids it
+    next(getattr(drive, verb).script(**arguments), None)  # raises if the family forbids the verb
     options = "".join(f", {name} = {getattr(value, 'value', value)}" for name, value in arguments.items())
     text = f"{drive.name}: {verb}{options}"
     if verb not in _MOVING:

@@ -81,8 +81,10 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
-        self._newest = 0  # session of this process: no number is used twice, even if a record is forged
-        self._ended: set[int] = set()  # paths that others have ended: they stay ended for this session
+        self._newest = (
+            0  # newest session of this process; no number is used twice, even if a record is forged
+        )
+        self._ended: set[int] = set()  # paths on which others have ended this session's record
 
     # ---- state ----
 
@@ -181,7 +183,7 @@ class Lease:
             revision = await self._buckets[path].put(self.name, self._value(), record.revision)
         except (Conflict, FleetError):
             return
-        if nonce == self._nonce:  # else it answers an earlier session
+        if nonce == self._nonce:  # otherwise this was the answer to an earlier session
             self.held[path] = Held(revision, sent)
 
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
@@ -230,7 +232,7 @@ class Lease:
             if isinstance(failure, Unsure):
                 await self._look_again(path, nonce, held)
         else:
-            if nonce == self._nonce:  # else it answers an earlier session
+            if nonce == self._nonce:  # otherwise this was the answer to an earlier session
                 self.held[path] = Held(revision, sent)
                 self._extend()
 

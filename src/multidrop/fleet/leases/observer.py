@@ -38,10 +38,10 @@ class Observer:
         self.me = me
         self.terms = terms
         self.paths = [Follower(bucket) for bucket in buckets]
-        self.ended = 0  # sessions that this gateway ended
+        self.ended = 0  # number of sessions that this gateway ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
         self._looked = [0] * len(self.paths)  # when the newest answered read started
-        self._over: dict[str, int] = {}  # each gateway's newest session that is certainly over
+        self._over: dict[str, int] = {}  # newest session that is certainly over, by gateway
         self._clock = clock
 
     def begin_anew(self) -> None:
@@ -74,7 +74,7 @@ class Observer:
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
         before = watched.get(record.key)
-        if before is not None and is_ended_by_another(record):  # not a renewal: the waiting time continues
+        if before is not None and is_ended_by_another(record):  # the waiting time continues
             watched[record.key] = before._replace(revision=record.revision)
         else:
             watched[record.key] = lease_rules.watch(before, record.revision, self._clock())
@@ -168,7 +168,7 @@ class Observer:
                 and not record.value["ended"]
                 and self._is_stale(path, record, self._looked[path])
             }
-            if lease_rules.is_over(len(stale), self.terms):  # fewer: it is alive, and would only be weakened
+            if lease_rules.is_over(len(stale), self.terms):  # with fewer, the gateway is alive
                 found[name] = stale
         return found
 
@@ -215,7 +215,7 @@ class Observer:
                 if len(answers) >= self.terms.ended:
                     break
         except TimeoutError:
-            pass  # the rest is judged again with newer records
+            pass  # the next step judges the rest by newer records
         finally:
             await end_tasks(*ends)  # a request in flight may still be stored, and is read later
         return any(answers)

@@ -46,8 +46,8 @@ class FleetLines:
     def _take(self, record: Record) -> None:
         line = line_of(record, self._folder)
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
-        if not any(one.drive.name in polled for one in line.drives):  # otherwise `add_line` refuses it
-            self._units.note(line, time.monotonic_ns())  # before the first of its rows
+        if not any(one.drive.name in polled for one in line.drives):  # otherwise `add_line` refuses the line
+            self._units.note(line, time.monotonic_ns())  # before the line's first row
         before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)

@@ -93,7 +93,7 @@ class LineKeeper:
         self._unopened = unopened or UnopenedLines(lambda: lease.clock())
         self._port_loss = port_loss
         self._is_leaving = False
-        self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is being opened, closed or claimed
+        self._at_work: dict[str, asyncio.Task[None]] = {}  # opening, closing or claim in progress, by line
         self._tasks: set[asyncio.Task[None]] = set()
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
@@ -214,19 +214,19 @@ class LineKeeper:
 
     def _start(self, lines: Sequence[str], work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
-        self._tasks.add(task)  # the loop keeps no reference to it
+        self._tasks.add(task)  # the event loop keeps no reference to tasks
         self._at_work |= dict.fromkeys(lines, task)
         task.add_done_callback(lambda done: self._done(lines, done))
 
     def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         for line in lines:
-            if self._at_work.get(line) is task:  # otherwise the next task on it has started
+            if self._at_work.get(line) is task:  # otherwise the line's next task has started
                 del self._at_work[line]
         self._on_change()
         failure = None if task.cancelled() else task.exception()
         if failure and not self._failure:
-            self._failure = failure  # this line may not be closed
+            self._failure = failure  # this line may still be open
             self._has_failed.set()
 
     def _take_new(self, line: str) -> None:

@@ -23,7 +23,7 @@ NOBODY = ""
 NEEDED = 2  # votes of a master
 
 Owner = tuple[str, int]  # a gateway and its session
-LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: not read
+LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: not read yet
 
 
 class Claim(NamedTuple):

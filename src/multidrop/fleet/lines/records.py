@@ -108,7 +108,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         try:
             return bool(await self.plant.look())
-        finally:  # records read before a failure are not read again
+        finally:  # also after a failure: records read before it are not read again
             if self._has_plant_changed:
                 self._has_plant_changed = False
                 self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
@@ -125,7 +125,7 @@ class FleetRecords:
             if former in self._owned and former not in map(owner_of, records.values()):
                 self._owned[former].discard(line)
                 if not self._owned[former]:
-                    del self._owned[former]  # sessions come and go for years
+                    del self._owned[former]  # sessions would accumulate for years
         if record.value:
             self._note_move(line)
 
@@ -139,12 +139,12 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            if known != master:  # otherwise it claimed the line again after an uncertain release
+            if known != master:  # equal: a gateway claimed its line again after an uncertain release
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
 ASKED_AT_ONCE = 500  # lines in one read; servers allow 1024
-DOUBT_S = 30.0  # longer than an election, after which an unanswered write may still be stored
+DOUBT_S = 30.0  # longer than an election: an unanswered write may be stored after one
 
 
 class ShareFollower(Follower):

@@ -91,7 +91,7 @@ class Sharers(NamedTuple):
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
-    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # by gateway
+    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # gateway, and the lines it could not open
 
 
 class Shares:

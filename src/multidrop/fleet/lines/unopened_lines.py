@@ -18,7 +18,7 @@ LOST_NS = 6 * SECOND  # a line whose port is lost is reported this long after it
 REPLY_NS = 3 * SECOND  # an older reply does not show when the port was lost
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait for a trial
 TRIAL_NS = 60 * SECOND  # the trial of a line that did not come back ends after this time
-MOST_BYTES = 8_000  # of line names in a lease record
+MOST_BYTES = 8_000  # limit of line names in a lease record
 
 
 class UnopenedLines:
@@ -65,7 +65,7 @@ class UnopenedLines:
         if line == self._tried:  # the network is back: try the other lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                del self._named[other]  # not of this gateway's share: a trial would not bring it back
+                del self._named[other]  # not in this gateway's share: a trial would not bring the line back
 
     def gone(self, line: str) -> None:
         """Note that the line is no longer ours: forget its failures."""

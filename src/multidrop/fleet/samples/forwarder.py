@@ -77,7 +77,7 @@ class Forwarder:
         stored = self._spool.following(self._last)
         if stored is None:
             return 0.0
-        with suppress(OSError):  # just removed
+        with suppress(OSError):  # the spool may have just removed the file
             return max(0.0, time.time() - stored.path.stat().st_mtime)
         return None
 
@@ -95,7 +95,7 @@ class Forwarder:
                 await self._forward()
             except (StreamError, NotOurLog, OSError) as failure:
                 self._note(str(failure))
-            except Exception as failure:  # a bug here, or no memory
+            except Exception as failure:  # such as a bug here, or MemoryError
                 self._note(f"{type(failure).__name__}: {failure}", failure)
             await asyncio.sleep(AGAIN_S)
 
@@ -112,7 +112,7 @@ class Forwarder:
                 end_if_cancelled()
                 continue
             data = await asyncio.to_thread(_read, stored.path)
-            if data is None:  # just removed: the spool is full
+            if data is None:  # the full spool has just removed the message
                 continue
             found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
             end_if_cancelled()
@@ -127,7 +127,7 @@ class Forwarder:
         """Return position and sequence of the last message of this log in the stream."""
         last = await last_of(self._client, self._subject)
         end_if_cancelled()
-        if last is None or last.sequence == 0:  # the stream drops old messages, and ignores forged ones
+        if last is None or last.sequence == 0:  # none is stored any longer, or the last one is forged
             sequence = self._last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence

@@ -46,7 +46,7 @@ LATEST = 4  # MetadataVersion.V5: older versions mark compressed buffers differe
 MOST_MESSAGES = 100  # Arrow messages in a stream: the schema, dictionaries and rows
 _DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of messages: MessageHeader in Message.fbs
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
-_BUFFER = Struct("<qq")  # offset in the body, and length
+_BUFFER = Struct("<qq")  # a buffer's offset in the body, and its length
 _NOT_COMPRESSED = -1  # marks a buffer that compression would not shrink
 
 
@@ -123,12 +123,12 @@ MOST_BYTES = 900_000  # of a message: NATS accepts 1 MiB by default, its headers
 MOST_ROWS = 1 << 16
 MOST_UNPACKED = 4 << 20  # bytes: 2.4 MB of rows, and names
 MOST_NAME = 1000  # bytes of a name, status or unit; PostgreSQL indexes names
-MOST_SAID = 300  # characters of an error about a message
+MOST_SAID = 300  # limit of the characters of an error's text
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
 NAMED = pa.dictionary(pa.int32(), pa.utf8())  # codes are wide enough for the names of many messages together
 TIMES = pa.timestamp("ns", "UTC")
-ROWS = pa.schema(  # as `unpack` returns them, and as in recordings
+ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
     [
         pa.field("time", TIMES, nullable=False),
         pa.field("monotonic_ns", pa.int64(), nullable=False),

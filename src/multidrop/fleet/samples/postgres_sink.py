@@ -204,7 +204,7 @@ create or replace view multidrop.samples as
     join multidrop.register_sets r on r.id = e.registers
     cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
 """
-HAS_UNITS = (  # tables of older hubs have none
+HAS_UNITS = (  # the view of an older hub has no column `unit`
     "select from information_schema.columns"
     " where table_schema = 'multidrop' and table_name = 'samples' and column_name = 'unit'"
 )

@@ -243,7 +243,7 @@ class Spool:
         self.gateway = checked_name("gateway", gateway)
         self._folder = SpoolFolder(Path(folder), gateway, checked_name("fleet", fleet))
         self.log = self._folder.log
-        self.on_message: Callable[[], object] = lambda: None  # called in the spool's thread after each
+        self.on_message: Callable[[], object] = lambda: None  # called in the thread, per message
         self._most = most
         self._units = units or PolledUnits()
         self._stored = sum(message.size for message in self._folder.messages.values())

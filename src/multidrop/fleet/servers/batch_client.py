@@ -18,8 +18,8 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 STATUS = slice(9, 12)  # place of the status in headers such as "NATS/1.0 404 No Messages"
-PROCESSED = 4  # arguments of Client._process_msg after the subscription's number
-WHOLE = ("204", "404")  # final statuses: after some messages, and after none
+PROCESSED = 4  # number of arguments of Client._process_msg after the subscription's number
+WHOLE = ("204", "404")  # final statuses: after the last message, and if there are none
 
 
 class DirectMessage(NamedTuple):

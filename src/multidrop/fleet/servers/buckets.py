@@ -18,7 +18,7 @@ from multidrop.fleet.servers.record_shapes import largest, parsed
 NONE_YET = 0  # revision of a key without a record
 BATCH = 1000  # records in one read
 FOLLOW_S = 0.2  # between reads of a bucket
-MOST_STRANGE = 1000  # invalid records of a bucket that are logged
+MOST_STRANGE = 1000  # at most this many invalid records of a bucket are logged
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
@@ -122,7 +122,7 @@ class Bucket:
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
         self.path = path
-        self._strange: set[str] = set()  # keys with an invalid record that was logged
+        self._strange: set[str] = set()  # keys whose invalid record was logged
 
     async def put(self, key: str, value: Any, revision: int) -> int:
         """Replace the record if it has exactly this revision, and return the new revision.

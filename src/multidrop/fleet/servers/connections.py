@@ -30,10 +30,10 @@ from multidrop.printable import masked
 
 OLDEST = (2, 12)  # version; 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
-ANSWER_S = 1.0  # per request; a lease is renewed twice a second
+ANSWER_S = 1.0  # time limit of an answer; a lease is renewed twice a second
 PONG_S = 0.7  # time limit of a ping; a slower server is left for another one
 KEEP_S = 1.0  # between checks of a connection
-# With 0 attempts nats-py would retry a closed port until our own timeout.
+# If the limit of attempts were 0, nats-py would retry a closed port until our own timeout.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 
 _log = logging.getLogger("multidrop.fleet")
@@ -171,7 +171,7 @@ class ServerPath:
             await self.subscribe(subject, called)
             client = self._connected()
             with suppress(NatsError, OSError, TimeoutError):
-                await client.flush()  # this ping may overtake pending data, the next one cannot
+                await client.flush()  # this ping may overtake pending data; the next one cannot
                 await client.flush()
 
     async def request(

@@ -31,7 +31,7 @@ STALLED_S = 10.0  # a client that reads none of its answers for this long is clo
 ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
-STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may be a stop too
+STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may be a kind of stop
 BACKLOG = 64  # pending connections; all are accepted together, before MOST_OPEN applies
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
@@ -43,7 +43,7 @@ _WHY = {
 class Rank(IntEnum):
     """The order in which connections are closed at MOST_OPEN; within a rank, the oldest is closed first."""
 
-    GREEDY = 0  # the client sends requests ahead of its answers, or reads none
+    GREEDY = 0  # the client sends requests without waiting for answers, or does not read these
     IDLE = 1
     BUSY = 2
     FRESH = 3  # new, and still without a request
@@ -74,7 +74,7 @@ class _Open:
 
     def end(self) -> None:
         """Shut the socket down; the server then closes the connection."""
-        with suppress(OSError):  # closed already
+        with suppress(OSError):  # the socket is closed already
             self.peer.shutdown(socket.SHUT_RDWR)
 
 
@@ -136,7 +136,7 @@ class Connections:
     def finish(self, client: tuple[str, int] | None) -> None:
         """Note that a request was answered."""
         if client in self._open:
-            found = self._open[client] = self._open.pop(client)  # now last in order
+            found = self._open[client] = self._open.pop(client)  # moves it to the end of the order
             found.is_busy = found.is_stop = False
             found.fresh_until, found.ends = 0.0, self._clock() + AGAIN_S
 

@@ -23,7 +23,7 @@ MOST_EXPORTS = 8  # concurrent exports
 PIECE_S = 600.0  # time limit of a piece; before the first piece of Parquet the whole file is made
 R = TypeVar("R")
 MOST_NAME = 80  # characters of a series' name in a file name
-FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # in file names
+FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # signs that some systems forbid in file names
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 
 

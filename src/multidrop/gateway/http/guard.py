@@ -32,7 +32,7 @@ ANYONE = "anyone"
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
 HAS_WRONG_TOKEN = "has_wrong_token"  # key in a request's scope; a stop is sent despite a wrong token
-MOST_HEAD = 64 * 1024  # bytes of a request's head: a browser sends the cookies of all ports of a host
+MOST_HEAD = 64 * 1024  # limit of a request's head in bytes; browsers send the cookies of all ports of a host
 
 
 def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
@@ -150,7 +150,7 @@ class Guard:
         local = is_loopback(address) and not self._behind_proxy
         free = self._may().without_token(is_loopback=local)
         secret, way = _secret(headers)
-        secret = secret if self._tokens else ""  # ignore it if the gateway has no tokens
+        secret = secret if self._tokens else ""  # without tokens of its own, the gateway ignores any token
         token: Token | None = None
         is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
         if secret and not is_shut:

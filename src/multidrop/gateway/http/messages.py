@@ -14,7 +14,7 @@ from starlette.responses import Response
 from multidrop.gateway.http.rights import Caller
 from multidrop.printable import plain_whole
 
-MOST_BYTES = 64 * 1024  # of a body
+MOST_BYTES = 64 * 1024  # limit of a body
 BODY_S = 10.0  # time limit for a body
 STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
 _log = logging.getLogger("multidrop.gateway")

@@ -19,9 +19,9 @@ from multidrop.gateway.live.hub import (
 )
 
 STOPPED, PORT = "stopped", "port"  # kinds in addition to "fault" and "silent"
-KINDS = (FAULT, STOPPED, PORT, SILENT)  # the gravest first
+KINDS = (FAULT, STOPPED, PORT, SILENT)  # the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
-STANDS_MS = 2000  # a motor must be at rest this long: a reversing one passes 0 Hz
+STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
 MOST_ENDED = 1000  # ended alarms kept
 MOST_SHOWN = 20  # ended alarms shown
 LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
@@ -76,7 +76,7 @@ class Alarms:
         """
         state, words = shown.state, shown.words
         if state == SILENT:
-            if not (words or "").startswith(LOST):  # a lost port is one alarm of the line
+            if not (words or "").startswith(LOST):  # a lost port raises one alarm of the line instead
                 self._begin(time, "", drive, SILENT, words or "no reply")
             return
         if words == NOT_ASKED:

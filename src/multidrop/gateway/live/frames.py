@@ -26,7 +26,7 @@ EARLY_S = 0.02  # a frame may come this much earlier after a late one
 WAIT_S = 20.0  # longest wait for a frame
 MOST_VIEWERS = 200  # viewers waiting concurrently
 WHOLE = -1  # in a request: the viewer has no frame
-REMEMBERED = 6  # newest frames kept: a viewer may be a second behind
+REMEMBERED = 6  # number of newest frames kept; a viewer may be a second behind
 
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
@@ -215,7 +215,7 @@ class Frames:
         turn: asyncio.Future[None] = loop.create_future()
         self._waiting.add(turn)
         self._build_when_due()
-        timer = loop.call_later(WAIT_S, _let_go, turn)  # cheaper than wait_for
+        timer = loop.call_later(WAIT_S, _let_go, turn)  # costs less than asyncio.wait_for
         try:
             await turn
         finally:
@@ -234,7 +234,7 @@ class Frames:
             return None
         newest = self._remembered[-1]
         known = next((one for one in self._remembered if one["n"] == n), None)
-        if known is None or known["revision"] != newest["revision"]:  # another plant with other keys
+        if known is None or known["revision"] != newest["revision"]:  # the plants, and so the keys, differ
             n, known = WHOLE, None
         if n not in self._encoded:
             told = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}

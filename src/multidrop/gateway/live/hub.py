@@ -13,7 +13,7 @@ from multidrop import Batch, Condition, Plant, PolledDrive, Register
 from multidrop.drive import FAULT_RECORDS, StateReader
 
 STALE_NS = 1_000_000_000  # a value stays current at least this long,
-STALE_PERIODS = 3  # and at least this many periods
+STALE_PERIODS = 3  # and for at least this many polling intervals
 
 KeptRow = tuple[int, int, float, int]  # time, monotonic time, value (meaningless in a miss), status
 Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good row, is it fresh
@@ -29,7 +29,7 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between reading two clocks
+LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between the reads of two clocks
 FAULT_REGISTER = "fault"
 RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
 _TURNING = ("output_frequency", "motor_speed")  # the motor turns if one is not 0
@@ -352,7 +352,7 @@ class Hub:
         if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
             register = watched.polled.drive.registers[FAULT_REGISTER]
             return Shown(FAULT, _words(register, fresh[FAULT_REGISTER]))
-        is_turning = any(fresh.get(name) for name in _TURNING)  # 0 Hz may be a run at a setpoint of 0
+        is_turning = any(fresh.get(name) for name in _TURNING)  # a motor at 0 Hz may run with a setpoint of 0
         if is_turning:
             return Shown(RUNS, None)
         note = found.note if found is not None else _lack(watched)
@@ -405,7 +405,7 @@ def _turns_since(watched: _Watched, since_ns: int) -> bool:
 
 def _forget_trip(watched: _Watched) -> None:
     watched.trip = None
-    watched.reader = StateReader(watched.polled.drive)  # the old one remembers the record
+    watched.reader = StateReader(watched.polled.drive)  # the old reader remembers the fault record
 
 
 def _words(register: Register[Any], value: float) -> str:

@@ -174,7 +174,7 @@ def troubles_of(gateway: Gateway) -> list[str]:
 def _health_of_part(feed: object) -> str:
     try:
         return str(getattr(feed, "health", str)()) or "ok"
-    except Exception as failure:  # also a problem of the part
+    except Exception as failure:  # the exception is a problem of the part, too
         return f"{type(failure).__name__}: {failure}"
 
 

@@ -32,7 +32,7 @@ MOST_UNTAKEN = 1 << 18  # bytes of answers that a client has not read
 MOST_UNDER_WAY = 16  # requests of one client waiting for lines
 IDLE_S = 300.0  # idle clients are closed after this time,
 FORGETTABLE_S = 10.0  # or after this time if a new client needs the place
-STALLED_S = 10.0  # a client that reads none of its answers for this long is cut
+STALLED_S = 10.0  # a client that reads none of its answers for this long is disconnected
 SWEEP_S = 1.0  # interval of checking all clients
 
 _log = logging.getLogger("multidrop.gateway")
@@ -272,7 +272,7 @@ class ModbusPort:
         self.clock = clock
         self.share = share or RoundShare()
         self.clients: set[ModbusClient] = set()
-        self.refused = 0  # connections
+        self.refused = 0  # number of refused connections
         self._may_connect = may_connect
         self._server: asyncio.Server | None = None
 

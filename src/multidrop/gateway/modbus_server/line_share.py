@@ -14,7 +14,7 @@ from typing import Any
 
 from multidrop.supervisor import supervisor
 
-SHARE = 0.2  # of a line's time
+SHARE = 0.2  # share of a line's time
 BURST_S = 0.2  # line time available without waiting after a pause
 MOST_WAITING = 8  # waiting requests per line
 EXPIRY_S = 1.0  # a waiting request is dropped after this time
@@ -29,7 +29,7 @@ class _WaitingAsk:
     client: object
     work: Callable[[float], Awaitable[Any]]
     answer: asyncio.Future[Any]
-    expires: float  # s, of the loop's clock
+    expires: float  # time of the loop's clock in s
     timer: asyncio.TimerHandle | None = None
 
 
@@ -44,7 +44,7 @@ class LineShare:
         self._left_s = BURST_S  # line time available now; negative after a long request
         self._filled = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
-        self.used_s = 0.0  # line time so far
+        self.used_s = 0.0  # line time used so far
         self.asked = 0
 
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:

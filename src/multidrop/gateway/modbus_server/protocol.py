@@ -158,7 +158,7 @@ class WriteRequest(NamedTuple):
 
     carrier: Carrier
     address: int
-    size: int  # words or bits
+    size: int  # number of words or bits
     data: bytes
 
 

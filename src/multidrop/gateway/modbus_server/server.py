@@ -87,7 +87,7 @@ class ModbusServer:
         self._shares: dict[str, LineShare] = {}
         self._sockets: dict[str, Any] = {}  # listening sockets by line
         self._listening: list[ModbusPort] = []
-        self._stops: dict[str, set[asyncio.Task[int]]] = {}  # in progress, by drive
+        self._stops: dict[str, set[asyncio.Task[int]]] = {}  # stops in progress, by drive
 
     # ---- start and end ----
 
@@ -169,7 +169,7 @@ class ModbusServer:
     async def _later(self, request: MbapRequest, task: asyncio.Task[int], wait_s: float | None) -> bytes:
         """Return the answer to a command, or "acknowledge" after `wait_s`; the command continues anyway."""
         done, _ = await asyncio.wait([task], timeout=wait_s)
-        code = task.result() if done else ModbusCode.ACKNOWLEDGE  # still in progress
+        code = task.result() if done else ModbusCode.ACKNOWLEDGE  # the command is still in progress
         return self._exception(request, code) if code else request.reply(request.data[:4])
 
     # ---- reading ----
@@ -236,14 +236,14 @@ class ModbusServer:
 
     def _write(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> Awaitable[bytes]:
         if self._role < Right.STOP:
-            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # read only
+            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # clients may only read
         carrier, address, count, data = written = WRITES[request.function](request)
         common, register = self.settings.common_addresses, unit.writable(carrier, address)
         is_one = count == (register.words if register else 1)
         if not is_one and unit.has_stop_in(written, common.start + STOP):
-            with suppress(Declined):  # too many are in progress already
+            with suppress(Declined):  # too many stops are in progress already
                 self._begin_stop(unit, client)
-            raise Declined(ModbusCode.ILLEGAL_VALUE)  # its other registers may start a motor
+            raise Declined(ModbusCode.ILLEGAL_VALUE)  # other registers in it may start a motor
         if carrier is Carrier.WORD and address in common:
             if address != common.start + STOP:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)

@@ -46,7 +46,7 @@ class Outbox:
         self._waiting: dict[str, Publication] = {}
         self._under_way: set[int] = set()
         self.sent = 0
-        self.dropped = 0  # replaced by a newer one, or lost with the connection
+        self.dropped = 0  # messages replaced by a newer one, or lost with the connection
 
     def put(self, message: Publication) -> None:
         """Queue the message, in place of an older one of its topic."""
@@ -265,7 +265,7 @@ class Broker:
         _log.info("connected to %s:%d", self._address.host, self._address.port)
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
-        self.failure = ""  # that of the previous connection
+        self.failure = ""  # forget the failure of the previous connection
         self.publish_all()
 
     def _acknowledge(self) -> None:

@@ -33,7 +33,7 @@ OWN = ("problem", "running", "set", "value")  # suffixes of ids that do not mean
 MOST = 1e12  # limit of the range of a number
 LEAST_STEP = 0.001  # smallest step of a number that Home Assistant accepts
 STALE_PERIODS = 3  # a sensor is unavailable after this many periods
-# Commands carry the time of Home Assistant's clock: the gateway refuses delayed ones.
+# Commands carry the time of Home Assistant's clock, so the gateway can refuse delayed commands.
 COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | int }}}}}}'
 
 

@@ -24,13 +24,13 @@ from multidrop.gateway.parts import PartContext
 from multidrop.plant import drive_meant
 
 ONLINE, OFFLINE = b"online", b"offline"
-MOST_KEPT = 256  # retained messages examined per connection; others wait for the next one
+MOST_KEPT = 256  # retained messages examined per connection; others are examined on the next connection
 MOST_DISCOVERY = 1 << 18  # bytes of a discovery message
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
-MOST_BYTES = 65_536  # of a write or a verb
+MOST_BYTES = 65_536  # limit of a write or a verb
 NOTHING = b""  # removes a retained message
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
@@ -89,7 +89,7 @@ class RetainedTopics:
         self._looked_at += 1
         drive = self._drive_in(_state_topic(payload))
         if drive is None or drive in there or topic != discovery_topic(self._prefix, drive):
-            return []  # of another gateway, whose prefix starts with this one
+            return []  # the message is of another gateway, whose prefix starts with ours
         return [KeptTopic(drive, topic)]
 
     def _drive_in(self, topic: str) -> str | None:

@@ -27,7 +27,7 @@ ENGINEERING_UNIT = "engUnit"  # the property that hosts show as a metric's unit
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
 MOST_PAYLOAD = 65_536  # bytes of a command
-_MOST_VARINT = 10  # bytes
+_MOST_VARINT = 10  # most bytes of a varint
 
 
 class DataType(IntEnum):
