@@ -14,8 +14,8 @@
  * pcapng file's interfaces. */
 
 enum {
-    RECORD_HEAD = 16, /* of pcap */
-    LEAST_BLOCK = 12, /* of pcapng */
+    RECORD_HEAD = 16, /* bytes before a packet of a pcap file */
+    LEAST_BLOCK = 12, /* bytes of the shortest pcapng block */
     MOST_PACKET = 1 << 16,
     RTAC_HEADER = 12,
     TAG_DISSECTOR = 12,

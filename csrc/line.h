@@ -131,9 +131,9 @@ struct md_urgent {
 /* The requests sent ahead of an exchange; all zero: none. */
 struct md_before {
     const struct md_exchange *then; /* the exchange */
-    uint64_t replies;               /* of its drive, before the last proof */
+    uint64_t replies;               /* the drive's reply count before the last proof */
     uint32_t proofs, is_probed;     /* proofs sent; its echo probe was sent */
-    uint32_t failures;              /* of its drive, before the first of them */
+    uint32_t failures;              /* the drive's failures before the first of these requests */
 };
 
 struct md_turn {
@@ -149,7 +149,7 @@ struct md_turn {
     int64_t owed_ns;       /* line time that urgent requests still owe to polling */
     struct md_before before;
     struct md_row_queue *row_queue;
-    uint32_t number; /* of the port, in row_queue */
+    uint32_t number; /* the port's number in row_queue */
     int lost_error;
     struct md_progress progress; /* each counter has one writer; readers use atomics */
     struct md_line line;

@@ -241,7 +241,7 @@ static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    if (turn->is_ending || turn->progress.lost) /* then the client moves its queue */
+    if (turn->is_ending || turn->progress.lost) /* the client moves its queue itself */
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;

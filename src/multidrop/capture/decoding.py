@@ -37,7 +37,7 @@ from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
 ROWS = 1 << 16  # limit of a batch
-_MOST_NAMES = 60_000  # of registers; a column's codes end at 65535
+_MOST_NAMES = 60_000  # limit of register names; a column's codes end at 65535
 
 
 class Decoding:

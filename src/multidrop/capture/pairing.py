@@ -29,7 +29,7 @@ class SniffedExchange:
     time_ns: int
     reply_time_ns: int
     is_sure: bool
-    raw: tuple[tuple[Side, bytes, int], ...]  # its frames, with their times
+    raw: tuple[tuple[Side, bytes, int], ...]  # frames: sender, bytes, time in ns
 
     @property
     def is_broadcast(self) -> bool:

@@ -137,4 +137,4 @@ def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
 
 
 WRAPPINGS = _wrappings(_RTU, _BYTES)
-TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # of tcp:// ports: a transaction id may start with ':'
+TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # for tcp:// ports: a transaction id may start with ':'

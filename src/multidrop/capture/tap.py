@@ -138,7 +138,7 @@ class FlightRecorder:
 
     def _write(self, now: int) -> None:
         second = (now + utc_minus_monotonic_ns()) // 10**9
-        while (path := self.directory / _name(second)).exists():  # of another recorder here
+        while (path := self.directory / _name(second)).exists():  # another recorder's file
             second += 1
         with CaptureWriter(path, self._lines, "; ".join(dict.fromkeys(self._anomalies))) as capture:
             for _, packets in self._packets:

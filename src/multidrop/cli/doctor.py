@@ -97,7 +97,7 @@ class _Target:
     settings: Settings
     rs485: RS485
     settle: float
-    line: str = ""  # its name in the plant file
+    line: str = ""  # the line's name in the plant file
 
 
 def run(arguments: argparse.Namespace) -> int:

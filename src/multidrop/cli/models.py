@@ -152,7 +152,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
     }
 
 
-_REGISTER_KEYS = (  # in this order
+_REGISTER_KEYS = (  # in the order of output
     *("name", "table", "address", "access", "unit", "step", "offset", "span", "at_least", "at_most"),
     *("values", "wire", "order", "part", "invalid", "scale_register"),
     *("kept", "ram_address", "default", "while_running", "broadcast", "moves", "harmless", "never_together"),

@@ -174,7 +174,7 @@ class Monitor:
     def _obey(self, key: str) -> None:
         if self._on_yes and key not in _STOP_KEYS:  # stop keys replace the question
             on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
-            if key in ("y", "Y"):  # with caps lock on
+            if key in ("y", "Y"):  # also with caps lock on
                 on_yes()
             else:
                 self._at.message = "nothing was sent"

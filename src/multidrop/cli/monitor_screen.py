@@ -20,7 +20,7 @@ from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE = 100  # has room for more columns
-OLD_NOTE, NOT_POLLED = "old", "not polled"  # of registers
+OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside registers
 NEVER = "never"
 LEAST_VALUE, AROUND = 12, 13  # columns: of a register's value; of its age and the blanks together
 OLD = "?"  # before an old value

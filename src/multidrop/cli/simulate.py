@@ -14,7 +14,7 @@ from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
 from multidrop.sim.faulty_wire import HELP, Faults
 
-ANY_TCP = "tcp://127.0.0.1:0"  # for a line on another machine: any free port of this one
+ANY_TCP = "tcp://127.0.0.1:0"  # any free port of this computer, to simulate a line that is elsewhere
 LOOPBACK = ("127.0.0.1", "localhost")
 NO_TERMINALS = (
     "this system has no pseudo-terminals for --ports DIR: remove --ports, and give each line a port such as "

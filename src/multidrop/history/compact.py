@@ -23,7 +23,7 @@ from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.segments import FileLock, segments_of
 
-MEMORY = "100MB"  # of DuckDB; the process takes about 80 MB more
+MEMORY = "100MB"  # limit for DuckDB; the process takes about 80 MB more
 WITH_UNITS = """
 create temp view told as select recorded.*, unit from recorded left join units using (drive, register)
 """

@@ -29,7 +29,7 @@ class SeriesTens:
 
     def __init__(self) -> None:
         self.past = 0
-        self.by_number: dict[int, Ten] = {}  # by number of the ten seconds since 1970
+        self.by_number: dict[int, Ten] = {}  # key: number of the ten-second interval since 1970
 
     def add(self, time: int, value: float | None) -> None:
         """Add a row; None is a miss."""

@@ -30,7 +30,7 @@ from multidrop.recording.format import Metadata
 
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns
-MEMORY = "200MB"  # of DuckDB
+MEMORY = "200MB"  # limit for DuckDB
 MOST_TRIES = 50  # attempts to read files that are being replaced; a slow reader may need many
 MOST_GROWING = 4  # segments whose index is cached
 FILES_AT_ONCE = 200  # per query of metadata; a text may take 100 kB
@@ -47,7 +47,7 @@ class Sources:
         self.folder = folder
         self.damage: dict[int, str] = {}  # sentences by segment
         self._growing: dict[int, GrowingSegment] = {}
-        self._bounds: dict[int, tuple[int, int]] = {}  # of times in closed segments
+        self._bounds: dict[int, tuple[int, int]] = {}  # first and last time of each closed segment
         self._known: dict[int, Known] = {}  # quantities in segments
         self._changing = threading.Lock()
         self._database = Database(MEMORY)

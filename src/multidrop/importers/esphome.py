@@ -39,7 +39,7 @@ _SHOWN = (
 )
 _TIMES = "skip_updates custom_command"  # an entry with custom_command (raw bytes) is not imported
 _WRITES = "write_lambda"
-KEYS = {  # by kind of entity
+KEYS = {  # treatment of keys, by kind of entity
     "sensor": key_table(
         carried=f"{_ITEM} value_type unit_of_measurement filters",
         irrelevant=f"{_SHOWN} register_count accuracy_decimals state_class force_update expire_after "

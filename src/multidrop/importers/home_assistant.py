@@ -45,7 +45,7 @@ _SHOWN = "unique_id device_class lazy_error_count entity_category icon friendly_
 _SWITCH = key_table(
     carried=f"{_ENTITY} write_type command_on command_off verify", irrelevant=f"{_SHOWN} optimistic"
 )
-KEYS = {  # by kind of entity
+KEYS = {  # treatment of keys, by kind of entity
     "sensors": key_table(
         carried=f"{_ENTITY} unit_of_measurement input_type data_type count structure scale offset swap "
         "reverse_order nan_value slave_count virtual_count",

@@ -44,7 +44,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     device = ImportedDevice(title)
     reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
     device.lose("the model", reason, is_entry=False)
-    names: dict[str, str] = {}  # of scale registers, by their points
+    names: dict[str, str] = {}  # names of scale registers, by name of their point
     address = FIRST
     for point in group["points"]:
         size, count = _size(point), whole(point, "count", 1)

@@ -33,7 +33,7 @@ _ORDERS = {  # the plugin uses the four orders of ABCD also for 16 and 64 bits
     **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
     **dict.fromkeys(("DCBA", "BA", "HGFEDCBA", "LSW", "LSW-LE"), "DCBA"),
 }
-FIELD_KEYS = {  # by style
+FIELD_KEYS = {  # treatment of keys, by style
     "register": key_table(carried="name byte_order data_type scale address bit", irrelevant="measurement"),
     "request": key_table(
         carried="address name type length scale omit bit", irrelevant="measurement", gap="output"

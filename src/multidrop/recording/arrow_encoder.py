@@ -29,7 +29,7 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import texts_of
 
-VERSION = ("<h", 4)  # of the format: V5
+VERSION = ("<h", 4)  # version of the Arrow format: V5
 LONGEST_TEXTS = (1 << 31) - 1  # bytes of a dictionary
 DRIVE, REGISTER, STATUS = CODED  # ids of the dictionaries
 MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # codes of each dictionary
@@ -82,7 +82,7 @@ class _CodedRows(NamedTuple):
 
     length: int
     columns: tuple[tuple[bytes, Column], ...]  # validity bitmap (empty: no nulls) and data of each column
-    names: dict[int, Names]  # by dictionary
+    names: dict[int, Names]  # by dictionary id
 
 
 def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_CodedRows]:

@@ -206,7 +206,7 @@ COLUMNS = (
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
     FileColumn(b"status", UTF8, code_bits=8),
 )
-COLUMNS_BEFORE = (  # of versions up to 0.1, and of our batches when other programs write them
+COLUMNS_BEFORE = (  # in versions up to 0.1, and if other programs write our batches
     *COLUMNS[:2],
     FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
     *(FileColumn(name, UTF8) for name in (b"drive", b"register")),

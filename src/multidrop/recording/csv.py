@@ -111,7 +111,7 @@ def _lines(file: BinaryIO, size: int) -> Iterator[str]:
 
 
 def _parse(cells: list[str]) -> Row:
-    if len(cells) - len(ROW_COLUMNS) not in (0, 1):  # with or without a unit
+    if len(cells) - len(ROW_COLUMNS) not in (0, 1):  # the column `unit` is optional
         raise ValueError(len(cells))
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells[: len(ROW_COLUMNS)]
     numbers = f"{monotonic_ns}{uncertainty_ns}{value}"

@@ -16,7 +16,7 @@ from multidrop.polling.tables import ArrowTable, WideRows
 
 Metadata = Mapping[str, Any]
 MOST_SHOWN = 16 << 20  # bytes of a file that a repr reads
-METADATA_KEY = "multidrop"  # of an Arrow schema's metadata
+METADATA_KEY = "multidrop"  # key in an Arrow schema's metadata
 
 
 class RecordingError(OSError):

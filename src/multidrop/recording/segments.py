@@ -63,7 +63,7 @@ class SegmentWriter(RecordingWriter):
             except BlockingIOError:
                 raise ValueError(f"{self.path} is being recorded by another process") from None
             before = segments_of(self.path)
-        self.number = max([after, *(number for number, _ in before)])  # of the newest segment
+        self.number = max([after, *(number for number, _ in before)])  # number of the newest segment
         for _, newest in before[-1:]:
             _cut_truncated(newest)
         self._retire()

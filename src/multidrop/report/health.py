@@ -28,7 +28,7 @@ from multidrop.report.style import (
 
 MOST_REASONS = 6  # in a picture; all others are shown together
 LEAST_IN_BIN = 20  # values; with fewer, a share of misses is not significant
-BINS = 12  # of the output frequency
+BINS = 12  # number of bins of the output frequency
 FREQUENCY = "output_frequency"
 ROOM = 2.0  # length of an axis, as a multiple of the 99 % quantile of the delays
 SHORTEST_AXIS = 0.001  # s
@@ -211,7 +211,7 @@ class LineUse:
     time: Array  # ns UTC
     needed: Array  # s: request, response delay, reply, silence; at most the measured time
     asked: Mapping[str, int]  # number of answered exchanges, by drive
-    values: int  # in their replies
+    values: int  # number of values in the replies
     seconds: float
 
     @property

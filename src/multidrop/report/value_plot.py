@@ -55,7 +55,7 @@ class Panel(NamedTuple):
 
     register: str
     unit: str
-    has_names: bool  # its counts have names: they are states
+    has_names: bool  # the counts have names, so they are states
 
     @property
     def title(self) -> str:
@@ -271,7 +271,7 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
 # Tol's pale colours: no state has the colour of a drive.
 COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
 HATCHES = ("", "////", "....")  # patterns, for when the colours are used up
-MOST_LANES = 64  # in one panel
+MOST_LANES = 64  # per panel
 NARROWEST = 1 / 1500  # part of the time axis: the least width of a state
 LETTER = 1 / 140  # part of the time axis: the width of a letter
 LANE_INCHES = 0.24
@@ -285,7 +285,7 @@ class Lane:
     drive: str
     title: str
     is_bit: bool  # the state is on or off
-    time: Array  # of its rows, ns UTC
+    time: Array  # of the rows, ns UTC
     missed: Array
     state: tuple[str, ...]  # of each run of equal rows
     begin: Array  # of each state, ns UTC

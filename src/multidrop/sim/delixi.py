@@ -11,9 +11,9 @@ MOST_GAP = 10e-3  # s between two bytes; from part 3, the only one that states a
 UNDER_VOLTAGE = 7  # fault number, POFF
 
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # by the codes of P04.28
-MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # of P04.29, first ASCII, then RTU
+MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # by codes of P04.29: ASCII, then RTU
 NATIVE_FORMATS = ("8N1", "8E1", "8O1")
-COMMANDS, STARTS = range(1, 5), (2, 3)  # of K = 02
+COMMANDS, STARTS = range(1, 5), (2, 3)  # values of the run command (K = 02)
 RUN_SOURCE, FREQUENCY_SOURCE = 0, 1  # P00.00 and P00.01
 BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
 RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28

@@ -68,7 +68,7 @@ class SimulatedDrive:
     """
 
     functions: ClassVar[Collection[int] | None] = None  # None: all of its protocol
-    codes: ClassVar[Mapping[Reason, int] | None] = None  # of refusal; None: the protocol's own
+    codes: ClassVar[Mapping[Reason, int] | None] = None  # exception codes; None: as the protocol
     needs_silence: ClassVar[bool] = False  # by its document, a frame without silence before it is ignored
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:

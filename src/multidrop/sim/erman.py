@@ -8,10 +8,10 @@ from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason
 
-COILS = range(13)  # with reserved ones, 3 to 8 and 10 to 12
+COILS = range(13)  # including reserved coils, 3 to 8 and 10 to 12
 START, STOP, EMERGENCY_STOP, FAULT_RESET = 0, 1, 2, 9
-EMERGENCY_STOPPED = 1 << 0  # in the last fault
-OVERLOADED = 1 << 5  # in the state
+EMERGENCY_STOPPED = 1 << 0  # bit of the last fault
+OVERLOADED = 1 << 5  # bit of the state
 _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
 
 

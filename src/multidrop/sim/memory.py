@@ -19,7 +19,7 @@ from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
-_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once
+_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # function codes that write several of the same cells
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # not stored, stored
 _DELIXI_STORES = 0x06
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 MAGNETISING = 0.3  # current at no load, as a part of the rated current
-ACCELERATING_TORQUE = 0.5  # of the rated torque, on top of the load
+ACCELERATING_TORQUE = 0.5  # part of the rated torque, added to the load
 BRAKING_TORQUE = 0.3
 SLIP = 0.04  # at rated torque
 HEATING = 35.0  # degrees above ambient at rated current
@@ -57,7 +57,7 @@ class Motor:
         self.maximum_frequency = self.rating.frequency
         self.acceleration_time = 10.0
         self.deceleration_time = 10.0
-        self.load = 0.4  # of the rated torque
+        self.load = 0.4  # part of the rated torque
         self.ambient = 25.0  # degrees Celsius
         self.direction = 1  # or -1
         self.frequency = 0.0  # Hz at the output, negative backwards
@@ -68,7 +68,7 @@ class Motor:
         self.fault = 0
         self.faults: deque[int] = deque(maxlen=4)  # the latest first
         self._goal: float | None = 0.0  # Hz; None: the target
-        self._brakes = False  # by direct current
+        self._brakes = False  # True while direct current brakes the motor
 
     def run(self, direction: int | None = None) -> None:
         """Run at `target`, which may change meanwhile. Without `direction`, keep the current one."""

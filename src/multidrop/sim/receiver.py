@@ -30,9 +30,9 @@ class Frame:
     body: bytes
     message: Message | None
     intact: bool
-    begin: float  # of its first bit
-    end: float  # of its last bit
-    transaction: int = 0  # of Modbus TCP
+    begin: float  # time of the first bit
+    end: float  # time of the last bit
+    transaction: int = 0  # id of a Modbus TCP frame
 
     @property
     def address(self) -> int:

@@ -28,10 +28,10 @@ from multidrop.cli.support.signals import end_signals_cancel
 GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
 LINES = 12
-DRIVES = 2  # on each line
+DRIVES = 2  # per line
 WAIT_S = 60.0  # timeout of steps that take seconds on an idle computer
 RUN_S = 2.0  # before the kill, and after each step
-KEEP = "100 MB"  # of samples, of the 256 MB of each server
+KEEP = "100 MB"  # stored samples; each server may store 256 MB
 
 Fleet = dict[str, Any]
 
@@ -41,7 +41,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.notes: list[str] = []
-        self.draw: Callable[[Fleet], object] | None = None  # on a terminal
+        self.draw: Callable[[Fleet], object] | None = None  # set if there is a terminal
         self.fleet: Fleet = {"gateways": {}, "lines": {}}
         self.updated = asyncio.Event()
         self._started = time.monotonic()

@@ -202,7 +202,7 @@ _HEX = re.compile("0[xX][0-9A-Fa-f]+")
 _BY_PORT = ("PORT", "MODEL", "ADDRESS")
 _BY_PLANT = ("PLANT.toml", "DRIVE")
 _STOPS_AND_LOOKS = ("read", "state", "stop", "coast", "emergency-stop")
-_SETTINGS = ("baudrate", "format", "framing")  # of a drive without a plant file
+_SETTINGS = ("baudrate", "format", "framing")  # options for a drive without a plant file
 
 
 @dataclass(frozen=True)

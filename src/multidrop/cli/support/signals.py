@@ -118,7 +118,7 @@ def on_end_signals(end: Callable[[], object]) -> None:
         came.add(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        if sys.platform == "win32":  # its loops handle no signals
+        if sys.platform == "win32":  # asyncio loops on Windows handle no signals
             signal.signal(number, lambda given, frame: loop.call_soon_threadsafe(come, signal.Signals(given)))
         else:
             loop.add_signal_handler(number, come, number)
