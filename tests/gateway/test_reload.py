@@ -223,7 +223,7 @@ def test_local_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
 
 
 def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: Path) -> None:
-    """The reload reports the need for a restart, so that browsers need not a month later."""
+    """Without that report, browsers would be the first to show the expired one, a month later."""
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
     with served(tmp_path, serve, tls=None) as gateway:
