@@ -146,9 +146,7 @@ class CommandDesk:
 
     def _limit_ns(self, offer: Offer) -> float:
         """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 once its offer is void."""
-        now_ns = (
-            time.monotonic_ns()
-        )  # read before the offer's clock, so a pause in between shortens the limit
+        now_ns = time.monotonic_ns()  # read first, so a pause before the next read shortens the limit
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 
     def _refusal(self, offer: Offer) -> CommandResult | None:

@@ -81,9 +81,7 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
-        self._newest = (
-            0  # newest session of this process; no number is used twice, even if a record is forged
-        )
+        self._newest = 0  # newest session of this process: no number is used twice, even if one is forged
         self._ended: set[int] = set()  # paths on which others have ended this session's record
 
     # ---- state ----

@@ -37,9 +37,8 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        self._led: dict[
-            str, float | None
-        ] = {}  # buckets with a leader; since when one of their servers is silent
+        # Buckets that have a leader, and since when one of their servers is silent (s); None: none is silent.
+        self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
         """Return the lines that may be closed now; the others must wait.

@@ -67,9 +67,8 @@ def _words(values: Iterable[int]) -> pa.UInt64Array:
 
 _NUMBER = (1 << NUMBER_BITS) - 1
 _WEIGHT = _words([(1 << 64) - 1 - _NUMBER])[0]
-_MIXER = _words([0x9E3779B97F4A7C15])[
-    0
-]  # odd: the upper bits of a product depend on all bits of the other factor
+# An odd factor: the upper bits of a product depend on all bits of the other factor.
+_MIXER = _words([0x9E3779B97F4A7C15])[0]
 
 
 def _weigh(hashes: pa.UInt64Array, gateway: str, number: int) -> pa.UInt64Array:

@@ -151,9 +151,8 @@ class ServerPath:
     async def _follow_wanted(self) -> None:
         async with self._changing:
             if self._client is not None:
-                with suppress(
-                    NatsError, OSError
-                ):  # this server is left soon; the next one gets all subscriptions
+                # If this fails, the path moves to another server soon, which gets all subscriptions.
+                with suppress(NatsError, OSError):
                     await self._bring(self._client, self._standing)
 
     async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:

@@ -205,9 +205,8 @@ class Alarms:
         self._known.add(key[:2])
         if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
             return
-        if before is not None and (
-            before.text == UNNAMED or kind == PORT
-        ):  # the same alarm with a better text
+        if before is not None and (before.text == UNNAMED or kind == PORT):
+            # This is the same alarm, with a better text.
             self._lasting[key] = before._replace(text=text)
             self._note(self._lasting[key])
             return
