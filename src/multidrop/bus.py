@@ -55,25 +55,25 @@ class Bus:
     Modbus TCP. `baudrate` and `format` replace the families' defaults for drives that are attached without
     their own. `silence`, in s, replaces the standard's t3.5 between frames, if all drives tolerate it.
 
-    - `echo`: whether the adapter repeats what it sends: "on", "off" (until it does), or "auto", to find out.
+    - `echo`: whether the adapter repeats what it sends: "on", "off" (until it does), or "auto" to detect it.
     - `transaction`: "ignore" if a Modbus TCP gateway replies with transaction ids of its own.
-    - `rs485`: the driver ("kernel") or the core ("rts-up", "rts-down", by RTS) switches between sending and
-      receiving, if the adapter does not.
+    - `rs485`: what switches between sending and receiving if the adapter does not: the driver ("kernel") or
+      the core by RTS ("rts-up", "rts-down").
     - `settle`: seconds without requests after the port opens, at most 10, for devices that restart then.
     - `ledger`: the file that counts writes to EEPROM, shared by all processes. `audit`: the log of all
       writes.
     - `expiry`: seconds. A write that cannot be sent within this time of the call, not counting the verb's own
       waits, raises Expired.
     - `stop_on_exit`: stop all drives when the bus or the program ends; see the method.
-    - `mastership`: if other processes may be masters of the line too, requests without it raise NotMaster,
-      stops included, and the port is not opened.
+    - `mastership`: for a line of which other processes may be masters too. Without holding it, all requests
+      raise NotMaster, even stops, and the port is not opened.
 
     A stop cancels each earlier call that may move a motor, on any thread, with CancelledByStop. A drive is on
     one bus at a time. Leaving the `with` block waits for pending stops and closes the port. It stops no drive
     unless `stop_on_exit` is set. Raises LineError if the port cannot be opened.
 
-    The logger `multidrop.line` reports the port's coming and going, and frames at DEBUG. `multidrop.control`
-    reports writes, refusals and stops.
+    The logger `multidrop.line` reports when the port is opened, lost and closed, and frames at DEBUG. The
+    logger `multidrop.control` reports writes, refusals and stops.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Bus:
         audit: Path | str | None = None,
         mastership: Mastership | None = None,
     ) -> Bus:
-        """Return a bus whose port is not open yet: its poller opens it, and so do stops."""
+        """Return a bus whose port is not open yet; a poller opens it, or a stop."""
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
         facts = _facts(port, echo, transaction, rs485)
@@ -168,12 +168,12 @@ class Bus:
 
     @property
     def is_open(self) -> bool:
-        """True until it is closed."""
+        """True until the bus is closed."""
         return not self._is_closed
 
     @property
     def why_lost(self) -> str | None:
-        """Why the port is still lost: "/dev/ttyUSB0: there is no such port". None while it is open."""
+        """Why the port is still lost ("/dev/ttyUSB0: there is no such port"); None while it is open."""
         return self.line.why_lost
 
     def __enter__(self) -> Bus:
@@ -197,9 +197,9 @@ class Bus:
         self._leaving.finish()
 
     def close(self) -> None:
-        """Leave the line and close the port. A write that was sent and is not answered yet is Unconfirmed.
+        """Cancel calls, wait for stops, and close the port. A write in flight raises Unconfirmed.
 
-        If a signal interrupts the wait, the closing still completes; a second call waits for it.
+        If a signal interrupts the wait, the closing still completes; a second call waits for that.
         """
         self._close()
         if self.stops_on_exit:
@@ -230,7 +230,7 @@ class Bus:
         return self._attached.drives
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
-        """Put a drive on the bus, and return it: a family with its arguments, or a drive made before.
+        """Put a drive on the bus, and return it. `drive` is a family, with its arguments, or a drive object.
 
         No request is sent; the identity of the drive is checked before its first write. Any thread may call
         this. Raises ValueError for an argument that the family does not allow, a taken address, or a drive on
@@ -245,8 +245,8 @@ class Bus:
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: its reads, writes and verbs raise NotAttached from then on.
 
-        Its motor goes on. Cancels its verbs with CancelledByStop, or with Unconfirmed if they were sent, and
-        waits for its pending stops.
+        Its motor continues as it is. Cancels the drive's verbs with CancelledByStop, or with Unconfirmed if
+        they were sent, and waits for its pending stops.
         """
         self._latches.remove(drive)
         with self._attached.lock:
@@ -261,7 +261,7 @@ class Bus:
         self._exchanges.remember(before._exchanges)
 
     def peer(self, drive: Drive) -> Peer:
-        """Return what is known about the replies of a drive. Raises NotAttached."""
+        """Return a drive's peer: its learnt timing and late replies. Raises NotAttached."""
         return self._exchanges.peer(drive)
 
     def is_asking(self, peer: Peer) -> bool:
@@ -270,7 +270,7 @@ class Bus:
 
     @property
     def peers(self) -> dict[Drive, Peer]:
-        """Known reply behaviour of each drive that is on this bus now."""
+        """The peer of each drive that is on this bus now."""
         return self._exchanges.peers
 
     # ---- commands ----
@@ -278,8 +278,9 @@ class Bus:
     def check_identity(self, drive: Drive) -> None:
         """Check that the drive at this address is of its declared family, as far as the family can.
 
-        Only reads, and only once until the port is opened again; the first write does it too. The first check
-        also logs the drive's watchdog. Raises WriteForbidden for another drive, and NoReply.
+        The check only reads, and is done only once until the port is reopened; the first write does it too.
+        The first check also logs the drive's watchdog. Raises WriteForbidden for a drive of another family,
+        and NoReply.
         """
         check_drive(drive)
         self._performer.check_identity(drive)
@@ -290,14 +291,14 @@ class Bus:
         return self._writer.identity_check.is_known(drive)
 
     def watchdog(self, drive: Drive) -> str:
-        """Return a sentence about the motor if this client dies, as far as the drive reports it."""
+        """Return a sentence on what the motor does if this client dies, as far as the drive reports it."""
         check_drive(drive)
         return self._performer.watchdog(drive)
 
-    # ---- all drives at once ----
+    # ---- all drives together ----
 
     def broadcast(self, register: Register[Any] | str, value: Any) -> dict[str, State | BusError]:
-        """Write to all drives of the line at once, and return each drive's state or error by name.
+        """Broadcast a write to all drives of the line; return each drive's state, or its error, by name.
 
         Drives do not answer a broadcast, so each state is read afterwards. All drives must be of one family
         and share their settings, because an address means different things to different families; the
@@ -306,14 +307,14 @@ class Bus:
         return self._broadcaster.write(self.drives, register, value)
 
     def stop_all(self, seconds: float | None = None) -> dict[str, Stopped]:
-        """Stop every drive, ahead of all queued requests, and return each result by the drive's name.
+        """Stop every drive, before all queued requests; return the results by drive name.
 
-        If all drives are known to be of one family with a stop broadcast, that is sent first. Then each drive
-        is sent its stop in turns until its motor is seen to stand: for `seconds`, or by default for at least
-        30 s and as long as its ramp may take. An invalid `seconds` is logged and ignored. A failure of one
-        drive is in its result and never ends the others. Calls that move a motor end with CancelledByStop if
-        they came before, or during this call. If interrupted, send the stop once more to each drive that is
-        not seen to stand.
+        If all drives are confirmed to be of one family with a stop broadcast, that is sent first. Then the
+        drives are sent their stops in turn, until each motor is seen to stand. Stops are repeated for
+        `seconds`; by default for at least 30 s, and as long as the ramp may take. An invalid `seconds` is
+        logged and ignored. A failure of one drive is in its result and never ends the others. Calls that move
+        a motor, made before or during this call, raise CancelledByStop. If interrupted, the stop is sent once
+        more to each drive that is not seen to stand.
         """
         run: StopRun | None = None
         tried = 0
@@ -347,14 +348,14 @@ class Bus:
     def stop_on_exit(self) -> None:
         """From now on, stop all drives when the `with` block is left or the process ends.
 
-        Also on SIGINT and SIGTERM, at once, with the drives of all other buses that asked for it; and on
-        SIGHUP of a closed terminal, unless the program handles or ignores it. Standard error names the drives
-        that are being stopped. The signal is held until they are, and then has its previous effect: Ctrl-C
-        raises KeyboardInterrupt. Three signals within a second cut the stops short. From the signal on, no
-        call that moves a motor is sent: it waits for the signal's effect. Python handles signals in the main
-        thread: if that waits for a reply, the stops start when the reply has come or timed out. A handler
-        that the program installs later replaces this one, until another bus calls `stop_on_exit`. Call it
-        from the main thread; raises ValueError on any other.
+        SIGINT and SIGTERM also stop them immediately, with the drives of all other buses with `stop_on_exit`;
+        so does SIGHUP of a closed terminal, unless the program handles or ignores it. Standard error names
+        the drives that are being stopped. After the stops, the signal has its previous effect: Ctrl-C raises
+        KeyboardInterrupt. Three signals within a second end the wait for the stops. After the signal, no call
+        that moves a motor is sent; such a call waits for the signal's effect. Python handles signals in the
+        main thread: if that thread waits for a reply, the stops start when the reply has come or timed out. A
+        handler that the program installs later replaces this one, until another bus calls `stop_on_exit`.
+        Call it from the main thread; it raises ValueError on any other.
         """
         self._leaving.stop_on_exit()
 
@@ -364,9 +365,10 @@ class Bus:
         return self._leaving.stops
 
     def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
-        """Cancel all calls that move drives that are about to be detached, and wait for their stops.
+        """Cancel all calls that move `drives`, which are about to be detached, and wait for their stops.
 
-        Stop those in `to_stop` first if `stop_on_exit` is set, because detached drives are not stopped later.
+        If `stop_on_exit` is set, stop the drives in `to_stop` first, because detached drives are not stopped
+        later.
         """
         self._leaving.part_with(drives, to_stop)
 
@@ -378,10 +380,9 @@ class Bus:
         return self._records.audit_trouble
 
     def statistics(self) -> LineStatistics:
-        """Return the statistics of all exchanges since the bus was opened or `reset_statistics`, also per
-        drive.
+        """Return the statistics of the line and its drives since the bus was opened or `reset_statistics`.
 
-        Any thread may call this at any time; it takes no line time.
+        Any thread may call this at any time; it does not delay the line.
         """
         return self._meter.read()
 

@@ -23,15 +23,15 @@ class LineError(BusError, OSError):
         super().__init__(f"{port}: {reason}")
         self.port = port
         self.reason = reason
-        self.is_sent = False  # part of a request had left
+        self.is_sent = False  # whether at least a part of the request was sent
 
 
 class PortLost(LineError):
-    """The port vanished, or is not back yet: it may be opened again."""
+    """The port vanished, or is not back yet; it may be reopened later."""
 
 
 class NoSuchPort(LineError, ValueError):
-    """No port can have this name, whatever is plugged in: a mistake of the caller."""
+    """The port's name is invalid, whatever is plugged in: a mistake of the caller."""
 
 
 class NoReply(BusError, TimeoutError):
@@ -94,11 +94,11 @@ class Unconfirmed(BusError):
 
 
 class Unsupported(BusError):
-    """The family's document has no such thing."""
+    """The family's document does not define this verb or fact."""
 
 
 class NotVerified(BusError):
-    """The drive confirmed the write and did not do it: it took another value, or tripped."""
+    """The drive confirmed the write but did not do it: it holds another value, or tripped."""
 
     def __init__(self, drive: str, what: str, reason: str) -> None:
         super().__init__(f"{drive}: {what} did not take effect: {reason}")
@@ -130,8 +130,8 @@ class CancelledByStop(BusError):
 class NotMaster(BusError):
     """Not sent: this process is not the master of the line, or it hears another master.
 
-    `heard` has the bytes of another master. `is_sent`: part of the request had left, as on a port that takes
-    a few bytes at a time; no drive takes a part for a request.
+    `heard` has the bytes of another master. `is_sent` says whether a part of the request was sent, as on a
+    port that takes a few bytes at a time; no drive accepts such a part as a request.
     """
 
     def __init__(self, drive: str, port: str, *, heard: bytes = b"", is_sent: bool = False) -> None:
@@ -192,9 +192,10 @@ ANOTHER_FAMILY = "another family is at its address"  # the rule of a WriteForbid
 
 
 class WriteForbidden(BusError, ValueError):
-    """The library did not send the write; with the register, the rule, and its place in the manual.
+    """The library did not send the write; the fields have the register, the rule, and the manual's section.
 
-    `is_budget`: the register's memory wears out; the same write may be sent later.
+    `is_budget` is True if the write was refused only to save the register's EEPROM, so that it may be sent
+    later.
     """
 
     def __init__(
@@ -223,4 +224,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """A drive answered once as another family's would: check its identity again, after other stops."""
+    """A drive answered once like a drive of another family; check its identity again, after other stops."""

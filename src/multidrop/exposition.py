@@ -1,4 +1,4 @@
-"""Exposition: families of metrics as text, in the two forms that scrapers read. Pure."""
+"""Exposition: families of metrics as text, in the two formats that scrapers read. No I/O."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import NamedTuple
 OPEN_METRICS = "application/openmetrics-text"
 OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
 PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus' own form, which promtool reads
-PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}  # kinds that the plain form lacks
-NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}  # by the plain form, the family too
-MOST_LABELS = 16_384  # texts of labels that are kept: 5 MB
+PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}  # replacements for kinds that the plain format lacks
+NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}  # suffixes of family names in the plain format
+MOST_LABELS = 16_384  # number of label texts in the cache: 5 MB
 
 Labels = Mapping[str, str]
 Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
@@ -28,19 +28,19 @@ class MetricFamily(NamedTuple):
 
 
 def expose_metrics(families: Iterable[MetricFamily], accept: str) -> tuple[str, str]:
-    """Return content type and text, in the form that the header `Accept` of the request asks for."""
+    """Return content type and text, in the format that the request's `Accept` header asks for."""
     if OPEN_METRICS in accept:
         return OPEN_METRICS_TYPE, open_metrics(families)
     return PLAIN_TYPE, plain_text(families)
 
 
 def open_metrics(families: Iterable[MetricFamily]) -> str:
-    """Return OpenMetrics 1.0, with its end mark."""
+    """Return the families as OpenMetrics 1.0, with its end mark."""
     return "".join(_written(one, one.name, one.kind) for one in families) + "# EOF\n"
 
 
 def plain_text(families: Iterable[MetricFamily]) -> str:
-    """Return version 0.0.4 of Prometheus' text format: other names of families, and the same samples."""
+    """Return the families in Prometheus' text format 0.0.4, which differs in the names of some families."""
     return "".join(
         _written(one, one.name + NAMED_WITH_SUFFIX.get(one.kind, ""), PLAIN_KINDS.get(one.kind, one.kind))
         for one in families
@@ -57,7 +57,7 @@ def _written(family: MetricFamily, name: str, kind: str) -> str:
 
 @lru_cache(maxsize=MOST_LABELS)
 def _braced(*labels: tuple[str, str]) -> str:
-    """Return labels as they stand behind a name; those of a scrape come again with the next one."""
+    """Return labels as text in braces, cached because the next scrape has the same labels."""
     inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels)
     return f"{{{inside}}}" if inside else ""
 

@@ -1,18 +1,18 @@
-"""Check that this is the main interpreter of its process: no other is served."""
+"""Check that this is the main interpreter of its process; sub-interpreters are not supported."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
 
-_MODULES = ("_interpreters", "_xxsubinterpreters")  # from Python 3.13 on; before
+_MODULES = ("_interpreters", "_xxsubinterpreters")  # since Python 3.13; before
 
 
 def refuse_other_interpreters() -> None:
     """Raise ImportError in a sub-interpreter.
 
-    The compiled module keeps its engine, its types and its callbacks for the whole process: those of an
-    interpreter that ends would stay behind, and be called.
+    The compiled module keeps its engine, types and callbacks for the whole process. Those of an interpreter
+    that ended would remain, and still be called.
     """
     for name in _MODULES:
         try:

@@ -10,13 +10,13 @@ _SECOND_NS = 1_000_000_000
 
 
 def format_time(time_ns: int) -> str:
-    """Return the text of a time in ns since 1970."""
+    """Return a time in ns since 1970 (UTC) as text."""
     second, rest = divmod(time_ns, _SECOND_NS)
     return f"{_format_second(second)}.{rest:09d}Z"
 
 
 def parse_time(text: str) -> int:
-    """Return ns since 1970. Raises ValueError for any other form than that of `format_time`."""
+    """Return the ns since 1970 (UTC). Raises ValueError if the text is not as from `format_time`."""
     second, dot, rest = text.partition(".")
     if not dot or len(rest) != 10 or rest[-1] != "Z":
         raise ValueError(text)

@@ -1,4 +1,4 @@
-"""ModbusDevice: any Modbus device, read and written by addresses alone."""
+"""ModbusDevice: any Modbus device, read and written by address, without declared registers."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ Format = Literal["U16", "I16", "I8", "U32", "I32", "U64", "I64", "F16", "F32", "
 Order = Literal["AB", "BA", "ABCD", "CDAB", "BADC", "DCBA"]
 
 _FORMATS = {each.name: each for each in WORDS if each is not NumberFormat.U32_EITHER}
-_MOST_WORDS, _MOST_COILS = 123, 1968  # of one write (application protocol V1.1b3, 6.11 and 6.12)
+_MOST_WORDS, _MOST_COILS = 123, 1968  # limits of one write (application protocol V1.1b3, 6.11 and 6.12)
 _CONFIRM = "pass confirm=True"
 
 
 class ModbusDevice(Drive):
-    """A Modbus device without a declared family: its tables are read and written by address.
+    """A Modbus device without a declared family, whose tables are read and written by address.
 
-    Addresses are those on the wire, from 0. Numbers have the formats of family files, "U16" to "F64", and the
-    orders of bytes "ABCD", "CDAB", "BADC" and "DCBA". Reads and writes follow the same rules as those of a
-    family: silence, retries, proofs against late replies, and the audit log. A write needs
-    `confirm=True`, because it may start a motor.
+    Addresses are those on the wire, from 0. Numbers have the formats of family files ("U16" to "F64") and the
+    byte orders "ABCD", "CDAB", "BADC" and "DCBA". As for drives of a family, the library keeps silences,
+    retries reads, detects late replies, and records writes in the audit log. A write needs `confirm=True`,
+    because it may start a motor.
     """
 
     title = "Modbus device"
@@ -47,17 +47,17 @@ class ModbusDevice(Drive):
     def read_holding(
         self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
     ) -> list[float]:
-        """Return `count` numbers from the holding registers that begin at `start`.
+        """Return `count` numbers from the holding registers from address `start`.
 
-        Raises NoReply, BadReply, DriveException or LineError if the read fails, and NoValue if a number is a
-        NaN or no decimal number.
+        Raises NoReply, BadReply, DriveException or LineError if the read fails, and NoValue if a number is
+        NaN or invalid BCD.
         """
         return self._numbers(3, "holding register", start, count, format, order)
 
     def read_input(
         self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
     ) -> list[float]:
-        """Return `count` numbers from the input registers that begin at `start`; raises as `read_holding`."""
+        """Return `count` numbers from the input registers from `start`; raises as `read_holding`."""
         return self._numbers(4, "input register", start, count, format, order)
 
     def read_coils(self, start: int, count: int = 1) -> list[bool]:
@@ -79,10 +79,10 @@ class ModbusDevice(Drive):
     ) -> list[float]:
         """Write numbers to the holding registers from `start`; return the numbers that the device then holds.
 
-        One register is written by function 6, several by function 16. They are read back; registers that
-        cannot be read are returned as written. Raises WriteForbidden without `confirm=True`,
-        ValueError for a number that does not fit, NotVerified if the device holds other numbers, and
-        Unconfirmed if the write may have happened.
+        One register is written by function 6, several by function 16. The registers are then read back; if
+        the device refuses that read, the written numbers are returned. Raises WriteForbidden without
+        `confirm=True`, ValueError for a number that does not fit, NotVerified if the device holds other
+        numbers, and Unconfirmed if the write may have happened.
         """
         coding = _coding(format, order)
         data = b"".join(coding.pack(_raw(value, format, coding)) for value in values)
@@ -157,13 +157,13 @@ class ModbusDevice(Drive):
             )
 
     def _read_back(self, what: str, function: int, start: int, count: int, written: bytes) -> bytes:
-        """Return the data that the device holds after a write.
+        """Return the data that the device holds after a write; `written` if the device refuses the read.
 
-        Only this read shows that an adapter's echo was not taken for the device's confirmation.
+        This read is needed because the reply to the write may have been only an adapter's echo.
         """
         try:
             return self.link.read_raw(self, function, start, count, attempts=3)
-        except DriveException:  # it is there, and does not let these be read
+        except DriveException:  # the device answers, but these registers cannot be read
             return written
         except (NoReply, BadReply, LineError) as failure:
             raise Unconfirmed(self.name, what, f"it could not be read back: {failure}") from failure
@@ -174,7 +174,7 @@ def _named(kind: str, start: int, count: int) -> str:
 
 
 def _parts(start: int, count: int, most: int, words: int) -> Iterator[tuple[int, int]]:
-    """Yield address and count of each request that reads part of the numbers."""
+    """Yield the address and the count of numbers of each request needed to read `count` numbers."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count = {count!r} is not 1 or more")
     for done in range(0, count, most):
@@ -190,7 +190,7 @@ def _coding(format: str, order: str) -> Coding:
 
 
 def _raw(value: float, format: str, coding: Coding) -> float:
-    """Return the number that goes over the wire. Raises TypeError or ValueError."""
+    """Return the raw count of a value. Raises TypeError or ValueError if the value does not fit."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{value!r} is not a number")
     if not abs(value) < float("inf"):

@@ -1,6 +1,6 @@
 """Poller: all lines of a plant, polled continuously, as batches of rows.
 
-The lines are kept busy by the core's own thread; one thread here tends them all when the core calls.
+The core's own thread carries out the exchanges. One thread here tends all lines whenever the core needs it.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
-LOOK_NS = 50_000_000  # between checks of the lines, while a line or a reader of `fileno` needs them
-BUSY_NS = 100_000_000  # while lines only have to be kept busy: a third of the time queued ahead
-REST_NS = 500_000_000  # while the lines need no work
-MOST_FAILURES = 8  # of the thread itself, in a row, before it gives up
-FAILED_NS = 50_000_000  # between its attempts
+LOOK_NS = 50_000_000  # interval between checks of the lines, while a line or a reader of `fileno` needs them
+BUSY_NS = 100_000_000  # interval while lines only need new exchanges: a third of the time queued ahead
+REST_NS = 500_000_000  # interval while the lines need no work
+MOST_FAILURES = 8  # failures of the thread itself in a row before it gives up
+FAILED_NS = 50_000_000  # pause between its attempts
 
 _log = logging.getLogger("multidrop.polling")
 
@@ -51,17 +51,17 @@ def _plant_of(plant: Plant | Path | str) -> Plant:
 
 
 class Poller(RowSource):
-    """Polls a plant, or the plant of a file, from `with` on until the block is left.
+    """Polls a plant, or the plant of a file, within a `with` block.
 
-    Iterate over it for batches of rows, in `for` or `async for`; `poller["pump-1"]` is a drive. Any thread
-    may take batches, and add or remove drives. Reads, writes and verbs of its drives go ahead of polling;
-    `ledger`, `audit`, `stop_on_exit` and `mastership` are as in Bus.
+    Iterate over it for batches of rows, with `for` or `async for`; `poller["pump-1"]` is a drive. Any thread
+    may take batches, and add or remove drives. Reads, writes and verbs of its drives are sent before queued
+    polling. `ledger`, `audit`, `stop_on_exit` and `mastership` are as in Bus.
 
-    Raises LineError if a port cannot be opened. Later failures are rows that say why a value is missing. If
-    an exception occurs on one line, such as one of a user's own class, it is logged, and the line is tried
-    again: `line_failures`. If polling itself fails, `take`, `batches` and `close` raise PollingFailed:
-    `failure`. Without its mastership the poller sends no request and opens no port; each value that is due
-    has a row that says so.
+    Raises LineError if a port cannot be opened. Later failures appear as rows with the reason why a value is
+    missing. If an exception occurs on one line, such as one in a user's own class, it is logged and the line
+    is tried again (see `line_failures`). If polling itself fails, `take`, `batches` and `close` raise
+    PollingFailed (see `failure`). Without its mastership the poller sends no request and opens no port; each
+    value that is due then has a row with that reason.
 
     The logger `multidrop.line` has no polled frames. `multidrop poll --capture` writes them to a file for
     Wireshark.
@@ -82,7 +82,7 @@ class Poller(RowSource):
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # when to check lines that have not called
+        self._look_ns = 0  # when to check lines for which the core has not called
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)
@@ -142,17 +142,17 @@ class Poller(RowSource):
         self._end()
         if isinstance(error, KeyboardInterrupt):
             without_internals(error)
-        if error is not None:  # it goes on; other failures were logged
+        if error is not None:  # the error is raised on; other failures were logged
             self._caller, self._is_failure_raised = None, True
         self.close()
 
     def close(self) -> None:
-        """Stop polling and close the ports; rows not yet taken can still be.
+        """Stop polling and close the ports. Rows that are not taken yet can still be taken.
 
         Waits up to a second for exchanges in flight; every slot that is over by then has a row. If a signal
-        interrupts the wait, the closing still completes; a second call waits for it. A function of `on_batch`
-        gets its last batches first. Raises that function's failure, and PollingFailed if polling had failed;
-        each once.
+        interrupts the wait, the closing still completes; a second call waits for that. A function of
+        `on_batch` gets its last batches first. Raises that function's failure, and PollingFailed if polling
+        had failed; each only once.
         """
         self._end()
         give_signals_back()
@@ -173,8 +173,8 @@ class Poller(RowSource):
     def _end_lines(self) -> None:
         self._closing = True
         for line in self._lines:
-            line.bus.leave()  # all lines at once
-        with self._changing:  # an adoption that is under way is waited for
+            line.bus.leave()  # start the stops of all lines before waiting for any
+        with self._changing:  # waits for an adoption in progress
             if self._thread.is_alive():
                 self._call_thread()
                 self._thread.join()
@@ -186,7 +186,7 @@ class Poller(RowSource):
         try:
             with self._lines.tended():
                 self._poll()
-        except BaseException as failure:  # else polling would end without a word
+        except BaseException as failure:  # of any kind: polling must not end silently
             self.failure = PollingFailed(f"polling has ended on all lines: {words_of(failure)}")
             self.failure.__cause__ = failure
             self._lines.end_polling()
@@ -196,7 +196,7 @@ class Poller(RowSource):
     def _poll(self) -> None:
         """Tend the lines until the poller is closed.
 
-        Raises a failure that occurs MOST_FAILURES times in a row: memory may be short for a moment.
+        A failure is raised only after MOST_FAILURES in a row, because memory may be short for a moment.
         """
         failures = 0
         while not self._closing:
@@ -210,7 +210,7 @@ class Poller(RowSource):
                 clock.sleep(FAILED_NS / 1e9)
 
     def _tend_lines(self) -> None:
-        """Wait until lines call or are due, and tend them."""
+        """Wait until the core calls for lines or a check is due, and tend those lines."""
         seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
         called = self._lines.called(self._row_queue.await_calls(seconds))
         now = clock.now_ns()
@@ -228,13 +228,13 @@ class Poller(RowSource):
 
     @property
     def plant(self) -> Plant:
-        """The plant as it is polled now; its drives are those that are on the buses."""
+        """The plant as it is polled now, with the drive objects that are on the buses."""
         lines = tuple(replace(line.declared, drives=line.polled) for line in self._lines)
         return Plant(lines, self._path)
 
     @property
     def polled_since(self) -> dict[str, int]:
-        """By name, since which `monotonic_ns` rows are of the drive that `plant` describes."""
+        """By drive name, the `monotonic_ns` from which rows belong to the drive that `plant` describes."""
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
     def adopt(self, plant: Plant | Path | str) -> dict[str, LineError]:
@@ -248,14 +248,14 @@ class Poller(RowSource):
         line keeps its port. All other lines are closed and opened again. A port that cannot be opened is
         tried again like a lost one. The plant overrides earlier calls of `add` and `set_rate`.
 
-        For lines and drives that leave: requests in flight end, and their rows come. Other calls on such a
-        line raise LineError; those of a drive NotAttached, or CancelledByStop if they move its motor. Pending
-        stops are waited for. Motors go on, unless `stop_on_exit` is set: then the drives are stopped before
-        they leave. A drive whose address becomes another family's is not stopped, because its stop may mean
-        something else there.
+        When lines and drives are removed, their requests in flight are completed and give rows. Other calls
+        on a removed line raise LineError; calls of a removed drive raise NotAttached, or CancelledByStop if
+        they move its motor. Pending stops are waited for. Motors continue as they are, unless `stop_on_exit`
+        is set: then the drives are stopped before they are removed. A drive whose address becomes another
+        family's is not stopped, because its stop may mean something else there.
 
-        Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
-        thread may call this, one at a time.
+        Names in batches keep their codes. The call returns when the change is complete; other lines are
+        polled meanwhile. Any thread may call this; calls run one after another.
         """
         wanted = _plant_of(plant)
         self._take_signals()
@@ -279,7 +279,7 @@ class Poller(RowSource):
         self._add_line(line)
 
     def _take_signals(self) -> None:
-        """Take the signals for lines that come, if this is the main thread: no other may."""
+        """With `stop_on_exit`, install the signal handlers for new lines, if this is the main thread."""
         if self._lines.stops_on_exit:
             with suppress(ValueError):
                 exit_hook().take_signals()
@@ -303,7 +303,7 @@ class Poller(RowSource):
     def remove_line(self, name: str) -> None:
         """Stop polling a line and close its port, as `adopt` does. Raises ValueError for an unknown line.
 
-        Other lines may come and go while this waits for stops and requests in flight.
+        Other lines may be added and removed while this waits for stops and requests in flight.
         """
         with self._changing:
             self._check_polling()
@@ -340,9 +340,9 @@ class Poller(RowSource):
     ) -> Drive:
         """Poll one more drive on this line from now on; return the drive.
 
-        `poll` has registers or their names, and Polled for a register with a period of its own; without it,
-        all readings are polled. `every` is the period in s, None for as fast as the line allows. Raises
-        ValueError for an unknown line, or a name or an address that is taken.
+        `poll` lists registers or their names, or Polled for a register with a period of its own. Without
+        `poll`, all readings are polled. `every` is the period of the others in s; None means as fast as the
+        line allows. Raises ValueError for an unknown line, or a name or an address that is already used.
         """
         polled = drive if isinstance(drive, PolledDrive) else PolledDrive(drive, poll, every=every)
         self._add(line, polled)
@@ -358,10 +358,10 @@ class Poller(RowSource):
 
     @undisturbed
     def remove(self, line: str, drive: str) -> None:
-        """Stop polling the drive of this name; its motor goes on.
+        """Stop polling the drive of this name; its motor continues as it is.
 
-        Queued requests are still sent. What is known about the drive stays in memory for the case that the
-        same PolledDrive is added again. Raises ValueError for an unknown drive.
+        Queued requests are still sent. The drive's learnt timing stays in memory in case the same PolledDrive
+        is added again. Raises ValueError for an unknown drive.
         """
         with self._changing:
             polled = self._lines.find(line)
@@ -372,12 +372,12 @@ class Poller(RowSource):
 
     @undisturbed
     def set_rate(self, drive: Drive | str, register: Register[Any] | str | None, every: float | None) -> None:
-        """Read a register of a drive every so many seconds from now on; with None, all its polled registers.
+        """Set the period of a polled register in s, or of all polled registers if `register` is None.
 
-        `every` None is as fast as the line allows. Requests in flight are finished; registers whose rate
-        stays keep their slots, and each changed one has its first slot now. The drive and the register may be
-        given by name. The metadata of a recording keeps the rates of its start. Raises ValueError for a drive
-        or register that is not polled, and for an invalid period.
+        `every` None means as fast as the line allows. Requests in flight are finished. Registers whose rate
+        does not change keep their slots; each changed register has its first slot now. The drive and the
+        register may be given by name. The metadata of a recording keeps the rates of its start. Raises
+        ValueError for a drive or register that is not polled, and for an invalid period.
         """
         if every is not None:
             check_period(every)
@@ -406,7 +406,7 @@ class Poller(RowSource):
     def stop_on_exit(self) -> None:
         """Stop the drives of all lines when polling or the process ends; see `Bus.stop_on_exit`.
 
-        Also those of later lines, and of lines and drives that leave by `adopt` or `remove_line`.
+        This includes drives of lines that are added later, and those that `adopt` or `remove_line` removes.
         """
         exit_hook().take_signals()
         self._lines.stops_on_exit = True
@@ -419,12 +419,12 @@ class Poller(RowSource):
     def line_failures(self) -> dict[str, str]:
         """The exception of each line that polling failed on recently, by the line's name.
 
-        Such a line is tried again within 30 s, and counts as sound after 10 s without another exception.
+        Such a line is tried again within 30 s, and is no longer listed after 10 s without another exception.
         """
         return {line.name: line.failure for line in self._lines if line.failure}
 
     def statistics(self) -> dict[str, LineStatistics]:
-        """Return statistics by line and drive since polling started or `reset_statistics`; cheap."""
+        """Return the statistics of each line since polling started or `reset_statistics`, by line name."""
         return {line.name: line.bus.statistics() for line in self._lines}
 
     def reset_statistics(self) -> None:

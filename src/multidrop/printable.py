@@ -1,26 +1,26 @@
-"""Text from files and arguments: made harmless for a terminal, a page or a log, and numbers in it."""
+"""Make text from files and arguments safe for a terminal, a page or a log; parse numbers in it."""
 
 from __future__ import annotations
 
 import re
 
-# int() and float() also take `1_0` for 10, and digits of all scripts.
+# Stricter than int() and float(), which also accept `1_0` for 10, and digits of all scripts.
 _WHOLE = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(
     r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.IGNORECASE | re.ASCII
 )
-_LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # to the last @: a password may have one
+_LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # up to the last @, because a password may contain one
 
 
 def masked(text: str) -> str:
-    """Return the text without the users and passwords of its URLs: nats://host:4222."""
+    """Return the text without the users and passwords in its URLs: nats://me:pw@host becomes nats://host."""
     return _LOGIN.sub("", text)
 
 
 def printable(text: str) -> str:
-    r"""Return the text with all unprintable characters spelt out: an escape is `\x1b`.
+    r"""Return the text with all unprintable characters escaped, such as `\x1b`.
 
-    Control characters can move a terminal's cursor, and change its title or clipboard; marks of direction
+    Control characters can move a terminal's cursor, and change its title or clipboard. Direction marks can
     make a name look like another one.
     """
     if text.isprintable():

@@ -1,4 +1,4 @@
-"""Check a file of nested tables: every error in it becomes a sentence with its place."""
+"""Check a TOML file against the keys it may have; every error becomes a sentence with its place."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from multidrop.printable import masked, printable
 
 T = TypeVar("T")
 
-MOST_PARTS = 100  # of a dotted key
+MOST_PARTS = 100  # limit of parts in a dotted key
 
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
-    """Return a TOML file's tables; ValueError, without the path, where it cannot be read.
+    """Return the tables of a TOML file. Raises ValueError, without the path, if it cannot be read.
 
-    A byte order mark before the text is skipped: some editors write one. A device is not read: a serial port
-    would be waited for without an end, and what its drives say be lost.
+    A byte order mark before the text is skipped, because some editors write one. A device is refused: reading
+    a serial port would block forever, and would take bytes from its drives.
     """
     try:
         if path.is_char_device():
@@ -33,7 +33,7 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
 
 
 def parse_document(data: bytes) -> dict[str, Any]:
-    """Return the tables of a TOML file's bytes; ValueError where they are none."""
+    """Return the tables of a TOML file's bytes. Raises ValueError if they are not valid TOML."""
     try:
         text = data.decode("utf-8-sig")
         _check_keys(text)
@@ -51,7 +51,7 @@ def parse_document(data: bytes) -> dict[str, Any]:
 
 
 def _check_keys(text: str) -> None:
-    """Refuse keys of very many parts, for which tomllib takes memory and time with their square."""
+    """Raise ValueError for keys with very many parts, whose cost in tomllib grows with the square."""
     if text.count(".") > MOST_PARTS:
         pieces = re.split(r"[=,{}\[\]\n]+", text)
         if any(piece.count(".") > MOST_PARTS for piece in pieces):
@@ -59,7 +59,7 @@ def _check_keys(text: str) -> None:
 
 
 def _fits(value: Any) -> bool:
-    """Return True where every integer fits into 64 bits, as in TOML."""
+    """Return True if every integer fits into 64 bits, as TOML requires."""
     if isinstance(value, dict):
         return all(map(_fits, value.values()))
     if isinstance(value, list):
@@ -76,7 +76,7 @@ class Key:
     needed: bool = False
 
     def takes(self, value: Any) -> bool:
-        """Return True for a value of its type that says something; true and false are no numbers."""
+        """Return True for a non-empty value of the key's type. true and false are not numbers."""
         if isinstance(value, bool):
             return self.kind is bool
         return isinstance(value, self.kind) and value not in ("", [])
@@ -84,7 +84,7 @@ class Key:
 
 @dataclass(frozen=True)
 class TomlPlace:
-    """A place in the file; all places share the errors found so far, and what must not come twice."""
+    """A place in the file. All places share the errors found so far, and the names seen so far."""
 
     path: Path
     labels: tuple[str, ...] = ()
@@ -92,7 +92,7 @@ class TomlPlace:
     seen: dict[tuple[object, ...], str] = field(default_factory=dict)
 
     def inside(self, kind: str, tables: list[Any]) -> Iterator[tuple[Any, TomlPlace]]:
-        """Yield each table with its place, which is called by the table's name or else its number."""
+        """Yield each table with its place, which is labelled with the table's name or else its number."""
         for number, table in enumerate(tables, 1):
             name = table.get("name") if isinstance(table, dict) else None
             label = f'{kind} "{name}"' if name and isinstance(name, str) else f"{kind} number {number}"
@@ -107,18 +107,21 @@ class TomlPlace:
         return TomlPlace(path, labels, self.config_errors, self.seen)
 
     def wrong(self, sentence: object) -> None:
-        """Add an error. What a terminal would not print as it stands is spelt out."""
+        """Add an error at this place. Unprintable characters are escaped, and passwords in URLs removed."""
         text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
         self.config_errors.append(f"{self.path}: {printable(masked(text))}")
 
     def once(self, *what: object, sentence: str) -> None:
-        """Add an error if this was seen before; `{first}` in the sentence is the place."""
+        """Add an error if `what` was seen before; `{first}` in the sentence becomes the first place."""
         if what in self.seen:
             self.wrong(sentence.format(first=self.seen[what]))
         self.seen.setdefault(what, ", ".join(self.labels))
 
     def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "") -> T | None:
-        """Return make(*arguments); None where that is a ValueError or TypeError, which gets the hint."""
+        """Return make(*arguments). If that raises ValueError or TypeError, add the error and return None.
+
+        `hint` is appended to the error.
+        """
         try:
             return make(*arguments)
         except (ValueError, TypeError) as mistake:
@@ -126,7 +129,7 @@ class TomlPlace:
             return None
 
     def check(self, table: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
-        """Return the entries of the table that have a known key and the right type."""
+        """Return the entries with a known key and a valid value; add an error for every other entry."""
         if not isinstance(table, dict):
             self.wrong(f"{table!r} is not a table with {', '.join(keys)}")
             return {}
@@ -146,7 +149,7 @@ class TomlPlace:
         return good
 
     def unknown(self, table: Mapping[str, Any], keys: Mapping[str, object]) -> set[str]:
-        """Add an error for each unknown key; return the known ones that they probably mean."""
+        """Add an error for each unknown key; return the known keys that were probably meant."""
         meant: set[str] = set()
         for name in [name for name in table if name not in keys]:
             near = difflib.get_close_matches(name, keys, n=1)
@@ -157,7 +160,7 @@ class TomlPlace:
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds in a duration such as "50 ms"; ValueError if it is none."""
+    """Return the seconds of a duration such as "50 ms". Raises ValueError if it is not a valid one."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", str(text).strip(), re.ASCII)
     units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
     seconds = float(match[1]) * units[match[2]] if match else 0
@@ -167,14 +170,14 @@ def parse_duration(text: str) -> float:
 
 
 def check_period(seconds: float) -> None:
-    """Raise ValueError unless a period in s is one that a plant file may have."""
+    """Raise ValueError unless this is a valid period in s for a plant file."""
     is_number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
     if not is_number or not _SHORTEST <= seconds <= _LONGEST:
         raise ValueError(f"every = {seconds!r} is not a number of seconds from 0.0001 to 86400, or None")
 
 
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
-    """Return the duration under this key in s; None where it is not given, or wrong."""
+    """Return the duration under this key in s; None if it is missing, or invalid, which adds an error."""
     return place.attempt(_duration_under, key, given[key]) if key in given else None
 
 

@@ -1,4 +1,4 @@
-"""The only room that imports the compiled module: frames, exchanges and columns for Python."""
+"""Frames, exchanges and columns for Python. Only this package imports the compiled module."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ _MOST_PIECES = 1 << 15
 
 
 class Stream:
-    """Bytes of one line in pieces (struct md_stream); `is_tcp`: all frames are Modbus TCP, or none is."""
+    """Bytes of one line in pieces (struct md_stream); `is_tcp` says whether all frames are Modbus TCP."""
 
     def __init__(self, place: Any = None, *, is_tcp: bool = False) -> None:
         self.c = ffi.new("struct md_stream *") if place is None else place
@@ -86,7 +86,7 @@ class Splitter:
 
 
 class Decoder:
-    """Makes rows of the exchanges that were sniffed on one line (struct md_decoder)."""
+    """Decodes the exchanges sniffed on one line into rows (struct md_decoder)."""
 
     _PLACES = 1 << 14
 
@@ -105,11 +105,11 @@ class Decoder:
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """The unknown request; pass its fields to know()."""
+        """The request that stopped `decode` with UNKNOWN; call `know` with the layout of its replies."""
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Set the fields of replies to `asked`, None: no rows; return False if the table is full."""
+        """Set the layout of replies to `asked` (None: no rows); return False if the table is full."""
         if block:
             self._blocks.append(block)
         c = block.c if block else ffi.NULL
@@ -123,7 +123,7 @@ class Decoder:
         return done
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of frames, exchanges, replies without a request, and bytes outside of frames."""
+        """Return the numbers of frames, exchanges, replies without a request, and bytes outside frames."""
         c = self._c
         return {"frames": c.frames, "exchanges": c.exchanges, "strays": c.strays, "unknown_bytes": c.junk}
 

@@ -112,7 +112,7 @@ def _packed(extra: Extra) -> dict[str, Any]:
 
 
 class RowLayout:
-    """The fields of one exchange's reply, of a drive given by the code of its name (struct md_block)."""
+    """The fields in the reply of one exchange (struct md_block); `drive` is the code of the drive's name."""
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
         self._fields, self._extra = _shared(tuple(fields))
@@ -130,7 +130,7 @@ class RowLayout:
 
     @property
     def refusals(self) -> int:
-        """Exceptions in a row."""
+        """Number of exceptions in a row."""
         return int(self.c.refusals)
 
     @refusals.setter
@@ -144,7 +144,7 @@ class RowLayout:
 
     @property
     def failures(self) -> int:
-        """Exchanges in a row without a reply, or with a bad one."""
+        """Number of exchanges in a row without a good reply."""
         return int(self.c.failures)
 
     @property
@@ -153,7 +153,7 @@ class RowLayout:
         return bool(self.c.is_answered)
 
     def forget(self) -> None:
-        """Reset the counts, as before the first exchange."""
+        """Reset the counts to those before the first exchange."""
         self.c.refusals = self.c.failures = self.c.is_answered = 0
 
 
@@ -169,7 +169,7 @@ COLUMNS: dict[str, Literal["q", "H", "d"]] = {
 
 
 class Columns:
-    """Rows in the core's own memory: one array a column (struct md_columns)."""
+    """Rows in the core's own memory, as one array per column (struct md_columns)."""
 
     def __init__(self, room: int) -> None:
         self._own(lib.md_columns_new(room), lib.md_columns_free)
@@ -208,7 +208,7 @@ class Columns:
 
 
 class Spelling(NamedTuple):
-    """Names as one text."""
+    """Names joined into one text, for the core."""
 
     names: int
     longest: int

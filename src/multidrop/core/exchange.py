@@ -94,9 +94,9 @@ class Completion:
     """The result of an exchange (struct md_completion). Properties read the struct on access.
 
     Times are CLOCK_MONOTONIC, in ns. `numbers` are the values of the exchange's fields, NaN for a missing
-    one; `count` is how many exist, -1 without a good reply and after an exception. A successful read needs
-    only these two: after a sleep, with cold caches, each further field and call costs microseconds. A
-    completion can be reused for an exchange with the same number of values (`room`).
+    value. `count` is the number of values that exist; -1 without a good reply and after an exception. A
+    successful read uses only these two, because with cold caches each further field and call costs
+    microseconds. A completion can be reused for an exchange with the same number of values (`room`).
     """
 
     __slots__ = ("c", "count", "numbers", "room", "values")
@@ -141,7 +141,7 @@ class Completion:
         return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
 
     def unanswered(self) -> Completion:
-        """Return a copy without a reply, because the reply was the request's echo."""
+        """Return a copy without a reply, for a reply that was only the request's echo."""
         found = ffi.new("struct md_completion *", self.c[0])
         found.result, found.raw_len = lib.MD_NO_REPLY, 0
         return Completion(found)
@@ -200,10 +200,10 @@ class Peer:
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Send one of these reads first whenever a late reply could be mistaken for another's.
+        """Set the proofs: reads of which one is sent first whenever a late reply could be mistaken.
 
-        Uses the first MOST_PROOFS. The replies to two of them must be distinguishable. Call it once, before
-        the first exchange: the core reads the list from then on.
+        Only the first MOST_PROOFS are used. Their replies must differ from one another. Call this once,
+        before the first exchange, because the core reads the list from then on.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
@@ -212,7 +212,7 @@ class Peer:
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
-        """Repeat the first read after a proof, because its first reply may answer another process.
+        """Repeat the first read after a proof, because its first reply may be for another process.
 
         Without proofs the first reply is accepted.
         """
@@ -246,13 +246,13 @@ class Peer:
 class Exchange:
     """A request with its drive, timing and settings; made once, carried out as often as needed.
 
-    Times are in seconds: `character` is that of one character, `silence` precedes the request and follows its
-    reply, `turnaround` follows a broadcast, `period` is that of its slots in a queue, 0: none. With `insists`
-    it is sent even if a late reply could be mistaken for its own. `timeout` is the least timeout; 0: as
-    learnt. `answer` is the least and the greatest raw value of the reply's one register. `block` has the
-    fields for rows, `values` those for the caller of `Port.carry_out`. `echo_probe` is sent first while it is
-    unknown whether the adapter echoes; its reply is never a copy of its request. After a stop, `permit`
-    keeps the request from being sent.
+    Times are in seconds: `character` is the duration of one character, `silence` precedes the request and
+    follows its reply, `turnaround` follows a broadcast, `period` is the period of its slots (0: none). With
+    `insists` the request is sent even if a late reply could be mistaken for its own. `timeout` is the least
+    timeout; 0 means the learnt one. `answer` is the least and the greatest raw value of the only register in
+    the reply. `block` has the fields for rows, `values` those for the caller of `Port.carry_out`. The
+    `echo_probe` is sent first while it is unknown whether the adapter echoes; its reply is never a copy of
+    its request. The request is not sent once its `permit` has ended.
     """
 
     __slots__ = (

@@ -1,7 +1,7 @@
 """Memory for structs that the core uses at every exchange: adjacent, and in whole cache lines.
 
-With many lines this memory and its page translations have left the caches since a line's last exchange. The
-structs of a drive are allocated together, so that they share a page or two.
+With many lines, this memory and its page translations are no longer cached when a line's next exchange
+starts. The structs of a drive are allocated together, so that they share a page or two.
 """
 
 from __future__ import annotations
@@ -68,6 +68,6 @@ def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def new_apart(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the same for a rarely used struct, in memory of its own."""
+    """Return a pointer to a new, rarely used struct in memory of its own, and the owner of that memory."""
     made = ffi.new(f"{kind} *", fields)
     return made, made

@@ -1,4 +1,4 @@
-"""Permissions to send: a drive's permits end with a stop, a process's mastership at a deadline."""
+"""Permissions to send: a stop ends a drive's permits, a deadline ends a process's mastership."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Mastership:
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Do not hold in a forked child: mastership and timer belong to the parent."""
+        """End the mastership in a forked child, because it and its timer belong to the parent."""
         self._free.detach()
         self._is_inherited = True
         self._lock = threading.Lock()
@@ -131,9 +131,9 @@ class Mastership:
     def extend(self, until_ns: int) -> None:
         """Hold until this time, and set the kernel's timer to `guard_s / 2` seconds after it.
 
-        A time before the present deadline has no effect. After `end` the mastership holds again.
+        A time before the present deadline has no effect. After `end`, a call makes the mastership hold again.
 
-        Raises ValueError if the time is past, without any change: a timer in the past would kill at once.
+        Raises ValueError, without any change, if the time is past: such a timer would kill immediately.
         """
         if isinstance(until_ns, bool) or not isinstance(until_ns, int):
             raise TypeError(f"until_ns is a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")

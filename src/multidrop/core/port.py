@@ -1,4 +1,4 @@
-"""Ports: lines that the core's thread drives, and the queue of their rows."""
+"""Ports, whose exchanges the core's thread carries out, and the queue of their rows."""
 
 from __future__ import annotations
 
@@ -90,10 +90,10 @@ class Echo(StrEnum):
 
 
 class RS485(StrEnum):
-    """The owner of the transceiver's direction; `OFF`: the adapter itself.
+    """What switches the transceiver's direction.
 
-    `KERNEL`: the driver's RS-485 mode. `RTS_UP`: the core, with RTS on while a request leaves. `RTS_DOWN`:
-    the core, with RTS off while a request leaves.
+    `OFF`: the adapter itself. `KERNEL`: the driver's RS-485 mode. `RTS_UP`: the core, with RTS on while a
+    request is sent. `RTS_DOWN`: the core, with RTS off while a request is sent.
     """
 
     OFF = "off"
@@ -207,11 +207,11 @@ def _stop(port: Any, memory: _PortMemory) -> None:
 
 
 class Port:
-    """A line that the core's thread drives on a descriptor (struct md_port).
+    """A descriptor on which the core's thread carries out exchanges (struct md_port).
 
-    `must_take` is the mask of REFUSALS that are failures; -1: a port without settings. `room` is the length
-    of its queue, a power of two. With `transactions` all exchanges are Modbus TCP, without them none is.
-    Requests leave only while the `mastership` holds; None: always.
+    `must_take` is the mask of REFUSALS that are failures; -1 means a port without settings. `room` is the
+    length of the queue, a power of two. `transactions` is NONE unless all exchanges are Modbus TCP. With a
+    `mastership`, requests are sent only while that holds.
 
     Raises OSError if the descriptor cannot be polled.
     """
@@ -252,11 +252,11 @@ class Port:
             lib.md_port_tap(self.c, tap.c)
 
     def tell_echo(self, echo: Echo) -> None:
-        """Set whether its adapter echoes."""
+        """Set whether the adapter echoes."""
         lib.md_port_tell_echo(self.c, _ECHOES[echo])
 
     def switch(self, rs485: RS485) -> None:
-        """Set the owner of the transceiver's direction, before the first request.
+        """Set what switches the transceiver's direction. Call it before the first request.
 
         Raises OSError if the driver refuses.
         """
@@ -273,17 +273,17 @@ class Port:
         return int(lib.md_port_counted_ns(self.c))
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let a peer take over the outstanding requests of the one that it replaces."""
+        """Let `peer` take over the outstanding requests of `before`, which it replaces."""
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
     @property
     def cut_off(self) -> bool:
-        """True once the port was lost during a polled exchange, after a good reply on it."""
+        """True if the port was lost during a polled exchange, after an earlier good reply on it."""
         return bool(self._progress.cut_off)
 
     def end(self) -> bool:
-        """Start urgent exchanges only from now on; return True while a polled one is in flight."""
+        """From now on start only urgent exchanges; return True while a polled exchange is in flight."""
         return bool(lib.md_port_end(self.c))
 
     def stop(self) -> None:
@@ -296,16 +296,16 @@ class Port:
     def report_to(self, row_queue: RowQueue, number: int) -> None:
         """Deliver rows to `row_queue`, and call its client with `number` when the port needs attention.
 
-        It does if its queue runs low, if it is lost or has stopped repeating, and if a drive refuses, fails
-        to answer, or answers again.
+        The port needs attention if its queue runs low, if it is lost or has stopped repeating, and if a drive
+        refuses, fails to answer, or answers again.
         """
         with self._memory.replacing("rows", row_queue):
             lib.md_port_report(self.c, row_queue.c, number)
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        """Carry these out in turn whenever no queued exchange is due, until they are replaced.
+        """Carry out these exchanges in turn whenever no queued exchange is due, until they are replaced.
 
-        Return the index of the next one in the replaced round; 0 on a closed port.
+        Return the index of the next exchange in the round that they replace; 0 on a closed port.
         """
         if self.c is None:
             return 0
@@ -316,11 +316,11 @@ class Port:
 
     @property
     def repeating(self) -> bool:
-        """True while it repeats exchanges: until the port is lost, or one could not be sent."""
+        """True while the port repeats exchanges: until it is lost, or an exchange cannot be sent."""
         return bool(self._progress.repeating)
 
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
-        """Queue exchanges with the earliest time of each; return how many fitted."""
+        """Queue exchanges, each with its earliest start; return how many fitted into the queue."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
         self._memory.lasting.update(exchange.peer for exchange in exchanges)  # a late reply may come
@@ -351,7 +351,7 @@ class Port:
 
     @property
     def foreign(self) -> int:
-        """Bytes received while listening before the first request: another master uses the line."""
+        """Number of bytes received while listening before the first request, from another master."""
         return int(self._progress.foreign)
 
     @property
@@ -366,10 +366,10 @@ class Port:
         expires_ns: int = 0,
         into: Completion | None = None,
     ) -> Completion:
-        """Carry out an exchange ahead of the queue, wait for it, and return its completion.
+        """Carry out an exchange before all queued ones, wait for it, and return its completion.
 
-        Reuses the completion `into` if it has room for the values. After `expires_ns` (of CLOCK_BOOTTIME; 0:
-        never), or after a stop, the exchange is not sent.
+        Reuses the completion `into` if it has room for the values. The exchange is not sent after
+        `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop that ends its permit.
         """
         self._memory.lasting.add(exchange.peer)  # a late reply may come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)

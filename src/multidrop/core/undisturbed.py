@@ -1,7 +1,7 @@
 """Work that no signal interrupts: a signal handler's exception ends the main thread's wait, not the work.
 
 Python raises KeyboardInterrupt and other exceptions of signal handlers between any two bytecodes of the main
-thread, also in `finally` and `__exit__`. Therefore separate threads open and close ports and lines.
+thread, even in `finally` and `__exit__`. Therefore separate threads open and close ports and lines.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _Act:
 def undisturbed(function: Callable[P, R]) -> Callable[P, R]:
     """Return a function that runs in a separate thread when the main thread calls it.
 
-    An exception that interrupts the main thread leaves the call at once, while the work continues. If no
+    An exception that interrupts the main thread ends the call immediately, while the work continues. If no
     thread can be started, the main thread does the work itself.
     """
 

@@ -1,4 +1,4 @@
-"""Check a drive's class when it is made: a table of rules for its facts, and tables for its registers."""
+"""Check a drive's class when it is defined, with tables of rules for its facts and its registers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Drive: the base of all families: facts of the manual, registers, and the verbs that command the motor.
+"""Drive: the base class of all families, with facts of the manual, registers, and verbs.
 
-A family is a subclass that declares registers. Its verbs are scripts; if the drive is attached to a bus, the
-bus runs them.
+A family is a subclass that declares registers. Its verbs command the motor. They are scripts, which the bus
+runs to which the drive is attached.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 
 START_TIME = 5.0  # s within which a started motor must be seen to run
-REVERSAL_TIME = 60.0  # s for the ramps of a motor that turned the other way, without the option `stop_time`
+REVERSAL_TIME = 60.0  # s for the ramps of a reversal if the option `stop_time` is not given
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
@@ -39,13 +39,13 @@ A = TypeVar("A")
 class Drive(RegisterAccess):
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, or fewer in some families; on a tcp:// port it is a unit id, 0 to 255 in some
-    families. Baud rate, format and framing default to the family's. On a tcp:// port the framing is
-    TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s, replaces the
-    standard's t3.5 if all drives on the line tolerate it; a longer silence in the family's document still
-    applies. Options are facts that only the owner knows (see `options`). `ram` names registers that the owner
-    knows to be kept in RAM although the document does not say so. Raises ValueError for values that the
-    family's document does not allow.
+    `address` is 1 to 247, or a smaller range in some families; on a tcp:// port it is a unit id, 0 to 255 in
+    some families. Baud rate, format and framing default to the family's. On a tcp:// port the framing is TCP,
+    and baud rate and format are those of the wire behind the gateway. `silence`, in s, replaces the
+    standard's t3.5; use it only if all drives on the line tolerate it. A longer silence in the family's
+    document still applies. Options are facts that only the owner knows (see `options`). `ram` names registers
+    that the owner knows to be kept in RAM although the document does not say so. Raises ValueError for values
+    that the family's document does not allow.
     """
 
     title: ClassVar[str] = ""
@@ -60,7 +60,7 @@ class Drive(RegisterAccess):
     baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
     addresses: ClassVar[range] = range(1, 248)
     line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line
-    most_devices: ClassVar[int] = 0  # on a line with such a drive; 0: not stated
+    most_devices: ClassVar[int] = 0  # limit of devices on a line with such a drive; 0: not stated
 
     silence: ClassVar[float] = 0.0  # s, before and after a frame; with RTU at least t3.5
     silence_characters: ClassVar[float] = 0.0  # the same, in characters
@@ -89,14 +89,14 @@ class Drive(RegisterAccess):
     }
     damaged: ClassVar[frozenset[int]] = frozenset()  # codes for a request that arrived damaged
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # codes of a drive that will answer later
-    broadcasts: ClassVar[bool] = False  # True if the document defines broadcasts
-    identify_recognises: ClassVar[bool] = False  # True if another make never passes `identify`
+    broadcasts: ClassVar[bool] = False  # whether the document defines broadcasts
+    identify_recognises: ClassVar[bool] = False  # True if a drive of another make never passes `identify`
     identity_proofs: ClassVar[tuple[Any, ...]] = ()  # of a family file: registers with their values
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
-    remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
+    remote: ClassVar[str] = "the drive must take its commands from the line"  # what to set on its keypad
     line_parameters: ClassVar[str] = ""  # the parameters for its address, baud rate and format
-    no_broadcasts: ClassVar[str] = "none documented"  # in words, if there are none
+    no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
@@ -121,7 +121,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _declared(cls, kind: type[A]) -> dict[str, A]:
-        """Return the class's attributes of a kind by name, without those that a subclass has replaced."""
+        """Return the class's attributes of this type by name, without those that a subclass has replaced."""
         found: dict[str, A] = {}
         for owner in reversed(cls.__mro__):
             for name, attribute in vars(owner).items():
@@ -133,7 +133,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, with `confirmed` if a command needs it: see `check_confirmed`."""
+        """Return the class's options, including `confirmed` if a command needs it: see `check_confirmed`."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
@@ -224,8 +224,8 @@ class Drive(RegisterAccess):
         self._known_setpoint = KnownSetpoint()
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.link: Link = NO_LINK
-        self.stops_called: Sequence[int] = (0,)  # its first item counts them
-        # The permit of a call; any stop called after the first `seen` stops ends it.
+        self.stops_called: Sequence[int] = (0,)  # the first item is the number of stops called so far
+        # Takes a verb and the number of stops seen; returns a new call, which any later stop cancels.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (
@@ -304,7 +304,7 @@ class Drive(RegisterAccess):
 
     @property
     def ledger_name(self) -> str:
-        """Name under which its EEPROM writes are counted; two files of one name differ by their titles."""
+        """Name under which EEPROM writes are counted; for a family file it includes the file's title."""
         if self.declared_in:
             return f"{self.model}: {self.title}"
         return self.model or type(self).__name__
@@ -318,10 +318,10 @@ class Drive(RegisterAccess):
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers whose raw counts lie in a known range: the least and the greatest count of each.
+        """Return registers whose raw counts lie in a known range, each with its least and greatest count.
 
-        If a family reads one register at a time, only the value distinguishes one register's late reply from
-        another's. So no two of the ranges may overlap.
+        If a family reads one register at a time, replies of two registers differ only by their values. So the
+        ranges must not overlap.
         """
         return {}
 
@@ -336,8 +336,8 @@ class Drive(RegisterAccess):
     def check_confirmed(self, what: str) -> None:
         """Raise WriteForbidden if the drive must be confirmed and is not.
 
-        Two kinds of families need it: those that cannot identify their drives, because the same address may
-        start the motor of another make; and those from a file, which are untested.
+        Two kinds of families need confirmation: those without `identify`, because the same write may start
+        the motor of another make; and those from a file, which are untested.
         """
         if "confirmed" not in self.options or self.option.get("confirmed"):
             return
@@ -350,7 +350,7 @@ class Drive(RegisterAccess):
 
     @property
     def commanded(self) -> float | None:
-        """The setpoint that was written last; None unless the drive is known to hold it."""
+        """The setpoint written last, if the drive is known to hold it, else None."""
         return self._known_setpoint.value
 
     @commanded.setter
@@ -358,7 +358,7 @@ class Drive(RegisterAccess):
         self._known_setpoint.value = held
 
     def begin_setpoint(self) -> Callable[[], None]:
-        """Forget the setpoint until its write ends; return a callback for a write that was not sent."""
+        """Forget the setpoint until its write ends; return a function to restore it if nothing was sent."""
         return self._known_setpoint.begin_write()
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
@@ -385,7 +385,7 @@ class Drive(RegisterAccess):
             raise NotVerified(self.name, what, f"the drive holds {register.format(held)}")
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise WriteForbidden unless the setpoint is known, not 0, and still the value written last."""
+        """Raise WriteForbidden if the setpoint is unknown, 0, or no longer the value written last."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
@@ -408,10 +408,10 @@ class Drive(RegisterAccess):
         return WriteForbidden(why, advice=Advice.call("reset_fault"))
 
     def _started(self, direction: Direction | None = None) -> Script[None]:
-        """Wait until the motor is seen to run, and in `direction` if the drive shows one.
+        """Wait until the motor is seen to run, and in `direction` if given and shown by the drive.
 
-        A motor that turned the other way gets the time of its ramps. Raises NotVerified if the drive trips,
-        Unconfirmed if it is not seen to run in time.
+        A motor that turned the other way gets more time, for its ramps. Raises NotVerified if the drive
+        trips, Unconfirmed if the motor is not seen to run in time.
         """
         if not (yield from until(self._runs, limit=START_TIME)):
             seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
@@ -445,14 +445,14 @@ class Drive(RegisterAccess):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check by reading that this is a drive of the family. Raises WriteForbidden if it is another.
+        """Check by reading that this is a drive of the family. Raises WriteForbidden if it is of another one.
 
-        A drive that passes is not proven to be one: few families identify themselves.
+        Passing the check is not proof, because few families identify themselves.
         """
         yield from ()
 
     def resembles(self) -> Script[bool]:
-        """Return True if a drive that `identify` refuses still reads like the family: enough for a guess."""
+        """Return True if a drive that failed `identify` still resembles the family enough for a guess."""
         yield from ()
         return False
 
@@ -518,7 +518,7 @@ TAKEN_NAMES = frozenset(
 )
 
 
-# ---- a drive's own registers: at the same address another family has something else ----
+# ---- checks that a register belongs to the drive: addresses mean something else in another family ----
 
 
 def check_drive(drive: Drive) -> None:
@@ -528,9 +528,9 @@ def check_drive(drive: Drive) -> None:
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError for another family's register: the same address means something else there.
+    """Raise ValueError for another family's register, because addresses mean something else there.
 
-    Raises TypeError for anything else, such as a name.
+    Raises TypeError if `register` is not a register, such as a name.
     """
     check_drive(drive)
     if not isinstance(register, Register):
@@ -549,7 +549,7 @@ def check_readable(drive: Drive, register: Register[Any]) -> None:
 
 
 def check_own_text(drive: Drive, text: Text) -> None:
-    """Raise ValueError for another family's text, TypeError for anything else."""
+    """Raise ValueError for another family's text, TypeError if `text` is not a text."""
     check_drive(drive)
     if not isinstance(text, Text):
         raise TypeError(f"{text!r} is not a text of {drive.name}: use its attribute, or drive.texts[NAME]")

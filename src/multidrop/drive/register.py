@@ -37,7 +37,7 @@ class Kept(Enum):
     EEPROM = "EEPROM"
     UNKNOWN = "not stated"
 
-    __hash__ = object.__hash__  # each member is one object: ten times as fast as by name, which Enum takes
+    __hash__ = object.__hash__  # ten times as fast as Enum's hash of the name
 
 
 class Carrier(Enum):
@@ -59,23 +59,23 @@ class Table:
     read: int | None
     write: int | None
     carrier: Carrier = Carrier.WORD
-    kept: Kept = Kept.UNKNOWN  # if the function code alone decides it
+    kept: Kept = Kept.UNKNOWN  # the memory, if the function code alone determines it
 
     @property
     def read_space(self) -> tuple[Carrier, int | None]:
-        """Key of the tables with the same function code for reads: their registers may share a request."""
+        """Key of the tables with the same function code for reads; their registers may share a request."""
         return self.carrier, self.read
 
 
 HOLDING = Table("holding register", 0x03, 0x06)
-HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # also one register is written by 10H
+HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # 10H is used even for a single register
 INPUT = Table("input register", 0x04, None)
 COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
 
 
 T = TypeVar("T", bound=float)
-ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # in the names of values
+ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # words in the names of values that stay in capitals
 
 
 class Worded(IntEnum):
@@ -145,7 +145,7 @@ class Register(Generic[T]):
             object.__setattr__(self, "kept", table_kept)
 
     def __set_name__(self, owner: type, name: str) -> None:
-        if not self.name:  # a second name would take the first one away
+        if not self.name:  # a second attribute for the same register must not rename it
             object.__setattr__(self, "name", name)
 
     def __str__(self) -> str:
@@ -153,12 +153,12 @@ class Register(Generic[T]):
 
     @cached_property
     def words(self) -> int:
-        """Number of addresses that it occupies in its table."""
+        """Number of addresses that the register occupies in its table."""
         return WORDS[self.number_format] if self.table.carrier is Carrier.WORD else 1
 
     @cached_property
     def reach(self) -> range:
-        """Addresses that one request reads for its value, with those of its scale register."""
+        """Addresses that a request reads for the value, including those of the scale register."""
         own = range(self.address, self.address + self.words)
         if self.scaled_by is None:
             return own
@@ -167,7 +167,7 @@ class Register(Generic[T]):
 
     @cached_property
     def coding(self) -> Coding:
-        """Its encoding in the words, with its exact scale."""
+        """The encoding of the value in the register's words, with the exact scale."""
         offset = Fraction(str(self.offset))
         return Coding(self.number_format, self.order, self.part, self.invalid, self.scale, offset)
 
@@ -197,29 +197,29 @@ class Register(Generic[T]):
 
     @property
     def commands(self) -> bool:
-        """True if a write may move the motor: only verbs send it, except for its `harmless` counts."""
+        """True if a write may move the motor, so that only verbs send it (except `harmless` counts)."""
         if self.moves is None:
             return self.access is Access.COMMAND or self.harmless is not None
         return self.moves
 
     @cached_property
     def scale(self) -> Fraction:
-        """Exact step, 1 if it is unknown: 3 * 1/10 is 0.3, not 0.30000000000000004."""
+        """The step as an exact fraction (1 if unknown), because 3 * 0.1 as floats is not 0.3."""
         return Fraction(str(self.step)) if self.step is not None else Fraction(1)
 
     @property
     def value_unit(self) -> str:
-        """The unit of its values: its `unit`, or "raw count" if its scale is not stated."""
+        """The unit of the values: `unit`, or "raw count" if the scale is not stated."""
         return self.unit if self.values is not None or self.step is not None else "raw count"
 
     @property
     def decimals(self) -> int:
-        """Digits that step and offset need after the point."""
+        """Number of decimals that step and offset need."""
         parts = (Decimal(f"{float(part):.6g}") for part in (self.scale, self.coding.offset))
         return max(0, *(-int(part.normalize().as_tuple().exponent) for part in parts))
 
     def number_in(self, data: bytes, at: int) -> float | None:
-        """Return the number at word (coils: bit) `at` of a reply's data, as in a row; None for no value."""
+        """Return the number, as in a row, at word (coils: bit) `at` of a reply's data; None for no value."""
         raw = self.coding.raw_in(data, at)
         if raw is None or self.scaled_by is None:
             return None if raw is None else self.coding.value_of(raw)
@@ -245,9 +245,9 @@ class Register(Generic[T]):
         return cast(T, bool(raw) if self.is_bit else self.coding.value_of(raw))
 
     def encode(self, value: T) -> float:
-        """Return the raw count of a value: a whole number, or in a float register the nearest float.
+        """Return the raw count of a value: a whole number, or for a float register the nearest float.
 
-        Raises ValueError outside the span, TypeError unless it is a number.
+        Raises ValueError if the value is outside the span, TypeError if it is not a number.
         """
         if self.values is not None:
             return self._encode_name(value)
@@ -285,7 +285,7 @@ class Register(Generic[T]):
         return self.coding.count_of(value)
 
     def takes(self, value: T) -> bool:
-        """Return True if a drive may hold this value: it has a name, or is in the span."""
+        """Return True if a drive may hold this value: it is a named value, or within the span."""
         if self.values is not None:
             return isinstance(value, self.values)
         if self.span is None:
@@ -297,7 +297,7 @@ class Register(Generic[T]):
 
     @property
     def _counts(self) -> bool:
-        """True if numbers are choices or raw counts: the nearest one may mean something else."""
+        """True if numbers are choices or raw counts, which must not be rounded."""
         return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
@@ -441,7 +441,7 @@ class Declaration(Protocol):
 
 
 def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
-    """Decorate a function that takes an address, a unit or an enumeration, and details."""
+    """Decorator that types a function which takes an address, a unit or an enumeration, and details."""
     return cast(Declaration, declare)
 
 
@@ -473,7 +473,7 @@ def _declare(access: Access, address: int, what: Any, given: Details) -> Registe
 
 
 def row_field(register: Register[Any], at: int, code: int) -> Field:
-    """Return the field of a register at word (coils: bit) `at` of a reply; `code` is that of its name."""
+    """Return the field of a register at word (coils: bit) `at` of a reply; `code` is its name's number."""
     multiplier, _, divisor = register.coding.factors
     return Field(at, register.coding.core_format, code, multiplier, divisor, _extra(register, at))
 

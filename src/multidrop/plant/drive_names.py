@@ -1,4 +1,4 @@
-"""Names of drives and lines: reserved names, and equal names in different Unicode forms."""
+"""Names of drives and lines: reserved names, and names that differ only in their Unicode form."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 from unicodedata import normalize
 
-# Names that would collide with a topic, path, file or key, and what each is used for.
+# Names that would collide with a topic, path, file or key, each with its use.
 RESERVED_NAMES: Final[Mapping[str, str]] = {
     "gateway": "the MQTT topic PREFIX/gateway",
     "stop": "the MQTT topic PREFIX/stop, which stops all drives",
@@ -21,7 +21,7 @@ RESERVED_NAMES: Final[Mapping[str, str]] = {
 
 
 def check_drive_name(name: str) -> bool:
-    """Return True for a name that a drive or a line may have. Raises ValueError for a reserved one."""
+    """Return True for a valid name of a drive or a line. Raises ValueError for a reserved or invalid one."""
     if name in RESERVED_NAMES:
         raise ValueError(f'name "{name}" is reserved for {RESERVED_NAMES[name]}; give it another name')
     if name.startswith("-"):
@@ -30,9 +30,10 @@ def check_drive_name(name: str) -> bool:
 
 
 def drive_meant(name: str, names: Iterable[str]) -> str:
-    """Return this name if it is listed, else the only listed name of the same normal form, else `name`.
+    """Return the listed name that `name` means.
 
-    For stops and reads only: a command that moves a motor must name it exactly.
+    That is `name` itself if it is listed, else the only listed name with the same Unicode normal form; else
+    return `name`. Use this only for stops and reads: a command that moves a motor must name it exactly.
     """
     names = [*names]
     if name in names:

@@ -1,4 +1,4 @@
-"""Load a plant file; every error in it is found before anything is done with it. Opens no port."""
+"""Load a plant file, and find all errors in it. Opens no port."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 
 class PlantError(ValueError):
-    """All errors of a plant file; `mistakes` has a sentence for each: its place, and what would be right.
+    """All errors of a plant file; `mistakes` has a sentence for each, with its place and what would be right.
 
-    `rest` is the plant without its lines, if the file is valid TOML.
+    `rest` is the plant without its lines if the file is valid TOML, else None.
     """
 
     def __init__(self, mistakes: tuple[str, ...], rest: Plant | None = None) -> None:
@@ -33,7 +33,7 @@ class PlantError(ValueError):
 
 
 def load_plant(path: Path | str) -> Plant:
-    """Return the plant that the file describes; PlantError when anything in it is wrong."""
+    """Return the plant that the file describes. Raises PlantError if there is any error in the file."""
     if why := port_or_address(path):
         raise PlantError((why,))
     path = Path(path)
@@ -48,7 +48,7 @@ def load_plant(path: Path | str) -> Plant:
 
 
 def port_or_address(name: Path | str) -> str:
-    """Return an error sentence for a URL or a device given as a plant file; "" for a possible file."""
+    """Return an error sentence if a URL or a device was given instead of a plant file, else ""."""
     url = _URL.match(str(name))
     if url is None and not str(name).startswith("/dev/tty"):
         return ""
@@ -60,7 +60,7 @@ def port_or_address(name: Path | str) -> str:
     return f"{shown} is a port, and no plant file; `multidrop scan {shown} --out plant.toml` writes one"
 
 
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # a Path has one slash of two
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # Path reduces two slashes to one
 _PORTS = ("tcp", "socket", "rfc2217")
 
 _PLANT = {
@@ -100,7 +100,7 @@ _POLL = {
     "every": Key(str, 'every = "50 ms"'),
 }
 
-_NOT_ARGUMENTS = ("name", "model", "every", "poll")  # of a drive's class
+_NOT_ARGUMENTS = ("name", "model", "every", "poll")  # keys that are not arguments of a drive's class
 
 
 def _line(table: Any, place: TomlPlace) -> PlantLine:
@@ -109,7 +109,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     if name:
         place.attempt(check_drive_name, name)
         place.once("line", name, sentence="another line has this name too; every line needs its own")
-    if port and not speaks_tcp(port):  # each line of one gateway is a connection with a request under way
+    if port and not speaks_tcp(port):  # several lines may have one tcp:// port, each its own connection
         place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
     if port:
         place.attempt(check_port, port)
@@ -184,7 +184,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
         return find_model(text, place.path.parent)
     except FamilyError as wrong:
         once = ("family", text)
-        if once not in place.seen:  # else all of its mistakes are there already
+        if once not in place.seen:  # report the file's mistakes only once
             for mistake in wrong.mistakes:
                 place.wrong(mistake)
         place.seen.setdefault(once, "")
@@ -194,7 +194,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
-    """Return keys for the family's options, or for those of all families if it is unknown."""
+    """Return the keys of the family's options; for an unknown family, those of all families' options."""
     families = [model] if model else list(MODELS.values())
     return {
         name: Key((int, float), f"{name} = {option.span[1]:g}")
@@ -206,19 +206,19 @@ def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
 def _try_each(
     model: type[Drive], arguments: Mapping[str, Any], inherited: Mapping[str, Any], place: TomlPlace
 ) -> None:
-    """Try one argument at a time, so that each one that the family refuses has its sentence."""
+    """Try one argument at a time, so that each argument that the family refuses gets its own error."""
     least: dict[str, Any] = {"address": model.addresses[0]}
     if "framing" in arguments:
         framing = {"framing": arguments["framing"]}
         if place.attempt(partial(model, **least, **framing)):
-            least |= framing  # on which the formats depend
+            least |= framing  # the allowed formats depend on the framing
     for key, value in arguments.items():
         if key != "framing":
             place.attempt(partial(model, **(least | {key: value})))
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # their values depend on the others
+        if key not in right:  # other keys cannot be tried alone
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)
@@ -244,7 +244,7 @@ def _polls(
 def _polled(
     entry: Any, model: type[Drive], every: float | None, place: TomlPlace
 ) -> Polled | tuple[Polled, ...] | None:
-    """Return the poll of an entry; those of all readings for "*"."""
+    """Return the poll of an entry; for "*", the polls of all readings; None if the entry is invalid."""
     if not isinstance(entry, (str, dict)):
         place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
         return None

@@ -1,4 +1,4 @@
-"""Plant: the lines, their drives and the polled registers, as plain data."""
+"""Plant: lines, their drives and the polled registers, as plain data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAY_LISTS: Final = {
 
 @dataclass(frozen=True)
 class Polled:
-    """A register that is read every so many seconds; None: as fast as the line allows.
+    """A register that is read every `every` seconds; None means as fast as the line allows.
 
     Raises ValueError unless `every` is from 0.0001 to 86400 s, or None.
     """
@@ -42,11 +42,11 @@ class Polled:
 
 @dataclass(frozen=True, init=False)
 class PolledDrive:
-    """A drive and the registers that are read from it again and again, each at its rate.
+    """A drive and its polled registers, each with its rate.
 
-    `polls` has registers of the drive or their names, and Polled for a register with a period of its own;
-    without it, all readings of the drive. `every` is the period of the others in s, None for as fast as the
-    line allows.
+    `polls` lists registers of the drive or their names, or Polled for a register with a period of its own.
+    Without `polls`, all readings of the drive are polled. `every` is the period of the others in s; None
+    means as fast as the line allows.
     """
 
     drive: Drive
@@ -63,16 +63,16 @@ class PolledDrive:
         object.__setattr__(self, "drive", drive)
         object.__setattr__(self, "polls", tuple(_polled(drive, one, every) for one in wanted))
 
-    def __hash__(self) -> int:  # not that of all polls: it is looked up again and again
+    def __hash__(self) -> int:  # without the polls, because it is computed often
         return hash(self.drive)
 
     @property
     def wanted(self) -> list[tuple[Register[Any], float | None]]:
-        """Registers and their periods in s, as planning takes them."""
+        """The polled registers with their periods in s, as `plan` takes them."""
         return [(poll.register, poll.every) for poll in self.polls]
 
     def at_rate(self, register: Register[Any] | None, every: float | None) -> PolledDrive:
-        """Return the same with another rate, for one register, or with None for all that are polled.
+        """Return a copy with another period in s for one register, or for all if `register` is None.
 
         Raises ValueError for a register that is not polled.
         """
@@ -100,7 +100,7 @@ class PlantLine:
     baudrate: int | None = None
     format: str | None = None
     drives: Sequence[PolledDrive] = ()  # kept as a tuple
-    switching: float = 0.0  # s that the port takes to change them
+    switching: float = 0.0  # s that the port takes to change baud rate or format
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
     rs485: RS485 = RS485.OFF
@@ -110,16 +110,16 @@ class PlantLine:
         object.__setattr__(self, "drives", tuple(self.drives))
 
     def at(self, port: str) -> PlantLine:
-        """Return the same line at another port; a network has no transceiver to switch."""
+        """Return the same line at another port; without `rs485` if that is a network port."""
         return replace(self, port=port, rs485=RS485.OFF if "://" in port else self.rs485)
 
 
 @dataclass(frozen=True)
 class Plant:
-    """All lines of a plant file, and its table `serve` as it stands: the gateway alone reads that."""
+    """All lines of a plant file, and its table `serve`, unchecked, which only the gateway reads."""
 
     lines: Sequence[PlantLine]  # kept as a tuple
-    path: Path = Path("plant")  # of its file
+    path: Path = Path("plant")  # the plant file
     serve: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -128,16 +128,16 @@ class Plant:
     @classmethod
     def load(cls, path: Path | str) -> Plant:
         """Return the plant that a file describes; no port is opened. Raises PlantError with all mistakes."""
-        plant: Plant = import_module("multidrop.plant.loader").load_plant(path)  # it imports this module
+        plant: Plant = import_module("multidrop.plant.loader").load_plant(path)  # avoids an import cycle
         return plant
 
     def find_line(self, name: str) -> PlantLine:
-        """Return the line of this name; ValueError with the nearest names when there is none."""
+        """Return the line of this name. Raises ValueError with the nearest names if there is none."""
         found = next((line for line in self.lines if line.name == name), None)
         return found or self._unknown("line", name, (line.name for line in self.lines))
 
     def find_drive(self, name: str) -> tuple[PlantLine, Drive]:
-        """Return the drive of this name and its line; ValueError with the nearest names for none."""
+        """Return the line and the drive of this name. Raises ValueError with the nearest names if none."""
         drives = {polled.drive.name: (line, polled.drive) for line in self.lines for polled in line.drives}
         return drives.get(name) or self._unknown("drive", name, drives)
 
@@ -148,9 +148,9 @@ class Plant:
         raise ValueError(f"{self.path} has no {kind} {name!r}; {hint}")
 
     def with_ports(self, ports: Mapping[str, str]) -> Plant:
-        """Return the same plant with other ports, by line, such as those of a simulator.
+        """Return the same plant with other ports, given by line name, such as those of a simulator.
 
-        Raises ValueError for an unknown line, and where two lines would have one port.
+        Raises ValueError for an unknown line, and if two lines would have the same port.
         """
         for name, port in ports.items():
             self.find_line(name)
@@ -169,15 +169,15 @@ class Plant:
 
 
 def current_for(period: float) -> float:
-    """Return how long, in s, a value that is polled with this period in s counts as current.
+    """Return for how many seconds a polled value counts as current.
 
-    `period` is the larger of the register's own and its line's bus cycle.
+    `period` in s is the register's own period or the line's bus cycle, whichever is longer.
     """
     return max(1.0, 3 * period)
 
 
 def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
-    """Return all that is polled on a line; `delays` are response delays in s that were measured."""
+    """Return the planned blocks of a line; `delays` are measured response delays in s."""
     known = delays or {}
     return [
         each
@@ -187,7 +187,7 @@ def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> 
 
 
 def _metadata(plant: Plant) -> dict[str, Any]:
-    from importlib.metadata import version  # takes a fifth of the time in which a poller is imported
+    from importlib.metadata import version  # imported here: a fifth of the import time of a poller
 
     return {
         "multidrop": version("multidrop"),
@@ -225,9 +225,9 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
 
 
 def check_listed(plant: Plant, key: str, entry: object) -> bool:
-    """Check an entry of a list: a register that can be written, or a verb that its drive has.
+    """Check an entry of the list `key`, which names a writable register or a verb of a drive.
 
-    `stop` is never listed: it is always allowed. Returns True. Raises ValueError.
+    Returns True, or raises ValueError for a wrong entry. `stop` is never listed: it is always allowed.
     """
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:
