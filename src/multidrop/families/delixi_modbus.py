@@ -26,7 +26,7 @@ class DelixiModbusControl(IntEnum):
 
 
 class DelixiModbusFormat(IntEnum):
-    """P04.29, in the firmware that speaks standard Modbus."""
+    """P04.29 in firmware that speaks standard Modbus."""
 
     ASCII_7N2 = 0
     ASCII_7E1 = 1
@@ -91,7 +91,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     )
     format_setting = setting(parameter(4, 29), DelixiModbusFormat, never=KEYPAD, place="P04.29")
 
-    _jogged = False  # by this object, since it was last seen to stand
+    _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
         """Return P04.30, its address, P04.28, its baud rate, and a bus voltage that no address reaches."""
@@ -145,7 +145,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop, which has happened when the output frequency is 0."""
+        """Stop. The motor counts as stopped when the output frequency is 0."""
         yield from insist(self.control, DelixiModbusControl.STOP)
         yield from self._stopped(self._stands, self._limit())
 

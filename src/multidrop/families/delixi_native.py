@@ -35,7 +35,7 @@ class DelixiNativeStatus(IntEnum):
 
 
 class DelixiNativeFormat(IntEnum):
-    """P04.29, in the firmware that speaks Delixi's own protocol."""
+    """P04.29 in firmware that speaks Delixi's own protocol."""
 
     N81 = 0
     E81 = 1
@@ -132,7 +132,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop, which has happened when neither the state nor the output frequency says otherwise."""
+        """Stop. The motor counts as stopped once neither state nor output frequency shows that it turns."""
         yield from insist(self.control, DelixiNativeControl.STOP)
         yield from self._stopped(self._stands, self._limit())
 

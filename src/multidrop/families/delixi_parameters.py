@@ -10,7 +10,7 @@ from multidrop.drive.options import Option
 from multidrop.drive.register import Register, Table, Worded, reading, setting
 from multidrop.drive.script import Script, read
 
-STOP_TIME = 60.0  # s; the deceleration time's number is not known
+STOP_TIME = 60.0  # s; the parameter number of the deceleration time is not known
 
 KEYPAD = "it belongs to the line or to the command over the motor; set it on the keypad"
 
@@ -23,7 +23,7 @@ def parameter(group: int, index: int) -> int:
 
 
 class DelixiFault(Worded):
-    """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are read."""
+    """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are accepted."""
 
     NONE = 0
     OC_OVERCURRENT = 1, "overcurrent (OC)"
@@ -63,9 +63,9 @@ class DelixiBaudrate(IntEnum):
 
 
 class DelixiParameters(Drive):
-    """The parameters of Delixi's inverters; a subclass says which table of its protocol carries them.
+    """The parameters of Delixi's inverters; a subclass declares the table of its protocol for them.
 
-    P04.29, the format, has other codes in each protocol, and is the subclass's.
+    P04.29, the format, has different codes in each protocol, so subclasses declare it.
 
     Values have no decimal point, and the list of scales is lost. Only the scale of the output
     frequency is known, from an example. The units of P05.01 to P05.10 are inferred from

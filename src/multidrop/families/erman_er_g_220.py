@@ -257,7 +257,7 @@ class ErmanERG220(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; when the motor still runs after it, or refuses that, emergency stop."""
+        """Stop along the ramp. If the drive refuses, or the motor still runs afterwards, emergency stop."""
         try:
             yield from self._hold_back(self.stop_coil)
         except DriveException:
@@ -277,7 +277,7 @@ class ErmanERG220(Drive):
         yield from self._stopped(self._stands, (yield from self._longest_ramp()))
 
     def _hold_back(self, stop: Register[Coil]) -> Script[None]:
-        """Write a stop on and START off; START even if the stop is not confirmed."""
+        """Write a stop coil on and START off; write START even if the stop is not confirmed."""
         try:
             yield from insist(stop, Coil.ON)
         except Unconfirmed:
@@ -286,7 +286,7 @@ class ErmanERG220(Drive):
         yield from insist(self.start_coil, Coil.OFF)
 
     def _longest_ramp(self) -> Script[float]:
-        """Return for how many s a stop may go on before the motor counts as not obeying it."""
+        """Return after how many seconds a motor that still runs counts as not obeying a stop."""
         try:
             return (yield from read(self.deceleration_time)) + STOP_MARGIN
         except BusError:  # a drive that answers to some requests alone is one that may not obey, either
@@ -298,7 +298,7 @@ class ErmanERG220(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; START is written off before, so that it cannot start the motor again."""
+        """Reset a fault. START is written off first, so that the reset cannot start the motor."""
         if (yield from read(self.status)) & PHASE:
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         fault = yield from read(self.last_fault)

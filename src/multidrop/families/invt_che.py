@@ -38,7 +38,7 @@ CHE100_CODES = "CHE100 manual v1.4, p. 119"
 SCALE = f"{CHE100}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
 SCALE_NEXT = f"{CHE100_NEXT}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
 
-STOP_TIME = 60.0  # s; the deceleration time's address is not known
+STOP_TIME = 60.0  # s; the address of the deceleration time is not known
 
 
 class CHEControl(IntEnum):
@@ -125,9 +125,9 @@ def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Re
 
 @declaration
 def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a function code that is written in EEPROM, and outlasts a loss of power.
+    """Declare a function code that is written to EEPROM, and so survives a loss of power.
 
-    Every write wears the EEPROM (section 11.6.4): it is written on change, and its writes are counted.
+    Every write wears the EEPROM (section 11.6.4), so writes are sent only on change, and are counted.
     """
     _in_section_11_6_4(ordinal, details)
     return setting(ordinal, what, **details)
@@ -273,7 +273,7 @@ class InvtCHE(Drive):
     )
     communication_fault = reading(0x5001, CommunicationFault, outside=CHE100_NEXT)
 
-    _jogged = False  # by this object, since it was last seen to stand
+    _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
 
     @verb
     def identify(self) -> Script[None]:
@@ -340,7 +340,7 @@ class InvtCHE(Drive):
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands_by(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
-        """Write a stop; return True if the motor is then at rest; collect its exception."""
+        """Write a stop; return True if the motor is then at rest. An exception of the drive is collected."""
         try:
             yield from insist(self.control, word)
         except DriveException as refusal:  # as in a fault, or without a jog
@@ -369,7 +369,7 @@ class InvtCHE(Drive):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint as the percentage of the maximum frequency that it is."""
+        """Write the setpoint, converted from Hz to a percentage of the maximum frequency."""
         most = self.option.get("maximum_frequency")
         if most is None:
             raise WriteForbidden(

@@ -1,11 +1,11 @@
 """Find a family by name: built-in, shipped as a file, or in a user's file.
 
 The shipped families are TOML files of this package, untested on hardware. A TOML file is data. A Python
-file is a program: it runs once a process, with all rights of the caller, and is logged to
-`multidrop.families.registry` before. It may import modules of its own directory by name, as a script does.
-No other file sees such a module: `sys.path` and the names in `sys.modules` stay unchanged, so two
-directories may have modules of one name. A module of Python's own, or multidrop itself, is never taken from
-that directory.
+file is a program: it is run once per process, with all rights of the caller, after its name is logged to
+`multidrop.families.registry`. Like a script, it may import modules of its own directory by name. Files in
+other directories do not see these modules: `sys.path` and the names in `sys.modules` stay unchanged, so two
+directories may have modules of the same name. Modules of the standard library, and multidrop itself, are
+never imported from that directory.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def shipped_family(name: str) -> type[Drive]:
 def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     """Return the family called `text`: one of MODELS or SHIPPED, "path/to/file.toml", or "file.py:Class".
 
-    A relative path starts at `relative_to`, or at the working directory. A Python file is run, once a
-    process. Raises ValueError for an unknown name and for any error in the file.
+    A relative path starts at `relative_to`, or at the working directory. A Python file is run, but only once
+    per process. Raises ValueError for an unknown name and for any error in the file.
     """
     if text in MODELS:
         return MODELS[text]
@@ -165,7 +165,7 @@ def load_model_file(path: Path) -> ModuleType:
 
 
 class _NotPython(Exception):
-    """A file whose name is not that of a Python file."""
+    """The file's name does not end like that of a Python file."""
 
 
 def _module(path: Path) -> ModuleType:

@@ -17,8 +17,8 @@ from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 SELECTION_TIME = 1.0  # s in which a preset speed becomes the frequency command
-RELEASE_TIME = 2.0  # s in which a motor that panel or terminals start is seen to turn
-RESET_TIME = 3.0  # s in which the drive restarts and may be deaf
+RELEASE_TIME = 2.0  # s within which a motor started by panel or terminals is seen to turn
+RESET_TIME = 3.0  # s in which the drive restarts and may not answer
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
@@ -30,7 +30,7 @@ AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
 
 class YD1000Control(IntFlag):
-    """1000H. Bits 15 and 14 latch until they are written 0 or the power goes."""
+    """1000H. Bits 15 and 14 latch until 0 is written to them or the power fails."""
 
     COMMAND_VALID = 1 << 15  # this word, not CNOD, commands the motor
     FREQUENCY_VALID = 1 << 14  # 1001H, not FNOD, is the setpoint
@@ -458,27 +458,27 @@ class YD1000(Drive):
         return state
 
     def _direction(self) -> Script[Direction]:
-        """Read the direction of a motor that turns: 1201H is frozen in a trip alone."""
+        """Return the direction of a turning motor from 1201H, which is frozen only in a trip."""
         status = yield from read(self.status)
         return Direction.REVERSE if status & YD1000Status.REVERSE else Direction.FORWARD
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp, which has happened when 1100H is 0 twice."""
+        """Stop along the ramp. The motor counts as stopped when 1100H is 0 twice in a row."""
         yield from insist(self.control, STOP)
         yield from self._stopped(self._stands, (yield from self._limit()))
 
     @verb
     def coast(self) -> Script[None]:
-        """Take the voltage off and let the motor run out; the coast bit stays set until the next command."""
+        """Remove the voltage and let the motor coast; the coast bit stays set until the next command."""
         yield from insist(self.control, STOP | YD1000Control.COAST)
         yield from self._stopped(self._stands, STOP_MARGIN)
 
     @verb
     def emergency_stop(self) -> Script[None]:
-        """Stop the motor as the drive's own emergency stop does, which is a fault.
+        """Stop the motor with the drive's own emergency stop, which is a fault.
 
-        It is a pulse and sent once. When it is not confirmed, the stop along the ramp follows at once.
+        It is a pulse that is sent once. If it is not confirmed, the stop along the ramp follows immediately.
         """
         try:
             yield Pulse(self.control, STOP | YD1000Control.EMERGENCY_STOP)
@@ -504,7 +504,7 @@ class YD1000(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Restart the drive, which resets its fault, and command the stop again; sent once.
+        """Restart the drive once, which resets its fault, and then command the stop again.
 
         Its setpoint is lost with it: call set_frequency before the next start.
         """
@@ -518,7 +518,7 @@ class YD1000(Drive):
         self._record = yield from read(self.fault_record_1)
 
     def _no_terminal_runs(self, when: str) -> Script[None]:
-        """Raise WriteForbidden if a terminal could start the motor once bit 15 is off, as after a restart."""
+        """Raise WriteForbidden if a terminal could start the motor once bit 15 is off (after a restart)."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
         for number, terminal in enumerate(Inputs, 1):  # F111 is the function of F, and so on
@@ -532,9 +532,9 @@ class YD1000(Drive):
 
     @verb
     def release_control(self) -> Script[None]:
-        """Give command and setpoint back to panel and terminals: bits 15 and 14 off; at rest only.
+        """Return command and setpoint to panel and terminals by clearing bits 15 and 14; only at rest.
 
-        If the motor is seen to turn then, or is not heard, the stop is written again.
+        If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
         if not (yield from self._stands()):
             raise self._stop_first("turns:")
@@ -569,7 +569,7 @@ class YD1000(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Report that it turns, or its fault: one that freezes 1200H, or is new since the last look."""
+        """Report whether the motor turns, or a fault: one that freezes 1200H, or is new in the record."""
         if not (yield from self._stands()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)
@@ -580,7 +580,7 @@ class YD1000(Drive):
         return State(Condition.STOPPED, note="a trip at rest before the first look would not show")
 
     def _is_frozen(self) -> Script[bool]:
-        """Return True where 1200H is held and 1100H is 0 (section 8.2); a motor that starts has both."""
+        """Return True if 1200H is frozen while 1100H is 0 (section 8.2), as in a trip or during a start."""
         if (yield from read(self.held_frequency)) == 0:
             return False
         return (yield from read(self.output_frequency)) == 0

@@ -40,7 +40,7 @@ MOST_CSV_FILES = 20
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A family, and the bytes of the files that it was made of."""
+    """A family, and the contents of the files from which it was made."""
 
     files: Mapping[Path, bytes]
     family: type[Drive]
@@ -52,8 +52,8 @@ _loaded: dict[Path, _Loaded] = {}
 def load_family(path: Path | str) -> type[Drive]:
     """Return the family that a TOML file declares: a subclass of `Drive`.
 
-    The same file gives the same class until its contents change. Its `model` is the file's name.
-    Raises FamilyError with all that is wrong with the file, and with the CSV files that it names.
+    The same file gives the same class until its contents change. The class's `model` is the file's name.
+    Raises FamilyError with all mistakes in the file and in the CSV files that it names.
     """
     path = Path(path)
     place = TomlPlace(path)

@@ -108,7 +108,7 @@ class Delta(Profile):
         return Direction.REVERSE if shown in (TO_REVERSE, REVERSE) else Direction.FORWARD
 
     def _turns_in(self, direction: Direction) -> Script[bool]:
-        """Return True if it turns so, and is not still about to: both lamps of the direction are alike."""
+        """Return True if the motor turns in this direction and is not still changing to it."""
         shown = (yield from self._status()) >> 3 & 3
         return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
 

@@ -68,7 +68,7 @@ class Invt(Profile):
         "status": Role((Access.READING,), values=InvtStatus),
     }
 
-    _jogged = False  # by this object, since it was last seen to stand
+    _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
 
     def _impossible(self, status: int) -> str:
         return "" if status in tuple(InvtStatus) else "the profile has no such number"
@@ -137,5 +137,5 @@ class Invt(Profile):
         yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
-        """Send no word: the drive acts on a word when it arrives, and does not hold it."""
+        """Do nothing: the drive acts on a word once, so the reset need not be cleared."""
         yield from ()

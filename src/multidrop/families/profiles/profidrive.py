@@ -135,7 +135,7 @@ class Profidrive(Profile):
         return bool((yield from self._status()) & ProfidriveStatus.READY_TO_OPERATE)
 
     def _hindrance(self, status: int) -> str:
-        """Return the words for the gravest thing that keeps the drive from being switched on."""
+        """Return a text for the most serious reason why the drive cannot be switched on."""
         if not status & ProfidriveStatus.NO_OFF2:
             return "is not started: OFF2, which coasts, is active from elsewhere"
         if not status & ProfidriveStatus.NO_OFF3:

@@ -1,4 +1,4 @@
-"""Profile: a state machine that many makes share, over registers that each family declares by role."""
+"""Profile: a state machine that many makes share; each family declares the registers for its roles."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _CODED = "what the profile itself says; leave it out"
 class Role:
     """One register of a state machine; `values` and `harmless` are the profile's, and no family's.
 
-    `needed` is False for a register without which the state machine does less. `extra` names bits that a
-    family may add to `values`, because makes differ in them.
+    `needed` is False for an optional register, without which the state machine does less. `extra` names bits
+    that a family may add to `values`, because makes differ in them.
     """
 
     access: tuple[Access, ...]
@@ -48,7 +48,7 @@ class Role:
 
     @property
     def is_word(self) -> bool:
-        """True if the state machine uses its bits or words, not a quantity."""
+        """True if the register holds bits or words, not a quantity."""
         return self.values is not None
 
 
@@ -232,7 +232,7 @@ class Profile(Drive):
     output_frequency: ClassVar[Register[float]]
 
     def __init_subclass__(cls) -> None:
-        """Complete the roles by the profile. Raises DeclarationError with all that is wrong with them."""
+        """Complete the roles with the profile's facts. Raises DeclarationError with all their mistakes."""
         own = {name: register for name, register in vars(cls).items() if isinstance(register, Register)}
         if own and (wrong := cls.role_mistakes(own)):
             raise DeclarationError(cls.__name__, wrong)
@@ -246,7 +246,7 @@ class Profile(Drive):
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
-        """Return a sentence for each mistake in a family's own registers, and in them together with ours."""
+        """Return a sentence for each mistake in a family's registers, alone or combined with the profile."""
         taken = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
         found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
         singly = (own_errors(name, one, cls.roles, taken) for name, one in own.items())
@@ -448,7 +448,7 @@ class Profile(Drive):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint in Hz, or as the percentage of `maximum_frequency` that it is."""
+        """Write the setpoint in Hz, or converted to a percentage of `maximum_frequency`."""
         most = self.option.get("maximum_frequency")
         if self.reference.unit == "%" and most is None:
             raise WriteForbidden(
