@@ -320,7 +320,7 @@ _OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
 
 
 def _number_errors(register: Register[Any]) -> Iterator[str]:
-    """Find what does not fit the number format, which fits its table."""
+    """Yield a sentence for each fact that does not fit the number format, which itself fits the table."""
     number_format, is_reading = register.number_format, register.access is Access.READING
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
@@ -367,7 +367,7 @@ def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
 
 
 def _written_errors(register: Register[Any]) -> Iterator[str]:
-    """Find counts that no write can send: they would allow or forbid something else."""
+    """Yield a sentence for each declared raw count that no write can send."""
     least, most = _counts(register)
     for key in ("harmless", "broadcast"):
         for count in getattr(register, key) or ():
@@ -410,7 +410,7 @@ def _invalid_errors(register: Register[Any]) -> Iterator[str]:
 
 
 def _name_errors(register: Register[Any]) -> Iterator[str]:
-    """Find names of counts that the register cannot hold: such a fault would never be seen."""
+    """Yield a sentence for each named count that the register cannot hold, and so would never show."""
     if register.values is None or (register.part is not None and register.number_format not in _PARTED):
         return
     least, most = _counts(register)
@@ -496,7 +496,7 @@ def _meaning(register: Register[Any]) -> object:
 
 
 def request_errors(family: Any) -> list[str]:
-    """Tie registers to their scale registers; return a sentence for each error in its requests."""
+    """Connect registers with their scale registers; return a sentence for each error in the requests."""
     wrong = list(_scale_errors(family)) or list(_limit_errors(family))
     if wrong:
         return wrong

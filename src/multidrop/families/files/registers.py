@@ -38,7 +38,7 @@ OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "na
 
 
 def unusable(name: str) -> str:
-    """Return why a name cannot be a Python attribute, with a valid one; "" if it can."""
+    """Return why a name cannot be a Python attribute, and suggest a valid name; "" if it can."""
     if len(name) > LONGEST_NAME:
         return f"it has more than {LONGEST_NAME} characters; give it a shorter one"
     if keyword.iskeyword(name):
@@ -58,7 +58,7 @@ def enumeration(owner: str, given: Mapping[str, Any]) -> type[IntEnum]:
 
 
 def flags(owner: str, given: Mapping[str, Any]) -> type[IntFlag]:
-    """Return the flags of a register, of the number of each bit. Raises ValueError for all that is wrong."""
+    """Return the flags of a register from its bit numbers. Raises ValueError with all mistakes in them."""
     _check("bits", given, MOST_BITS, range(MOST_BITS), f"a bit's number, 0 to {MOST_BITS - 1}")
     make: Any = IntFlag
     return cast(type[IntFlag], make(owner, {name: 1 << bit for name, bit in given.items()}))
@@ -262,7 +262,7 @@ ReadAddress = Callable[[Any, str | None, str], tuple[int, str]]
 
 @dataclass
 class Declared:
-    """The registers of a file so far, and where each name was given."""
+    """The registers of a file declared so far, and the place of each name."""
 
     counting: Counting
     defaults: Mapping[str, Any]
@@ -286,7 +286,7 @@ class Declared:
     def add(
         self, name: str, access: Access, given: Mapping[str, Any], place: TomlPlace, read: ReadAddress
     ) -> None:
-        """Declare one register; `read` reads its addresses."""
+        """Declare one register; `read` parses its addresses."""
         known = self._reserve(name, place)
         good = self._converted(given, place)
         address = self._addresses(given, good, place, read)
@@ -452,7 +452,7 @@ def _decoded(data: bytes, place: TomlPlace) -> str | None:
 
 
 def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
-    """Yield each line that has a cell, with its number."""
+    """Yield each non-empty line with its number."""
     first = text.lstrip("\r\n").splitlines()[:1]
     delimiter = max(_DELIMITERS, key=first[0].count) if first else ","
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)

@@ -56,7 +56,7 @@ _LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
 
 
 def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return the attributes of the class; each wrong value is a sentence."""
+    """Return the attributes of the class; add an error for each wrong value."""
     facts: dict[str, Any] = {_TEXTS[key]: given[key] for key in _TEXTS if key in given}
     for key in _DURATIONS:
         seconds = duration_of(given, key, place)
@@ -172,7 +172,7 @@ _MAKERS: Mapping[str, Callable[[Any], Any]] = {
 
 
 def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return how many registers of each table are read together, and across which gaps."""
+    """Return, for each table, how many registers one read may have, and which gaps it may include."""
     most: dict[Table, int] = {}
     gaps: dict[Table, range] = {}
     for key in ("together", "gaps"):
@@ -304,7 +304,7 @@ PROOF_KEYS = {
 
 @dataclass(frozen=True)
 class Proof:
-    """A register, and the values that it has in a drive of the family: some numbers, or a range."""
+    """A register, and the values (numbers or a range) that it has in every drive of the family."""
 
     register: str
     values: tuple[float, ...]  # empty: any value in the range
@@ -313,7 +313,7 @@ class Proof:
 
     @property
     def example(self) -> float:
-        """A value that proves the family, such as a simulated drive has."""
+        """One of the values that prove the family, for use by a simulated drive."""
         if self.values:
             return self.values[0]
         ends = [end for end in (self.above, self.below) if abs(end) < inf]
