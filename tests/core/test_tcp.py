@@ -131,13 +131,14 @@ def test_the_longest_frame_has_its_place() -> None:
     ("damaged", "fault"),
     [
         ("00 00 00 01 00 05 01 03 02 00 07", FrameFault.NO_START),  # protocol 1
-        ("00 00 00 00 00 01 01", FrameFault.NO_START),
-        ("00 00 00 00 00 FF 01", FrameFault.NO_START),
+        ("00 00 00 00 00 01 01 03", FrameFault.NO_START),
+        ("00 00 00 00 00 FF 01 03", FrameFault.NO_START),
         ("00 00 00 00 00 06 01 03 02 00 07 00", FrameFault.BAD_LENGTH),
         ("00 00 00 00 00 04 01 03 02 00", FrameFault.BAD_LENGTH),
         ("00 00 00 00 00 05 02 03 02 00 07", FrameFault.BAD_ADDRESS),
         ("00 00 00 00 00 05 01 04 02 00 07", FrameFault.BAD_FUNCTION),
         ("00 00 00 00 00 05 01 03 02 00", FrameFault.INCOMPLETE),
+        ("00 00 00 00 00 01 01", FrameFault.INCOMPLETE),  # may become an exception
         ("00 00 00", FrameFault.INCOMPLETE),
     ],
 )
