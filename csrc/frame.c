@@ -136,7 +136,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     int whole = md_tcp_length(bytes, len);
     if (md_tcp_is_exception(bytes, len, request))
         whole = MD_TCP_EXCEPTION;
-    else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && (len < 4 || md_get16(bytes + 2) == 0))
+    else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && (len < 4 || !md_get16(bytes + 2)))
         return MD_INCOMPLETE; /* may become an exception with a wrong length */
     if (whole <= 0)
         return whole;
