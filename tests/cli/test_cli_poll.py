@@ -19,11 +19,15 @@ from recordings import recorded
 from terminals import on_terminal
 from toy import Toy
 
+from multidrop import Plant
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
+from multidrop.cli.support import polling
 from multidrop.cli.support.demo_plant import DRIVES, start_motors
+from multidrop.cli.support.polling import polling_session
 from multidrop.core import Status
 from multidrop.errors import NoReply
+from multidrop.polling.batch import Batch, Rows
 from multidrop.recording import open_recording, open_writer
 from multidrop.sim import Simulator, simulated
 
@@ -242,6 +246,36 @@ def test_a_place_that_takes_no_recording_is_a_sentence(
 ) -> None:
     done, _, err = run("poll", plant, "--seconds", 1, "--out", tmp_path / out)
     assert (done, err) == (status, f"multidrop: {tmp_path / out}: {sentence}\n")
+
+
+class ScriptedPoller:
+    """A poller with one batch now, and another when the session ends."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.left = [counting(3), counting(2), None]
+
+    def take(self) -> Batch | None:
+        return self.left.pop(0)
+
+    def close(self) -> None:
+        assert self.left == []
+
+
+def test_a_consumer_that_failed_gets_no_later_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording that continued after a failed write would have a gap."""
+    monkeypatch.setattr(polling, "Poller", ScriptedPoller)
+    shown, refused = [], []
+
+    def fail(rows: Rows) -> None:
+        refused.append(len(rows))
+        raise OSError("the disk is full")
+
+    with (
+        pytest.raises(OSError, match="the disk is full"),
+        polling_session(Plant((), Path()), None, lambda rows: shown.append(len(rows)), fail) as session,
+    ):
+        session.hand_out()
+    assert (shown, refused) == ([3, 2], [3])
 
 
 @pytest.mark.long

@@ -63,8 +63,12 @@ def polling_session(
 
         def hand_out() -> None:
             while batch := poller.take():
-                for take in takers:
-                    take(batch)
+                for take in tuple(takers):
+                    try:
+                        take(batch)
+                    except BaseException:
+                        takers.remove(take)  # later rows would leave a gap in a recording
+                        raise
 
         try:
             yield PollingSession(poller, interruption, hand_out)
