@@ -111,7 +111,7 @@ def test_it_is_not_well_once_the_newest_look_is_old() -> None:
     view.failure = OSError("no server")
     asyncio.run(watch.look())
     assert health_after(0) == "it was read 6 s ago: no server"
-    assert watch.told()["age_s"] == 6.0
+    assert watch.state()["age_s"] == 6.0
 
 
 def test_a_password_in_an_address_is_never_shown() -> None:
@@ -119,7 +119,7 @@ def test_a_password_in_an_address_is_never_shown() -> None:
     view.failure = OSError("no NATS server is reached at nats://anna:s3cret@a:4222, tls://t0ken@b:4222")
     watch = FleetWatch(view)
     asyncio.run(watch.look())
-    assert watch.told()["trouble"] == "no NATS server is reached at nats://a:4222, tls://b:4222"
+    assert watch.state()["trouble"] == "no NATS server is reached at nats://a:4222, tls://b:4222"
 
 
 @pytest.mark.long

@@ -160,7 +160,7 @@ class FleetWatch:
         """Return how old the newest view is; None if there is none yet."""
         return None if self._looked is None else round(self._clock() - self._looked, 3)
 
-    def told(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return the view that `fleet watch --json` prints and the gateway's page shows."""
         about = {"at_ms": time.time_ns() // 1_000_000, "age_s": self.age_s, "trouble": self.trouble}
         return {**about, **self._view.fleet()}

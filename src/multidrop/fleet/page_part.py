@@ -122,9 +122,9 @@ class FleetPart:
         seen = "it was never read" if age is None else f"it was read {age:.0f} s ago"
         return f"{seen}: {self._watch.trouble or 'the first read is in progress'}"
 
-    def told(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return the fleet for the page, with its age."""
-        return self._watch.told()
+        return self._watch.state()
 
 
 class HasFolder(Protocol):

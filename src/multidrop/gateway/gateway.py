@@ -147,7 +147,7 @@ class Gateway:
                 await asyncio.sleep(0.005)
             if not serving.done():
                 on_ready()
-                self.notifier.tell("READY=1", self.status)
+                self.notifier.send("READY=1", self.status)
             await asyncio.wait({end, serving}, return_when=asyncio.FIRST_COMPLETED)
             if not self._end.is_set():
                 raise RuntimeError(f"the web server has ended: {supervisor().dead.get('web')}")
@@ -162,7 +162,7 @@ class Gateway:
         def left_s(kept_s: float) -> float:
             return max(0.1, ends - self.clock() - kept_s)
 
-        self.notifier.tell("STOPPING=1")
+        self.notifier.send("STOPPING=1")
         self.frames.close()
         await self._end_of("web", left_s(2.4), self._end_server(server))
         await self._end_of("side reads", left_s(2.4), self.side_reads.close())
@@ -329,7 +329,7 @@ class Gateway:
             supervisor().look()
             self._has_news = True  # a frame is due: its time shows pages that the gateway is alive
             if notifier.watchdog_s:
-                notifier.tell("WATCHDOG=1")
+                notifier.send("WATCHDOG=1")
             await asyncio.sleep(every)
 
     def _read_statistics(self, poller: Poller) -> None:

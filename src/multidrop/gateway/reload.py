@@ -85,13 +85,13 @@ class Reload:
         self._is_overtaken.set()
         async with self._turn:
             _log.info("reload, asked for by %s", by)
-            self._gateway.notifier.tell_reloading()
+            self._gateway.notifier.send_reloading()
             try:
-                told = await self._carry_out()
+                result = await self._carry_out()
             except Exception as failure:  # the old plant continues after any failure
-                told = self._refused(failure)
-            self._gateway.notifier.tell("READY=1", self._gateway.status)
-            return told
+                result = self._refused(failure)
+            self._gateway.notifier.send("READY=1", self._gateway.status)
+            return result
 
     async def _read_within(self, read: Read) -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
         """Return the plant, its settings and the plan of its lines.

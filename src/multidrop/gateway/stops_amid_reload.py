@@ -58,8 +58,8 @@ async def stop_meant(
     names = names_of(lines)
     meant = {name: drive_meant(name, names) for name in drives}
     others = _also_meant(lines, [*meant.values()])
-    told = await stop_as_changed(lines, [*meant.values(), *others], stop)
-    return {name: told[meant.get(name, name)] for name in (*meant, *others)}
+    results = await stop_as_changed(lines, [*meant.values(), *others], stop)
+    return {name: results[meant.get(name, name)] for name in (*meant, *others)}
 
 
 def _also_meant(lines: ChangingLines, drives: Sequence[str]) -> list[str]:
@@ -104,13 +104,13 @@ async def stop_as_changed(
     any line has changed since. Return when no reload is in progress and all stops have ended.
     """
     latest: dict[str, _Latest] = {}
-    told: dict[str, T] = {}
+    results: dict[str, T] = {}
     under_way: set[asyncio.Task[None]] = set()
 
     async def begin(plant: Plant, begun: dict[str, _Latest]) -> None:
         for name, end in (await stop(plant, [*begun])).items():
             if latest[name] is begun[name]:
-                told[name] = end
+                results[name] = end
                 begun[name].has_failed = not end.is_done
 
     try:
@@ -126,7 +126,7 @@ async def stop_as_changed(
                 latest |= left
                 under_way.add(supervisor().start("stop", begin(plant, left)))
             elif is_settled and not under_way:
-                return told
+                return results
             if under_way:
                 over, under_way = await asyncio.wait(
                     under_way, timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED

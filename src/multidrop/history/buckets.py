@@ -175,24 +175,24 @@ class UnitBuckets:
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
-        self._told: dict[str, Accumulator] = {}
+        self._by_unit: dict[str, Accumulator] = {}
         self._newest_ns: dict[str, int] = {}
         self.untold = Accumulator(grid)
 
-    def told(self, unit: str | None, newest_ns: int) -> Accumulator:
+    def of_unit(self, unit: str | None, newest_ns: int) -> Accumulator:
         """Return the accumulator for rows with this unit; `newest_ns` is the time of the newest such row."""
         if unit is None:
             return self.untold
         self._newest_ns[unit] = max(newest_ns, self._newest_ns.get(unit, newest_ns))
-        return self._told.setdefault(unit, Accumulator(self._grid))
+        return self._by_unit.setdefault(unit, Accumulator(self._grid))
 
     def buckets(self, unit: str | None, left_out: Sequence[str]) -> Buckets:
         """Return the buckets of `unit`; if it is None, those of the unit of the newest row."""
-        if unit is None and self._told:
-            unit, *others = sorted(self._told, key=self._newest_ns.__getitem__, reverse=True)
-            parts, left_out = [self._told[unit]], others
+        if unit is None and self._by_unit:
+            unit, *others = sorted(self._by_unit, key=self._newest_ns.__getitem__, reverse=True)
+            parts, left_out = [self._by_unit[unit]], others
         else:
-            parts = [*self._told.values()]
+            parts = [*self._by_unit.values()]
         for part in parts:
             self.untold.add_all(part)
         return self.untold.buckets(unit, left_out)

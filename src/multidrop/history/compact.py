@@ -25,9 +25,9 @@ from multidrop.recording.segments import FileLock, segments_of
 
 MEMORY = "100MB"  # limit for DuckDB; the process takes about 80 MB more
 WITH_UNITS = """
-create temp view told as select recorded.*, unit from recorded left join units using (drive, register)
+create temp view with_units as select recorded.*, unit from recorded left join units using (drive, register)
 """
-ROWS = "select * from told order by drive, time"
+ROWS = "select * from with_units order by drive, time"
 TENS = """
 select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register, unit, count(value) as n,
     count(*) - count(value) as missed, min(value) as least, avg(value) as mean, max(value) as most,
@@ -135,7 +135,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
             least, most, rows = cursor.execute(bounds).fetchone()
             if rows:
                 name = file_name(number, number, least, most)
-                _write(cursor, TENS.format("told"), folder / "tens" / name)
+                _write(cursor, TENS.format("with_units"), folder / "tens" / name)
                 _write(cursor, ROWS, folder / "rows" / name, metadata)
     for sentence in damage:
         print(sentence, file=sys.stderr)

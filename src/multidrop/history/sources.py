@@ -226,7 +226,7 @@ def gather_files(
     with sources.cursor() as cursor, while_there(files):
         found = cursor.execute(query, values).fetchall()
     for drive, register, unit, newest_ns, bucket, n, missed, *numbers in found:
-        into[drive, register].told(unit, newest_ns).add(bucket, n, missed, *numbers)
+        into[drive, register].of_unit(unit, newest_ns).add(bucket, n, missed, *numbers)
 
 
 def units_in_rows(

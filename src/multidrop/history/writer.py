@@ -211,13 +211,13 @@ class Compactor:
         if self._child or not self.is_possible or below <= self._done or clock.now_ns() < self._not_before_ns:
             return
         program = [sys.executable, "-X", "utf8", "-m", "multidrop.history.compact"]
-        told: dict[str, Any] = {"stderr": subprocess.PIPE, "encoding": "utf-8", "errors": "replace"}
+        options: dict[str, Any] = {"stderr": subprocess.PIPE, "encoding": "utf-8", "errors": "replace"}
         try:
             self._child = subprocess.Popen(
                 [*program, str(self._folder), "--below", str(below)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                **told,
+                **options,
             )
             self._below = below
         except OSError as failure:

@@ -785,7 +785,7 @@ def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()
-    topics._tell(FAN.name, "stop", CommandResult(CommandOutcome.DONE, "done"))
+    topics._report(FAN.name, "stop", CommandResult(CommandOutcome.DONE, "done"))
     said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
     words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
     ours = words - {"+", FAN.name, "pump-1"}

@@ -12,7 +12,7 @@ from typing import Any
 from rich.text import Text
 
 from multidrop.cli.fleet.tables import (
-    Told,
+    FleetState,
     count_sentence,
     gateway_table,
     line_table,
@@ -28,36 +28,42 @@ NOTES = 4  # at most so many lines of notes, and as many of problems
 MOVES = 8  # rows of the table of moves, with its head, if the lines need the remaining room
 
 
-def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
-    """Draw gateways, lines, moves and "notes" of `told`, which is as `fleet watch --json` prints it."""
+def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[Text]:
+    """Draw gateways, lines, moves and "notes" of `fleet`, which is as `fleet watch --json` prints it."""
     width, height = size
-    is_old = told["age_s"] is None or told["age_s"] > OLD_S
-    top = [_title(told, head, width), _warning(told, width)]
-    foot = [Text(_cut(note, width)) for note in (*_notes(told, width), "Ctrl-C ends it")]
+    is_old = fleet["age_s"] is None or fleet["age_s"] > OLD_S
+    top = [_title(fleet, head, width), _warning(fleet, width)]
+    foot = [Text(_cut(note, width)) for note in (*_notes(fleet, width), "Ctrl-C ends it")]
     room = max(0, height - len(top) - len(foot))
-    body = [_row(text, width, is_old) for text in _body(told, width, room)[:room]]
+    body = [_row(text, width, is_old) for text in _body(fleet, width, room)[:room]]
     return [*top, *body, *[Text()] * (room - len(body)), *foot][:height]
 
 
-def _body(told: Told, width: int, room: int) -> list[str]:
+def _body(fleet: FleetState, width: int, room: int) -> list[str]:
     """Return all gateways, and as many moves and lines as fit."""
-    begin = [*gateway_table(told, width - 1), "", count_sentence(told), *trouble_sentences(told)[:NOTES], ""]
+    begin = [
+        *gateway_table(fleet, width - 1),
+        "",
+        count_sentence(fleet),
+        *trouble_sentences(fleet)[:NOTES],
+        "",
+    ]
     room = max(0, room - len(begin))
-    silent = silent_gateways(told)
-    names = sorted(told["lines"], key=lambda name: _urgency(name, told["lines"][name]["master"], silent))
-    lines = line_table(told, names, width - 1)
-    moves = _moves(told, width, max(min(MOVES, room // 2), room - len(lines)))
+    silent = silent_gateways(fleet)
+    names = sorted(fleet["lines"], key=lambda name: _urgency(name, fleet["lines"][name]["master"], silent))
+    lines = line_table(fleet, names, width - 1)
+    moves = _moves(fleet, width, max(min(MOVES, room // 2), room - len(lines)))
     return [*begin, *_fitting(lines, room - len(moves)), *moves]
 
 
-def _notes(told: Told, width: int) -> list[str]:
+def _notes(fleet: FleetState, width: int) -> list[str]:
     """Return the last notes, wrapped, as many as fit."""
-    wrapped = [line for note in told.get("notes", ()) for line in textwrap.wrap(note, width - 1)]
+    wrapped = [line for note in fleet.get("notes", ()) for line in textwrap.wrap(note, width - 1)]
     return wrapped[-NOTES:]
 
 
-def _moves(told: Told, width: int, room: int) -> list[str]:
-    rows = move_table(told["moves"][: max(0, room - 2)], width - 1)
+def _moves(fleet: FleetState, width: int, room: int) -> list[str]:
+    rows = move_table(fleet["moves"][: max(0, room - 2)], width - 1)
     return ["", "last moves:", *rows] if rows else []
 
 
@@ -75,17 +81,17 @@ def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list
     return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 
-def _title(told: Told, head: str, width: int) -> Text:
-    clock = time.strftime("%H:%M:%S UTC ", time.gmtime(told["at_ms"] / 1000))
+def _title(fleet: FleetState, head: str, width: int) -> Text:
+    clock = time.strftime("%H:%M:%S UTC ", time.gmtime(fleet["at_ms"] / 1000))
     text = f" {head}"[: max(0, width - len(clock))]
     return Text((text.ljust(width - len(clock)) + clock)[:width], style="reverse")
 
 
-def _warning(told: Told, width: int) -> Text:
-    if not told["trouble"]:
+def _warning(fleet: FleetState, width: int) -> Text:
+    if not fleet["trouble"]:
         return Text()
-    age = "not read yet" if told["age_s"] is None else f"this is {told['age_s']:.0f} s old"
-    return Text(_cut(f"{age}: {told['trouble']}", width), style="bold red")
+    age = "not read yet" if fleet["age_s"] is None else f"this is {fleet['age_s']:.0f} s old"
+    return Text(_cut(f"{age}: {fleet['trouble']}", width), style="bold red")
 
 
 def _row(text: str, width: int, is_old: bool) -> Text:

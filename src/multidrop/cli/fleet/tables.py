@@ -10,7 +10,7 @@ from typing import Any
 
 from multidrop.cli.support.values import Row, aligned, counted
 
-Told = Mapping[str, Any]  # a fleet, as `--json` prints it
+FleetState = Mapping[str, Any]  # a fleet, as `--json` prints it
 GATEWAYS = (
     "GATEWAY",
     "HOST",
@@ -39,7 +39,7 @@ def moment(ms: int | None) -> str:
         return "?"
 
 
-def gateway_table(fleet: Told, width: float = inf) -> list[str]:
+def gateway_table(fleet: FleetState, width: float = inf) -> list[str]:
     """Return the table of gateways, without some columns if it would be wider than `width`."""
     rows = [_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items()]
     return _fitting([GATEWAYS, *rows], "<<><<>>>>>>", LEFT_OUT, width)
@@ -57,7 +57,7 @@ def _fitting(table: list[Row], sides: str, left_out: Iterable[str], width: float
     return aligned(table, sides)
 
 
-def _gateway_row(name: str, gateway: Told) -> Row:
+def _gateway_row(name: str, gateway: FleetState) -> Row:
     says = gateway["says"]
     head = (name, gateway["host"], str(gateway["session"]), moment(gateway["began_ms"]))
     if says is None:
@@ -89,52 +89,52 @@ def natural(name: str) -> list[str | int]:
     return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def line_table(fleet: Told, names: Iterable[str], width: float = inf) -> list[str]:
+def line_table(fleet: FleetState, names: Iterable[str], width: float = inf) -> list[str]:
     """Return the table of these lines, without some columns if it would be wider than `width`."""
     silent = silent_gateways(fleet)
     rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
     return _fitting([LINES, *rows], "<<<<", LINES_LEFT_OUT, width)
 
 
-def _line_row(name: str, line: Told, silent: set[str]) -> Row:
+def _line_row(name: str, line: FleetState, silent: set[str]) -> Row:
     master, since = line["master"], line["since_ms"]
     answer = ", no answer" if master in silent else ""
     return name, line["port"], f"{master}{answer}" if master else "none", moment(since) if master else ""
 
 
-def silent_gateways(fleet: Told) -> set[str]:
+def silent_gateways(fleet: FleetState) -> set[str]:
     """Return the gateways that do not answer: their lines may not be polled."""
     return {name for name, gateway in fleet["gateways"].items() if gateway["says"] is None}
 
 
-def free_lines(fleet: Told) -> list[str]:
+def free_lines(fleet: FleetState) -> list[str]:
     """Return the lines without a master."""
     return [name for name, line in fleet["lines"].items() if not line["master"]]
 
 
-def unsure_lines(fleet: Told) -> list[str]:
+def unsure_lines(fleet: FleetState) -> list[str]:
     """Return the lines whose master does not answer."""
     silent = silent_gateways(fleet)
     return [name for name, line in fleet["lines"].items() if line["master"] in silent]
 
 
-def lost_lines(fleet: Told) -> list[str]:
+def lost_lines(fleet: FleetState) -> list[str]:
     """Return the lines whose master has lost the port: these lines are not polled."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
 
 
-def failing_lines(fleet: Told) -> list[str]:
+def failing_lines(fleet: FleetState) -> list[str]:
     """Return the lines on which polling raises exceptions: their values are missing."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "failing")]
 
 
-def _lines_in(says: Told | None, key: str) -> list[str]:
+def _lines_in(says: FleetState | None, key: str) -> list[str]:
     """Return the lines that a gateway's answer lists; none if it has no such list."""
     found = (says or {}).get(key)
     return [line for line in found if isinstance(line, str)] if isinstance(found, list) else []
 
 
-def count_sentence(fleet: Told) -> str:
+def count_sentence(fleet: FleetState) -> str:
     unsure, lost, failing = (len(lines(fleet)) for lines in (unsure_lines, lost_lines, failing_lines))
     more = f", {unsure} whose master does not answer" if unsure else ""
     more += f", {lost} with a lost port" if lost else ""
@@ -142,7 +142,7 @@ def count_sentence(fleet: Told) -> str:
     return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master{more}"
 
 
-def move_table(moves: Iterable[Told], width: float = inf) -> list[str]:
+def move_table(moves: Iterable[FleetState], width: float = inf) -> list[str]:
     """Return a line of text for each move: time, line, former master (if it fits) and new master."""
     rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
     found = aligned(rows, "<<<<")
@@ -151,12 +151,12 @@ def move_table(moves: Iterable[Told], width: float = inf) -> list[str]:
     return aligned([(at, line, to) for at, line, _, to in rows], "<<<")
 
 
-def _from_to(move: Told) -> tuple[str, str]:
+def _from_to(move: FleetState) -> tuple[str, str]:
     before = "" if move["from"] is None else f"from {move['from'] or 'nobody'}"
     return before, f"to {move['to'] or 'nobody'}"
 
 
-def trouble_sentences(fleet: Told) -> list[str]:
+def trouble_sentences(fleet: FleetState) -> list[str]:
     """Return the problems that gateways report, a sentence for each."""
     found = [
         f"{name} on {gateway['host']} is missing: last seen {moment(gateway['seen_ms'])}"

@@ -68,14 +68,14 @@ async def follow(watch: FleetWatch, show: Callable[[dict[str, Any]], object], ov
         supervisor().check()
         begun = time.monotonic()
         await watch.look()
-        show(watch.told())
+        show(watch.state())
         with suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), max(0.0, begun + EVERY_S - time.monotonic()))
 
 
 @contextmanager
 def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
-    yield lambda told: print_text(json.dumps(told), flush=True)
+    yield lambda fleet: print_text(json.dumps(fleet), flush=True)
 
 
 @contextmanager
@@ -92,17 +92,17 @@ def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str,
 
     console = Console()
 
-    def drawn(told: dict[str, Any]) -> Any:
-        lines = picture(told, (console.width, console.height), head)
+    def drawn(fleet: dict[str, Any]) -> Any:
+        lines = picture(fleet, (console.width, console.height), head)
         return joined(lines, console.encoding)
 
     if console.is_dumb_terminal:
-        yield lambda told: console.print(drawn(told))
+        yield lambda fleet: console.print(drawn(fleet))
         return
     with console.screen(hide_cursor=True) as screen:
 
-        def draw(told: dict[str, Any]) -> None:
+        def draw(fleet: dict[str, Any]) -> None:
             console.control(Control.home())  # otherwise rich draws below the last picture
-            screen.update(drawn(told))
+            screen.update(drawn(fleet))
 
         yield draw

@@ -173,10 +173,10 @@ class FleetCommands:
         """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without answer."""
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
-        told = {""}
+        reported = {""}
         while answer.outcome is CommandOutcome.UNDER_WAY:
-            if answer.text not in told:
-                told.add(answer.text)
+            if answer.text not in reported:
+                reported.add(answer.text)
                 on_news(answer)
             at += 1
             try:
@@ -313,7 +313,7 @@ async def _first_answer(
     then, `on_news` reports that the stop was not sent yet.
     """
     loop = asyncio.get_running_loop()
-    ends, told = loop.time() + NO_MASTER_S, ""
+    ends, reported = loop.time() + NO_MASTER_S, ""
     while True:
         try:
             return await _ask_all(paths, line, request, what)
@@ -322,8 +322,8 @@ async def _first_answer(
             if loop.time() > ends or isinstance(failure, MayNotSend):
                 sentence = f"{what} was NOT sent: {why}; {HARD_WIRED}"
                 return CommandAnswer(CommandOutcome.NOT_SENT, sentence)
-        if why != told:
-            told = why
+        if why != reported:
+            reported = why
             sentence = f"{what} was NOT sent yet: {why}; {HARD_WIRED}"
             on_news(CommandAnswer(CommandOutcome.UNDER_WAY, sentence))
         await asyncio.sleep(AGAIN_S)

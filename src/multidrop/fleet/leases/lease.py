@@ -119,11 +119,11 @@ class Lease:
 
     async def begin(self) -> None:
         """Start a session as soon as every earlier one of this gateway is over."""
-        told = ""
+        reported = ""
         while not await self.try_to_begin():
-            if self.trouble != told:
+            if self.trouble != reported:
                 _log.warning("%s polls no lines yet: %s", self.name, self.trouble)
-            told = self.trouble
+            reported = self.trouble
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:

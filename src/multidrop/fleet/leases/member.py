@@ -376,9 +376,9 @@ class Member:
         Gateways of versions that do not report such lines are left out: they would not take lines handed over
         to them.
         """
-        told = {name: value.get("unopened") for name, value in present.items()}
-        told[self.name] = list(self.unopened.named())
-        known = {name: said for name in sorted(sharing) if isinstance(said := told.get(name), list)}
+        unopened = {name: value.get("unopened") for name, value in present.items()}
+        unopened[self.name] = list(self.unopened.named())
+        known = {name: said for name in sorted(sharing) if isinstance(said := unopened.get(name), list)}
         if not any(known.values()):
             return ()
         there = frozenset(lines)

@@ -233,8 +233,8 @@ def unpack(data: bytes | memoryview) -> Any:
         uncertainty_us = table.column("uncertainty_us").cast(pa.int32()).cast(pa.int64())
         columns["uncertainty_ns"] = pc.multiply(uncertainty_us, 1000)
         columns["value"] = table.column("value")
-        is_told = "unit" in table.schema.names
-        columns["unit"] = table.column("unit") if is_told else pa.nulls(len(table), pa.utf8())
+        has_units = "unit" in table.schema.names
+        columns["unit"] = table.column("unit") if has_units else pa.nulls(len(table), pa.utf8())
         rows = pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
         _check(rows)
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:

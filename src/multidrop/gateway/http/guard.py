@@ -181,8 +181,8 @@ class Guard:
         peer = str(client[0]) if client else ""
         if not self._behind_proxy:
             return peer
-        told = ",".join(headers.getlist("x-forwarded-for")).rpartition(",")[2].strip()
-        return told[:64] or peer
+        forwarded = ",".join(headers.getlist("x-forwarded-for")).rpartition(",")[2].strip()
+        return forwarded[:64] or peer
 
 
 def _length(scope: Scope) -> int:

@@ -132,14 +132,16 @@ async def _denied(request: Request, failure: Exception) -> Response:
     return _error(getattr(failure, "status", 400), str(failure))
 
 
-def _told(told: CommandResult) -> dict[str, Any]:
-    return {"done": told.is_done, "text": told.text}
+def _fields(result: CommandResult) -> dict[str, Any]:
+    return {"done": result.is_done, "text": result.text}
 
 
-def _answer(told: CommandResult) -> Response:
+def _answer(result: CommandResult) -> Response:
     """Return the outcome of a command: status 403 if a right was missing, else 200."""
-    is_denied = isinstance(told.error, WriteForbidden) and told.error.rule in RIGHTS_RULES
-    return JsonResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
+    is_denied = isinstance(result.error, WriteForbidden) and result.error.rule in RIGHTS_RULES
+    return JsonResponse(
+        _fields(result) | ({"error": result.text} if is_denied else {}), 403 if is_denied else 200
+    )
 
 
 async def _answer_one(work: Coroutine[Any, Any, CommandResult]) -> Response:
@@ -147,7 +149,7 @@ async def _answer_one(work: Coroutine[Any, Any, CommandResult]) -> Response:
 
 
 async def _answer_all(work: Coroutine[Any, Any, Mapping[str, CommandResult]]) -> Response:
-    return JsonResponse({name: _told(one) for name, one in (await work).items()})
+    return JsonResponse({name: _fields(one) for name, one in (await work).items()})
 
 
 async def _answer_fleet(work: Coroutine[Any, Any, Mapping[str, tuple[bool, str]]]) -> Response:
@@ -196,7 +198,7 @@ class _Pages:
         part: Any = self._gateway.feeds.get("fleet")
         if part is None:
             return _error(404, "this gateway shows no fleet; add [serve.fleet] to the plant file")
-        return JsonResponse(part.told())
+        return JsonResponse(part.state())
 
     async def health(self, request: Request) -> Response:
         health = health_of(self._gateway)
@@ -318,9 +320,14 @@ class _Pages:
     async def reload(self, request: Request) -> Response:
         if (await body_of(request)).get("confirm") is not True:
             raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
-        told = await self._gateway.reload.carry_out(caller_of(request).by)
+        result = await self._gateway.reload.carry_out(caller_of(request).by)
         return JsonResponse(
-            {"done": told.is_done, "text": told.text, "mistakes": told.mistakes, "restart": told.restart}
+            {
+                "done": result.is_done,
+                "text": result.text,
+                "mistakes": result.mistakes,
+                "restart": result.restart,
+            }
         )
 
     # ---- tokens ----

@@ -237,8 +237,8 @@ class Frames:
         if known is None or known["revision"] != newest["revision"]:  # the plants, and so the keys, differ
             n, known = WHOLE, None
         if n not in self._encoded:
-            told = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}
-            plain = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
+            frame = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}
+            plain = json.dumps(frame, separators=(",", ":"), allow_nan=False).encode()
             self._encoded[n] = Encoded(newest["n"], plain, gzip.compress(plain, 9, mtime=0))
         return self._encoded[n]
 

@@ -269,9 +269,9 @@ class ModbusServer:
     async def _write_one(self, unit: Unit, register: Register[Any], raw: float, caller: Caller) -> int:
         """Write a register; return 0 or an exception code."""
         value = raw if register.values is not None else register.decode(raw)
-        told = await self._commands.write(unit.drive.name, register.name, value, caller)
-        self.answered["written" if told.is_done else "not written"] += 1
-        return 0 if told.is_done else code_of(told.error)
+        result = await self._commands.write(unit.drive.name, register.name, value, caller)
+        self.answered["written" if result.is_done else "not written"] += 1
+        return 0 if result.is_done else code_of(result.error)
 
     def _stop(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> Awaitable[bytes]:
         return self._later(request, self._begin_stop(unit, client), STOP_WAIT_S)
@@ -291,13 +291,13 @@ class ModbusServer:
     async def _stop_one(self, unit: Unit, caller: Caller) -> int:
         name = unit.drive.name
         try:
-            told = (await self._commands.stop([name], caller))[name]
+            result = (await self._commands.stop([name], caller))[name]
         except Exception:
             _log.exception("stop of %s by a modbus client", name)
             return ModbusCode.NO_RESPONSE
-        if told.is_done:
+        if result.is_done:
             return 0
-        code = code_of(told.error)
+        code = code_of(result.error)
         return ModbusCode.NO_RESPONSE if code == ModbusCode.DEVICE_FAILURE else code
 
     def _caller(self, client: ModbusClient) -> Caller:

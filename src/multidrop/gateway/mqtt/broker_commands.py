@@ -93,8 +93,8 @@ class BrokerCommands:
         return False
 
     async def _stop(self, drives: Sequence[str] | None) -> None:
-        for drive, told in (await self._commands.stop(drives, self._caller)).items():
-            self._report(drive, "stop", told)
+        for drive, result in (await self._commands.stop(drives, self._caller)).items():
+            self._report(drive, "stop", result)
 
     async def _do(self, drive: str, what: str, work: Coroutine[Any, Any, CommandResult]) -> None:
         self._report(drive, what, await work)

@@ -123,7 +123,7 @@ class JsonTopics:
         self._context = context
         self._hub = context.hub
         self._plant = context.plant
-        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
+        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._available: dict[str, bytes] = {}
         self._left: set[str] = set()  # removed drives whose retained messages must be deleted
         self._retained_topics = RetainedTopics(settings.prefix, home_assistant=settings.home_assistant)
@@ -263,8 +263,8 @@ class JsonTopics:
         }
         return json.dumps(said, ensure_ascii=False).encode()
 
-    def _tell(self, drive: str, what: str, told: CommandResult) -> None:
-        said = json.dumps({"what": what, "done": told.is_done, "text": told.text}, ensure_ascii=False)
+    def _report(self, drive: str, what: str, result: CommandResult) -> None:
+        said = json.dumps({"what": what, "done": result.is_done, "text": result.text}, ensure_ascii=False)
         self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
 
     def _discover(self, name: str) -> None:

@@ -45,7 +45,7 @@ class SparkplugNode:
         self._plant = context.plant
         self._utc_ms = utc_ms
         self._node = settings.node or context.plant.path.stem
-        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._tell)
+        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._birth = -1  # bdSeq
         self._seq = 0
         self._said: dict[str, dict[str, Value]] = {}  # last values of drives whose birth was sent
@@ -232,8 +232,8 @@ class SparkplugNode:
         known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
         return known.get(alias or 0, f"alias {alias}")
 
-    def _tell(self, drive: str, what: str, told: CommandResult) -> None:
-        (_log.info if told.is_done else _log.warning)("%s of %s: %s", what, drive, told.text)
+    def _report(self, drive: str, what: str, result: CommandResult) -> None:
+        (_log.info if result.is_done else _log.warning)("%s of %s: %s", what, drive, result.text)
 
 
 def _metric_of(register: str) -> str:
