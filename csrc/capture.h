@@ -35,7 +35,7 @@ struct md_wrapping {
 /* Write whole pcapng packets to `out` while there is room. */
 size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
                    int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room);
-/* Return the length in the file of a packet that holds `len` bytes, of which `first` is the first. */
+/* Return the length in the file of a packet with `len` bytes. Its wrapping depends on the `first` byte. */
 size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len);
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);

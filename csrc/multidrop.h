@@ -190,7 +190,7 @@ enum md_transactions {
 /* The owner of the transceiver's direction. */
 enum md_rs485_mode {
     MD_RS485_OFF,     /* the adapter itself */
-    MD_RS485_KERNEL,  /* the driver, with its configured polarity and delays */
+    MD_RS485_KERNEL,  /* the kernel's driver, as it is configured */
     MD_RS485_RTS_UP,  /* this port: RTS is on while a request leaves */
     MD_RS485_RTS_DOWN /* this port: RTS is off while a request leaves, otherwise on */
 };
@@ -387,7 +387,7 @@ struct md_extra {
     uint8_t scale_format;  /* format of the decimal exponent at word scale_at; */
     uint8_t has_scale;     /* outside of 10^-22 to 10^22 the field has no value */
     uint16_t scale_at;
-    uint8_t invalid_count, scale_invalid_count; /* the exponent's patterns follow the number's */
+    uint8_t invalid_count, scale_invalid_count; /* in `invalid`, first those of the number */
     struct md_invalid invalid[MD_MOST_INVALID];
 };
 

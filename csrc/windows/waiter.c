@@ -98,7 +98,7 @@ void md_wakeup_ring(struct md_wakeup *wakeup)
         SetEvent(handle_of(wakeup->fd));
 }
 
-/* The thread is about to handle an earlier ring; a later one ends its next wait. */
+/* The thread is about to handle an earlier wake-up; a later wake-up ends its next wait. */
 void md_wakeup_silence(struct md_wakeup *wakeup)
 {
     atomic_store(&wakeup->is_rung, 0);

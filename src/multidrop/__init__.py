@@ -11,7 +11,7 @@ refuse_other_interpreters()
 
 
 def _homes(stub: str) -> dict[str, str]:
-    """Return the module of each public name, by the imports of the stub, one name a line.
+    """Return the module of each public name, from the stub's imports; each import has its own line.
 
     Each is loaded when it is first used: all of them together take a fifth of a second.
     """

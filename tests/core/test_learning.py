@@ -424,7 +424,7 @@ def test_other_drives_are_not_concerned(line: LineDriver, drive: Peer) -> None:
     ask(line, other, Message(2, 3, 0, 1))
 
 
-def test_the_ceiling_of_the_document_ends_the_waiting(line: LineDriver, drive: Peer) -> None:
+def test_the_documented_longest_delay_ends_the_wait(line: LineDriver, drive: Peer) -> None:
     left = line.now + SILENCE + 8 * CHARACTER
     time_out(line, drive)
     assert drive.late_until_ns >= left + MOST

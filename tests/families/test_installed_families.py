@@ -13,7 +13,7 @@ from multidrop.families.registry import GROUP, find_model
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
-    """Have these entry points installed: by name, "module:attribute"; a name may end in "__" to be twice."""
+    """Pretend that these entry points are installed, as name="module:attribute"; "name__" repeats a name."""
     points = [EntryPoint(name.rstrip("_"), value, GROUP) for name, value in values.items()]
     monkeypatch.setattr(
         importlib.metadata, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted)

@@ -440,7 +440,7 @@ def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.long
 def test_stop_of_a_restarted_drive_is_a_new_stop(tmp_path: Path) -> None:
-    """That one goes on for a silent drive alone, and has seen this one stand."""
+    """The first stop is still repeated for the silent drive, but has ended for the restarted one."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")

@@ -94,7 +94,7 @@ class Broadcaster:
             return failure
 
     def stop(self, drives: Sequence[Drive]) -> bool:
-        """Broadcast a stop if all drives are confirmed and their family has a broadcast stop.
+        """Broadcast a stop if the family of all drives is confirmed and has a broadcast stop.
 
         Return True if the stop may have been sent.
         """

@@ -251,7 +251,7 @@ class Coding:
     # ---- writing ----
 
     def count_of(self, value: float) -> float:
-        """Return the nearest raw count; in a float format, the nearest float of that size.
+        """Return the raw count nearest to a value; in a float format, the nearest float of its width.
 
         Raises OverflowError beyond the largest float.
         """

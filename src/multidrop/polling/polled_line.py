@@ -273,7 +273,7 @@ class PolledLine:
     def _is_sound(self, now_ns: int) -> bool:
         """Return True if polling may continue after a failure.
 
-        Until the next attempt is due, return False, and make misses of the values that are due.
+        Before the next attempt, it returns False and records each due value as a miss.
         """
         if self._is_broken:
             self._queue.abandon()

@@ -98,7 +98,7 @@ class BatchDecoder:
             if identity is not None:
                 codes, known = wide_codes(data, rows, column.code_bits // 8), names_of.get(identity)
                 if known is None or (rows and greatest_code(codes) >= len(known)):
-                    raise ValueError("there are rows before the names of their codes")
+                    raise ValueError("rows come before the dictionary that their codes need")
                 found.append(codes)
                 names.append(known.listed)
             elif column.detail == SINGLE:
@@ -121,7 +121,7 @@ class BatchDecoder:
         if identity is not None:
             names = self._names.get(identity)
             if names is None:
-                raise ValueError("there are rows before the names of their codes")
+                raise ValueError("rows come before the dictionary that their codes need")
             if rows * names.spelling.longest > MOST_SPELLED:
                 raise ValueError(f"there is a batch of {rows} rows with names too long for so many")
             return valid, *spell(wide_codes(data[0], rows, column.code_bits // 8), names)

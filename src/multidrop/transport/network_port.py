@@ -150,10 +150,10 @@ class RFC2217Port(rfc2217.Serial):
 
     def _internal_raw_write(self, data: bytes) -> None:
         if not self.is_open or not self._write_lock.acquire(timeout=LOCK_TIME):
-            raise serial.SerialException("the network takes nothing")
+            raise serial.SerialException("the network accepts no bytes")
         try:
             if _send_at_once(self._socket, data) < len(data):
-                raise serial.SerialException("the network takes nothing more")
+                raise serial.SerialException("the network accepts no more bytes")
         except OSError as failure:
             raise serial.SerialException(f"the connection failed: {failure}") from failure
         finally:
