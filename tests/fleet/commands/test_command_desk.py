@@ -22,6 +22,7 @@ from multidrop.control import Seen, audit_log, read_audit
 
 require_module("nats")
 
+from multidrop.fleet.commands import stop_desk  # noqa: E402
 from multidrop.fleet.commands.desk import MOST_WRITES  # noqa: E402
 from multidrop.fleet.commands.messages import (  # noqa: E402
     CommandAnswer,
@@ -466,7 +467,7 @@ def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
 ) -> None:
     """It is noted in words that can be printed, and one that names no drives stops all of the line."""
     # Who asks again for a stop without an id asks for another one.
-    monkeypatch.setattr("multidrop.fleet.commands.stop_desk.HOLD_S", PATIENCE_S)
+    monkeypatch.setattr(stop_desk, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
     assert answer is not None
     assert answer.drives["pump"].outcome is DONE
