@@ -83,7 +83,7 @@ def test_an_unconfirmed_stop_is_unknown(monkeypatch: pytest.MonkeyPatch, way: st
 @pytest.mark.parametrize("way", STOPS)
 def test_a_confirmed_stop_is_done(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     _, drive, _ = one(monkeypatch, InnovertIBD(1))
-    assert STOPS[way](drive)[drive.name].is_done
+    assert STOPS[way](drive)[drive.name].ok
 
 
 def test_a_stop_of_a_line_that_is_gone_says_so_for_each_drive() -> None:
@@ -122,7 +122,7 @@ def test_a_write_has_a_result_and_never_raises(
     result = write_register(mill, "setpoint", value)
     assert result.outcome is outcome, result
     assert result.text.startswith(text)
-    assert (result.error is None) == result.is_done
+    assert (result.error is None) == result.ok
 
 
 # ---- threads ----
@@ -213,7 +213,7 @@ def test_a_motor_is_stopped_without_a_thread(threads: Threads, tmp_path: Path) -
     with desks(tmp_path) as desk:
         stopped = asyncio.run(desk.stop(drives=["pump"]))
     assert stopped is not None
-    assert stopped.is_done
+    assert stopped.ok
     assert {name for name, _ in desk.writes} == {"control"}
 
 
@@ -297,7 +297,7 @@ def test_a_stop_during_a_repeated_one_is_sent_once() -> None:
         assert not any(one.done() for one in called)
         called[1].cancel()  # its client is gone
         repeated.set_result({"pump": STANDS})
-        assert all([(await one)["pump"].is_done for one in called if one is not called[1]])
+        assert all([(await one)["pump"].ok for one in called if one is not called[1]])
         assert stops.of(drive) is None
 
     asyncio.run(live())
@@ -319,7 +319,7 @@ def test_a_stop_is_repeated_further_if_the_earlier_one_gives_up() -> None:
         await until_met(lambda: pump.calls[-1] is None)  # repeated as if it had been called alone
         assert pump.calls.count(None) == 1  # for both
         pump.turns.release()
-        assert (await called)["pump"].is_done is False
+        assert (await called)["pump"].ok is False
 
     asyncio.run(live())
 

@@ -19,7 +19,7 @@ from multidrop.control.outcome import Effect, Seen, Stopped
 from multidrop.control.ramp import ramp
 from multidrop.control.time_limit import written_before
 from multidrop.core import Message
-from multidrop.drive import Direction, Drive, Script, read, write
+from multidrop.drive import Direction, Drive, Script, State, read, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
@@ -84,6 +84,15 @@ def call_stop_at(line: SimulatedBus, drive: Any, nth: int) -> None:
 def test_a_verbs_result_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive = stubborn(monkeypatch)
     assert drive.start() == 7
+
+
+@pytest.mark.parametrize("model", MAKE)
+def test_commands_return_a_result(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    _, drive, _ = one(monkeypatch, MAKE[model](1))
+    for result in (drive.set_frequency(20), drive.start(), drive.stop()):
+        assert result.ok
+    assert result.text.startswith("stopped: seen to stand after")
+    assert isinstance(drive.state(), State)
 
 
 def test_a_start_that_goes_on_after_its_stop_ends_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

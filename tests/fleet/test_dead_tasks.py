@@ -295,7 +295,7 @@ def test_a_stop_that_fails_in_the_desk_is_answered(tmp_path: Path, monkeypatch: 
         monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
     assert answer is not None
-    assert (answer.outcome, answer.is_done) == (CommandOutcome.UNKNOWN, False)
+    assert (answer.outcome, answer.ok) == (CommandOutcome.UNKNOWN, False)
     assert "it is not known whether the stop was sent" in answer.text
 
 

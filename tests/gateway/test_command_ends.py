@@ -17,7 +17,7 @@ from simulated_bus import one
 from tables import table
 
 from multidrop import Bus, InvtCHE, Plant, Stopped, Unconfirmed
-from multidrop.control import CommandResult, Ledger, Seen
+from multidrop.control import CommandOutcome, CommandResult, Ledger, Seen
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.live.views import drive_view
@@ -80,7 +80,7 @@ def test_a_drive_that_left_its_line_is_named_in_the_result(
         return await command(Commands(UnopenedLines(), MAY))
 
     told = asyncio.run(carry_out())
-    assert not told.is_done
+    assert not told.ok
     assert told.text.startswith("mill is ")
 
 
@@ -103,9 +103,9 @@ def test_a_number_that_is_none_is_told_of(
         return await Commands(lines, may).write("mill", register, value, CALLER)
 
     told = asyncio.run(carry_out())
-    assert told.is_done == (register == "setpoint" and value == 1.5)
+    assert told.ok == (register == "setpoint" and value == 1.5)
     assert told.text.startswith(("mill: setpoint", "setpoint ", "control takes"))
-    assert len(line.written) == told.is_done
+    assert len(line.written) == told.ok
 
 
 def test_a_command_that_was_not_carried_out_has_no_end() -> None:
@@ -133,7 +133,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
             await commands.write(spelt, "setpoint", 10.0, CALLER),
         ]
         assert line.written == []
-        assert {told.is_done for told in started} == {False}
+        assert {told.ok for told in started} == {False}
         if verb == "stop":
             stopped = await commands.stop([spelt], CALLER)
             assert [*stopped] == [spelt]
@@ -141,7 +141,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
         return [await commands.act(spelt, verb, {}, CALLER)]
 
     for told in asyncio.run(carry_out()):
-        assert told.is_done, told.text
+        assert told.ok, told.text
     assert line.written
     assert commands.stopped_ns(fan) is not None
 
@@ -180,11 +180,12 @@ def test_a_coast_of_a_name_on_its_way_to_another_drive_stops_both(
     sent: list[str] = []
     lines = MovingLines(sent, plant_of(("hall-2", InvtCHE(2, name="fan"))))
 
-    def coast(name: str, **limit: object) -> None:
+    def coast(name: str, **limit: object) -> CommandResult:
         sent.append(f"{name}.coast")
         if name == "pump":
             lines.plant_coming = None
             raise Unconfirmed("pump", "coast", "no reply")
+        return CommandResult(CommandOutcome.DONE, "stopped")
 
     for drive in (FAN, PUMP):
         monkeypatch.setattr(drive, "coast", partial(coast, drive.name), raising=False)
@@ -192,8 +193,8 @@ def test_a_coast_of_a_name_on_its_way_to_another_drive_stops_both(
     coasting = asyncio.wait_for(Commands(lines, may).act("fan", "coast", {}, CALLER), PATIENCE)
     told = asyncio.run(coasting)
     assert sorted(sent) == ["fan.coast", "pump.coast" if "pump" in listed else "pump.stop"]
-    assert not told.is_done  # what became of the other one is told as well
-    assert told.text.startswith("fan: coast is done; pump: ")
+    assert not told.ok  # what became of the other one is told as well
+    assert told.text.startswith("fan: stopped; pump: ")
     assert "no reply" in told.text
 
 

@@ -324,7 +324,7 @@ def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPat
                 write.start()
             until(lambda: len(entered) == 8 and len(found) == 4)
             coast = {"drive": "pump-1", "verb": "coast", "options": {}}
-            assert gateway.post("/api/act", coast).json == {"done": True, "text": "pump-1: coast is done"}
+            assert gateway.post("/api/act", coast).json["done"]
             assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
         finally:
             held.set()
@@ -451,7 +451,9 @@ def test_stop_of_a_restarted_drive_is_a_new_stop(tmp_path: Path) -> None:
         motor.run()  # from its own panel
         until(lambda: motor.goal)
         told = gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]
-        assert (told, stands(gateway, "pump-1")) == ({"done": True, "text": "stopped: seen to stand"}, True)
+        assert told["done"]
+        assert told["text"].startswith("stopped: seen to stand after")
+        assert stands(gateway, "pump-1")
         assert not whole.done()
         gateway.sims["pump-2"].deaf_until = 0.0
         whole.result()

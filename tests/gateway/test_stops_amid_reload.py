@@ -20,7 +20,7 @@ class End:
     """The end of a stop, of this drive."""
 
     drive: Drive | None
-    is_done: bool = True
+    ok: bool = True
 
 
 @dataclass
@@ -103,7 +103,7 @@ def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
         silent.set()
         return await stopping
 
-    assert not asyncio.run(main())["fan"].is_done
+    assert not asyncio.run(main())["fan"].ok
     assert lines.begun == [FAN, FAN]
 
 

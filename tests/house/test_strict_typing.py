@@ -28,6 +28,8 @@ with Bus("/dev/ttyUSB0") as bus:
     reveal_type(pump.read(pump.output_current))
     reveal_type(pump.read("output_current", pump.output_frequency))
     reveal_type(pump.write(pump.acceleration_time, 20.0))
+    reveal_type(pump.stop(seconds=5).ok)
+    reveal_type(pump.state())
     pump.write(pump.acceleration_time, "fast")
     pump.red("output_current")
 """
@@ -35,6 +37,8 @@ FOUND = [
     'note: Revealed type is "float"',
     'note: Revealed type is "dict[str, Any]"',
     'note: Revealed type is "float"',
+    'note: Revealed type is "bool"',
+    'note: Revealed type is "multidrop.drive.state.State"',
     'error: No overload variant of "write" of "RegisterAccess"',
     'error: "InnovertIBD" has no attribute "red"',
 ]

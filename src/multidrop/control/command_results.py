@@ -1,12 +1,11 @@
-"""CommandResult: the outcome of a command, as far as it is certain. No I/O."""
+"""Make a CommandResult of a write's outcome, a stop's result, or the error that a command raised. No I/O."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
-from typing import NamedTuple
 
 from multidrop.control.outcome import Effect, Outcome, Seen, Stopped
+from multidrop.drive.command_result import CommandOutcome, CommandResult
 from multidrop.errors import (
     BadReply,
     BusError,
@@ -21,35 +20,6 @@ from multidrop.errors import (
     Unsupported,
     WriteForbidden,
 )
-
-
-class CommandOutcome(StrEnum):
-    """The outcome of a command; UNKNOWN unless its effect is certain."""
-
-    DONE = "done"
-    FAILED = "failed"  # sent, but the drive refused it, or was seen not to do it
-    REFUSED = "refused"  # forbidden by the library's rules or the plant's lists; not sent
-    NOT_SENT = "not sent"  # it is certain that nothing was sent
-    UNKNOWN = "unknown"  # the command may have been carried out
-    UNDER_WAY = "under way"  # not over yet: ask again later
-
-
-class CommandResult(NamedTuple):
-    """The result of a command.
-
-    `text` is one sentence for a person, `error` the library's error if the command failed. `held` is the
-    value that the drive holds after a write, as text with its unit.
-    """
-
-    outcome: CommandOutcome
-    text: str
-    error: BusError | ValueError | None = None
-    held: str = ""
-
-    @property
-    def is_done(self) -> bool:
-        return self.outcome is CommandOutcome.DONE
-
 
 _OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (  # the first match counts
     (WriteForbidden, CommandOutcome.REFUSED),

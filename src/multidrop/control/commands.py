@@ -15,8 +15,6 @@ from math import isfinite
 from typing import Any, NamedTuple, TypeVar
 
 from multidrop.control.command_results import (
-    CommandOutcome,
-    CommandResult,
     result_of_failed_stop,
     result_of_failure,
     result_of_stop,
@@ -24,6 +22,7 @@ from multidrop.control.command_results import (
 )
 from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.time_limit import written_before
+from multidrop.drive.command_result import CommandOutcome, CommandResult
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import NotAttached
@@ -83,20 +82,15 @@ def typed_value(register: Register[Any], value: float | str) -> Any:
 
 def stop_drive(drive: Drive, seconds: float | None) -> Results:
     """Stop one drive; return the result by its name."""
-    try:
-        drive.stop(seconds=seconds)
-    except Exception as failure:  # of any kind: everybody must see it
-        return {drive.name: result_of_failed_stop(failure)}
-    return {drive.name: CommandResult(CommandOutcome.DONE, "stopped: seen to stand")}
+    return stop_drive_by("stop", drive, seconds)
 
 
 def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive with another verb than `stop`, such as `coast`; return the result by its name."""
+    """Stop one drive with this verb, such as `coast`; return the result by its name."""
     try:
-        getattr(drive, verb)(seconds=seconds)
-    except Exception as failure:  # of any kind: everybody must see it
+        return {drive.name: getattr(drive, verb)(seconds=seconds)}
+    except Exception as failure:  # of any kind: the caller must see it
         return {drive.name: result_of_failed_stop(failure)}
-    return {drive.name: CommandResult(CommandOutcome.DONE, f"{drive.name}: {verb} is done")}
 
 
 def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | None) -> Results:
@@ -184,7 +178,7 @@ async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
         except (RuntimeError, MemoryError):
             results = work(TURN_S)
             found |= results
-            if not all(result.is_done for result in results.values()):
+            if not all(result.ok for result in results.values()):
                 left.append(work)
     for results in await asyncio.gather(*waited):
         found |= results
@@ -281,7 +275,7 @@ class RepeatedStops:
         result = (await asyncio.shield(self._soon(drive)))[drive.name]
         if (repeated := self.of(drive)) is not None:
             result = (await asyncio.shield(repeated))[drive.name]
-        if not result.is_done and _now() < ends:
+        if not result.ok and _now() < ends:
             if (repeated := self.of(drive)) is None:
                 (repeated,) = self._begin([partial(self._stop, drive)])
                 self.note([drive], repeated)

@@ -14,10 +14,12 @@ from math import inf
 from numbers import Real
 from typing import Any
 
+from multidrop.control.command_results import result_of_stop
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped
 from multidrop.control.writer import Writer
 from multidrop.core import Message
+from multidrop.drive.command_result import CommandResult
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Pulse, Read, Script, Step, Wait, Write
 from multidrop.errors import (
@@ -397,12 +399,12 @@ class StopRun:
                 raise interruption
         return found
 
-    def result(self) -> None:
-        """Raise the first failure of a stop whose motor was not seen to stop."""
-        self.found()
-        for attempt in self.attempts:
-            if attempt.known is not None:
-                raise attempt.known
+    def result(self) -> CommandResult:
+        """Return the result of one drive's stop. Raises its failure if the motor was not seen to stop."""
+        (stopped,) = self.found().values()
+        if (failure := self.attempts[0].known) is not None:
+            raise failure
+        return result_of_stop(stopped)
 
 
 class Stopper:

@@ -7,6 +7,7 @@ from inspect import Signature, signature
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, cast, overload
 
+from multidrop.drive.command_result import CommandOutcome, CommandResult
 from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
 
@@ -44,7 +45,7 @@ class CalledStop(Protocol):
 
     def carry_out(self) -> None: ...
     def interrupted(self, interruption: BaseException) -> None: ...
-    def result(self) -> Any: ...
+    def result(self) -> CommandResult: ...
 
 
 class UnattachedStop:
@@ -60,13 +61,15 @@ class UnattachedStop:
     def interrupted(self, interruption: BaseException) -> None:
         """Do nothing."""
 
-    def result(self) -> Any:
+    def result(self) -> CommandResult:
         """Raise NotAttached."""
-        return self._drive.perform(self._make())
+        return cast(CommandResult, self._drive.perform(self._make()))
 
 
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive; calling it carries out the verb.
+
+    The call returns what the script returns, or if that is None, a CommandResult.
 
     A stop takes `seconds`: it is repeated for that long, or until the motor is seen to be at rest. Without a
     valid `seconds` it is repeated for the duration of the motor's ramp, and at least 30 s. A stop that is
@@ -85,11 +88,18 @@ class _BoundVerb(Generic[P, R]):
         return whole.replace(parameters=[*whole.parameters.values()][1:], return_annotation=Signature.empty)
 
     @overload
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    def __call__(self: _BoundVerb[P, None], *args: P.args, **kwargs: P.kwargs) -> CommandResult: ...
     @overload
-    def __call__(self, *, seconds: float | None) -> R: ...
-    def __call__(self, *args: Any, **kwargs: Any) -> R:
-        return cast(R, self.drive.perform(self.script(*args, **kwargs)))
+    def __call__(self: _BoundVerb[P, None], *, seconds: float | None) -> CommandResult: ...
+    @overload
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._result(self.drive.perform(self.script(*args, **kwargs)))
+
+    def _result(self, returned: Any) -> Any:
+        if returned is None:
+            return CommandResult(CommandOutcome.DONE, f"{self.drive.name}: {self.name} is done")
+        return returned
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
         """Return the verb's script, for another verb or a test. Raises TypeError for a wrong argument."""
@@ -104,19 +114,19 @@ class _BoundVerb(Generic[P, R]):
 class _BoundMove(_BoundVerb[P, R]):
     """A verb that may move the motor. A stop that is called after the start of the call cancels it."""
 
-    def __call__(self, *args: Any, **kwargs: Any) -> R:
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
         # Read the count first, without calling a Python function. Then a signal handler that stops the drive
         # either runs before this call, or cancels it.
         seen = self.drive.stops_called[0]
         script = self.script(*args, **kwargs)
         self.drive.check_confirmed(self.name)
-        return cast(R, self.drive.carry_out_move(script, self.drive.begin_call(self.name, seen)))
+        return self._result(self.drive.carry_out_move(script, self.drive.begin_call(self.name, seen)))
 
 
 class _BoundStop(_BoundVerb[P, R]):
     """A verb that stops the motor, even if the call is interrupted."""
 
-    def __call__(self, *args: Any, **kwargs: Any) -> R:
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
         run: CalledStop | None = None
         tried = 0
         while True:
@@ -134,7 +144,7 @@ class _BoundStop(_BoundVerb[P, R]):
         if mistake := self._mistake(args, **kwargs):
             mistake.add_note(f"{self.name} of {self.drive.name} was sent all the same, without them")
             raise mistake
-        return cast(R, result)
+        return result
 
     def _called(self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any) -> CalledStop:
         if self._mistake(args, **kwargs):
@@ -174,7 +184,11 @@ class Verb(Generic[P, R]):
     def __signature__(self) -> Signature:
         return signature(self._script).replace(return_annotation=Signature.empty)
 
-    def __call__(self, drive: Drive, *args: P.args, **kwargs: P.kwargs) -> R:
+    @overload
+    def __call__(self: Verb[P, None], drive: Drive, *args: P.args, **kwargs: P.kwargs) -> CommandResult: ...
+    @overload
+    def __call__(self, drive: Drive, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    def __call__(self, drive: Drive, *args: Any, **kwargs: Any) -> Any:
         """Carry out the verb on a drive: `YD1000.start(pump)` is `pump.start()`."""
         return self.__get__(drive, type(drive))(*args, **kwargs)
 

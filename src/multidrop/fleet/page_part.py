@@ -106,9 +106,9 @@ class FleetPart:
             answer = await self._commands.stop(by=by)
         except (OSError, ValueError) as failure:
             return {"the fleet": (False, masked(str(failure)))}
-        found = {name: (one.is_done, one.text) for name, one in answer.drives.items()}
-        if not found or not answer.is_done:  # the answer has no drives of a line without a master
-            found["the fleet"] = answer.is_done, answer.text
+        found = {name: (one.ok, one.text) for name, one in answer.drives.items()}
+        if not found or not answer.ok:  # the answer has no drives of a line without a master
+            found["the fleet"] = answer.ok, answer.text
         return found
 
     async def close(self) -> None:

@@ -231,7 +231,7 @@ class Commands:
         finally:
             self._jogging[drive] -= is_jog
             self._halts[drive] += is_jog
-        if verb == "reset_fault" and result.is_done:
+        if verb == "reset_fault" and result.ok:
             self._on_reset(drive)
         return result
 
@@ -321,7 +321,7 @@ def as_one(results: Mapping[str, CommandResult]) -> CommandResult:
     """Return one result for a stop whose drive name was ambiguous, so that several drives were stopped."""
     if len(results) == 1:
         return next(iter(results.values()))
-    failed = [result for result in results.values() if not result.is_done]
+    failed = [result for result in results.values() if not result.ok]
     outcome = failed[0].outcome if failed else CommandOutcome.DONE
     return CommandResult(outcome, in_one_text(results), failed[0].error if failed else None)
 

@@ -17,7 +17,7 @@ class StopEnd(Protocol):
     """The result of a stop."""
 
     @property
-    def is_done(self) -> bool: ...
+    def ok(self) -> bool: ...
 
 
 T = TypeVar("T", bound=StopEnd)
@@ -111,7 +111,7 @@ async def stop_as_changed(
         for name, end in (await stop(plant, [*begun])).items():
             if latest[name] is begun[name]:
                 results[name] = end
-                begun[name].has_failed = not end.is_done
+                begun[name].has_failed = not end.ok
 
     try:
         while True:

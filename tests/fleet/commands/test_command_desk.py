@@ -146,7 +146,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
             synced.append((len(desk.notes), len(desk.writes)))
 
         monkeypatch.setattr(audit_log, "_sync", sync)
-        assert asyncio.run(desk.do(desk.offered())).is_done
+        assert asyncio.run(desk.do(desk.offered())).ok
         assert synced == [(1, 0), (2, 1)]
 
 

@@ -58,7 +58,7 @@ async def _write_and_stop(desk: Desks) -> None:
     assert desk.writes == []
     stopped = await desk.stop()
     assert stopped is not None
-    assert stopped.is_done
+    assert stopped.ok
     assert desk.written == {"control"}
 
 

@@ -75,7 +75,7 @@ def test_a_commander_may_and_a_viewer_may_not(servers: SecuredCluster, tmp_path:
                         assert f"do not allow to publish to cmd.{LINE}" in told.text
                         assert made.writes == []
                     stopped = await asker.stop()
-                    assert stopped.is_done == told.is_done, stopped.text
+                    assert stopped.ok == told.ok, stopped.text
             assert [name for name, _ in made.writes] == ["frequency", "control"]
 
     with desks(tmp_path) as made:

@@ -107,7 +107,7 @@ def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytes
         assert not isinstance(stopped["mill"].error, WriteForbidden)
         go_on.set()
         await asyncio.gather(*some)
-        assert (await control.write("mill", "setpoint", 9.0, writer)).is_done  # there is room again
+        assert (await control.write("mill", "setpoint", 9.0, writer)).ok  # there is room again
 
     for work in ("write_register", "carry_out_verb"):
         monkeypatch.setattr(commands, work, slow)

@@ -164,8 +164,8 @@ def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
     if arguments.json:
         print_text(json.dumps(answer.as_json(), indent=2))
     else:
-        print_text(_sentence(answer), file=sys.stdout if answer.is_done else sys.stderr)
-    return 0 if answer.is_done else 1
+        print_text(_sentence(answer), file=sys.stdout if answer.ok else sys.stderr)
+    return 0 if answer.ok else 1
 
 
 def _show_news(answer: CommandAnswer) -> None:

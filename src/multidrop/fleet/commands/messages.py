@@ -29,7 +29,7 @@ class CommandAnswer(NamedTuple):
     drives: Mapping[str, CommandAnswer] = {}
 
     @property
-    def is_done(self) -> bool:
+    def ok(self) -> bool:
         return self.outcome is CommandOutcome.DONE
 
     @classmethod

@@ -74,7 +74,7 @@ class StopDesk:
             return self._so_far(held, request)
         answer = task.result()
         is_ours = self._lines.for_stop(line) is held and not held.is_leaving
-        return answer if answer.is_done or is_ours else None
+        return answer if answer.ok or is_ours else None
 
     def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
         names = held.drives if request.drives is None else request.drives

@@ -133,7 +133,7 @@ async def _denied(request: Request, failure: Exception) -> Response:
 
 
 def _fields(result: CommandResult) -> dict[str, Any]:
-    return {"done": result.is_done, "text": result.text}
+    return {"done": result.ok, "text": result.text}
 
 
 def _answer(result: CommandResult) -> Response:

@@ -270,8 +270,8 @@ class ModbusServer:
         """Write a register; return 0 or an exception code."""
         value = raw if register.values is not None else register.decode(raw)
         result = await self._commands.write(unit.drive.name, register.name, value, caller)
-        self.answered["written" if result.is_done else "not written"] += 1
-        return 0 if result.is_done else code_of(result.error)
+        self.answered["written" if result.ok else "not written"] += 1
+        return 0 if result.ok else code_of(result.error)
 
     def _stop(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> Awaitable[bytes]:
         return self._later(request, self._begin_stop(unit, client), STOP_WAIT_S)
@@ -295,7 +295,7 @@ class ModbusServer:
         except Exception:
             _log.exception("stop of %s by a modbus client", name)
             return ModbusCode.NO_RESPONSE
-        if result.is_done:
+        if result.ok:
             return 0
         code = code_of(result.error)
         return ModbusCode.NO_RESPONSE if code == ModbusCode.DEVICE_FAILURE else code

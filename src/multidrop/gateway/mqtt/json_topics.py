@@ -264,7 +264,7 @@ class JsonTopics:
         return json.dumps(said, ensure_ascii=False).encode()
 
     def _report(self, drive: str, what: str, result: CommandResult) -> None:
-        said = json.dumps({"what": what, "done": result.is_done, "text": result.text}, ensure_ascii=False)
+        said = json.dumps({"what": what, "done": result.ok, "text": result.text}, ensure_ascii=False)
         self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
 
     def _discover(self, name: str) -> None:

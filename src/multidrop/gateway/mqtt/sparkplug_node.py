@@ -233,7 +233,7 @@ class SparkplugNode:
         return known.get(alias or 0, f"alias {alias}")
 
     def _report(self, drive: str, what: str, result: CommandResult) -> None:
-        (_log.info if result.is_done else _log.warning)("%s of %s: %s", what, drive, result.text)
+        (_log.info if result.ok else _log.warning)("%s of %s: %s", what, drive, result.text)
 
 
 def _metric_of(register: str) -> str:
