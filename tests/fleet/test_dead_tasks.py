@@ -187,22 +187,18 @@ def test_subjects_that_cannot_be_heard_end_the_gateway(gateway: Any, monkeypatch
         gateway(kill)
 
 
-def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_path: Path) -> None:
+async def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_path: Path) -> None:
     """The page then reconnects."""
-
-    async def main() -> None:
-        async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
-            commands._keeping[1].cancel()
-            with pytest.raises(Ended, match="a connection to the fleet has ended"):
-                await asyncio.wait_for(commands.stay(), 60)
-
-    asyncio.run(main())
+    async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
+        commands._keeping[1].cancel()
+        with pytest.raises(Ended, match="a connection to the fleet has ended"):
+            await asyncio.wait_for(commands.stay(), 60)
 
 
 # ---- failures that end no gateway ----
 
 
-def test_a_forwarder_that_fails_is_logged_and_tries_again(
+async def test_a_forwarder_that_fails_is_logged_and_tries_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.0)
@@ -215,14 +211,11 @@ def test_a_forwarder_that_fails_is_logged_and_tries_again(
         asked.append(forwarder.state().trouble)
         raise Ill("a mistake")
 
-    async def main() -> None:
-        monkeypatch.setattr(forwarder, "_ask", ask)
-        running = asyncio.create_task(forwarder.run())
-        while len(asked) < 3:
-            await asyncio.sleep(0)
-        running.cancel()
-
-    asyncio.run(main())
+    monkeypatch.setattr(forwarder, "_ask", ask)
+    running = asyncio.create_task(forwarder.run())
+    while len(asked) < 3:
+        await asyncio.sleep(0)
+    running.cancel()
     spool.close()
     assert asked[:2] == [None, "Ill: a mistake"]
     assert caplog.text.count("samples are not forwarded: Ill: a mistake") == 1
@@ -345,30 +338,23 @@ def test_a_line_that_fails_to_open_is_not_polled(
     assert taken.lines.poller.buses == {}
 
 
-def test_a_line_that_cannot_be_opened_to_commands_is_not_polled(
+async def test_a_line_that_cannot_be_opened_to_commands_is_not_polled(
     taken: Taken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
     held: Any = SimpleNamespace(leave=lambda line: None, shut=lambda line: None)
-
-    async def main() -> None:
-        subjects = CommandSubjects("gw-1", [], held, log)
-        monkeypatch.setattr(subjects, "open", lambda *details: asyncio.run(fail()))
-        with pytest.raises(RuntimeError):
-            await CommandedLines(taken.lines, subjects).take(LINE, taken.description)
-
-    asyncio.run(main())
+    subjects = CommandSubjects("gw-1", [], held, log)
+    monkeypatch.setattr(subjects, "open", lambda *details: asyncio.run(fail()))
+    with pytest.raises(RuntimeError):
+        await CommandedLines(taken.lines, subjects).take(LINE, taken.description)
     log.close()
     assert taken.lines.poller.buses == {}
 
 
-def test_lines_are_closed_though_polling_has_failed(taken: Taken) -> None:
-    async def main() -> None:
-        await taken.lines.take(LINE, taken.description)
-        taken.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
-        await taken.lines.let_go(LINE)
-
-    asyncio.run(main())
+async def test_lines_are_closed_though_polling_has_failed(taken: Taken) -> None:
+    await taken.lines.take(LINE, taken.description)
+    taken.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
+    await taken.lines.let_go(LINE)
     assert not taken.lines.bus(LINE).is_open
     taken.lines.poller._is_failure_raised = True
 

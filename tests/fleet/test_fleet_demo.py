@@ -26,25 +26,22 @@ from multidrop.cli.fleet.demo import Stage, gap_s, plant_file  # noqa: E402
 from multidrop.plant.loader import load_plant  # noqa: E402
 
 
-def test_the_fleet_is_calm_when_no_line_has_moved_between_two_views() -> None:
-    async def play() -> None:
-        stage = Stage()
+async def test_the_fleet_is_calm_when_no_line_has_moved_between_two_views() -> None:
+    stage = Stage()
 
-        async def look(master: str) -> None:
-            for _ in range(10):
-                await asyncio.sleep(0)
-            stage.show({"gateways": {}, "lines": {"line-1": {"master": master}}})
-            for _ in range(10):
-                await asyncio.sleep(0)
+    async def look(master: str) -> None:
+        for _ in range(10):
+            await asyncio.sleep(0)
+        stage.show({"gateways": {}, "lines": {"line-1": {"master": master}}})
+        for _ in range(10):
+            await asyncio.sleep(0)
 
-        await look("gw-1")
-        waiting = asyncio.create_task(stage.calm(0))
-        await look("gw-2")
-        assert not waiting.done()
-        await look("gw-2")
-        await asyncio.wait_for(waiting, PATIENCE)
-
-    asyncio.run(play())
+    await look("gw-1")
+    waiting = asyncio.create_task(stage.calm(0))
+    await look("gw-2")
+    assert not waiting.done()
+    await look("gw-2")
+    await asyncio.wait_for(waiting, PATIENCE)
 
 
 def test_unsent_messages_are_counted_for_each_gateway() -> None:

@@ -41,101 +41,82 @@ class Asked:
         self.answers.append(json.loads(data))
 
 
-def test_a_waiting_namesake_answers_no_requests(tmp_path: Path) -> None:
+async def test_a_waiting_namesake_answers_no_requests(tmp_path: Path) -> None:
     """The other one gets the request too: `status` would show the wrong one, and `drain` trust it."""
-
-    async def main() -> None:
-        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-        lease = gateway.member.lease
-        for wanted in ("state", "drain"):
-            asked: Any = Asked(wanted)
-            await gateway._answer(asked)
-            assert (asked.answers, gateway.member.is_draining) == ([], False)
-        lease.session = 7
-        asked = Asked("state")
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    lease = gateway.member.lease
+    for wanted in ("state", "drain"):
+        asked: Any = Asked(wanted)
         await gateway._answer(asked)
-        assert [answer["session"] for answer in asked.answers] == [7]
-        await gateway._close()
+        assert (asked.answers, gateway.member.is_draining) == ([], False)
+    lease.session = 7
+    asked = Asked("state")
+    await gateway._answer(asked)
+    assert [answer["session"] for answer in asked.answers] == [7]
+    await gateway._close()
 
-    asyncio.run(main())
 
-
-def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path) -> None:
+async def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path) -> None:
     """The servers let it go there: a record of the plant is what its asker may not write. And an answer of a
     server to somebody's request, sent here, has no inbox."""
-
-    async def main() -> None:
-        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-        gateway.member.lease.session = 7
-        for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):
-            for wanted in ("state", "drain"):
-                asked: Any = Asked(wanted, reply)
-                await gateway._answer(asked)
-                assert (asked.answers, gateway.member.is_draining) == ([], False)
-        asked = Asked("drain", "_INBOX_UABC.1")
-        await gateway._answer(asked)
-        assert gateway.member.is_draining
-        assert asked.answers
-        await gateway._close()
-
-    asyncio.run(main())
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    gateway.member.lease.session = 7
+    for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):
+        for wanted in ("state", "drain"):
+            asked: Any = Asked(wanted, reply)
+            await gateway._answer(asked)
+            assert (asked.answers, gateway.member.is_draining) == ([], False)
+    asked = Asked("drain", "_INBOX_UABC.1")
+    await gateway._answer(asked)
+    assert gateway.member.is_draining
+    assert asked.answers
+    await gateway._close()
 
 
 @pytest.mark.parametrize(("trouble", "is_forwarded"), [(None, True), ("the stream is full", False)])
-def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
+async def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: str | None, is_forwarded: bool
 ) -> None:
     monkeypatch.setattr(fleet_gateway, "FORWARD_S", PATIENCE_S)
     monkeypatch.setattr(fleet_gateway, "IN_TROUBLE_S", 0.0)
-
-    async def main() -> None:
-        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-        taken = iter([0, 0, 1])  # messages of the spool's two that the stream has at each look
-        forwarder: Any = SimpleNamespace(state=lambda: ForwarderState(0, next(taken, 2), trouble))
-        spool, gateway.forwarder = gateway.spool, forwarder
-        monkeypatch.setattr(gateway, "spool", SimpleNamespace(state=lambda: SimpleNamespace(newest=2)))
-        forwarding = asyncio.create_task(asyncio.sleep(PATIENCE_S))
-        await gateway._forward_the_rest(forwarding)
-        assert (next(taken, None) is None) == is_forwarded
-        forwarding.cancel()
-        gateway.spool = spool
-        await gateway._close()
-
-    asyncio.run(main())
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    taken = iter([0, 0, 1])  # messages of the spool's two that the stream has at each look
+    forwarder: Any = SimpleNamespace(state=lambda: ForwarderState(0, next(taken, 2), trouble))
+    spool, gateway.forwarder = gateway.spool, forwarder
+    monkeypatch.setattr(gateway, "spool", SimpleNamespace(state=lambda: SimpleNamespace(newest=2)))
+    forwarding = asyncio.create_task(asyncio.sleep(PATIENCE_S))
+    await gateway._forward_the_rest(forwarding)
+    assert (next(taken, None) is None) == is_forwarded
+    forwarding.cancel()
+    gateway.spool = spool
+    await gateway._close()
 
 
-def test_a_margin_is_never_less_than_none(tmp_path: Path) -> None:
-    async def main() -> None:
-        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-        assert gateway.state()["margin_s"] == 0.0
-        await gateway._close()
-
-    asyncio.run(main())
+async def test_a_margin_is_never_less_than_none(tmp_path: Path) -> None:
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    assert gateway.state()["margin_s"] == 0.0
+    await gateway._close()
 
 
-def test_the_kernels_timer_is_called_off_once_the_lines_are_closed(
+async def test_the_kernels_timer_is_called_off_once_the_lines_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A process whose member failed may go on: the kernel would kill it."""
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
+    held: list[bool] = []
+    close = gateway.lines.poller.close
 
-    async def main() -> None:
-        gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-        gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
-        held: list[bool] = []
-        close = gateway.lines.poller.close
+    def noted() -> None:
+        held.append(gateway.mastership.holds)
+        close()
 
-        def noted() -> None:
-            held.append(gateway.mastership.holds)
-            close()
-
-        monkeypatch.setattr(gateway.lines.poller, "close", noted)
-        try:
-            await gateway._close()
-            assert (held, gateway.mastership.until_ns) == ([True], 0)
-        finally:
-            gateway.mastership.end()
-
-    asyncio.run(main())
+    monkeypatch.setattr(gateway.lines.poller, "close", noted)
+    try:
+        await gateway._close()
+        assert (held, gateway.mastership.until_ns) == ([True], 0)
+    finally:
+        gateway.mastership.end()
 
 
 @pytest.mark.long

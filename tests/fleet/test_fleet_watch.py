@@ -225,35 +225,27 @@ class FailingView:
         return {"gateways": {}, "lines": {}, "moves": []}
 
 
-def test_a_failed_read_is_shown_with_the_age_of_the_view(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_failed_read_is_shown_with_the_age_of_the_view(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet_watch, "EVERY_S", 0.02)
     shown: list[dict[str, Any]] = []
+    over = asyncio.Event()
 
-    async def main() -> None:
-        over = asyncio.Event()
+    def show(told: dict[str, Any]) -> None:
+        shown.append(told)
+        if len(shown) == 3:
+            over.set()
 
-        def show(told: dict[str, Any]) -> None:
-            shown.append(told)
-            if len(shown) == 3:
-                over.set()
-
-        await fleet_watch.follow(FleetWatch(FailingView()), show, over)  # type: ignore[arg-type]
-
-    asyncio.run(main())
+    await fleet_watch.follow(FleetWatch(FailingView()), show, over)  # type: ignore[arg-type]
     assert [one["trouble"] for one in shown] == [None, "no server", "no server"]
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
 
-def test_a_watch_ends_with_the_task_of_its_connection() -> None:
+async def test_a_watch_ends_with_the_task_of_its_connection() -> None:
     """Else it would show the last look for ever."""
-
-    async def main() -> None:
-        supervisor().keep("path", asyncio.sleep(0)).cancel()
-        watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
-        with pytest.raises(Ended, match="path has ended: it was cancelled"):
-            await fleet_watch.follow(watch, lambda told: None, asyncio.Event())
-
-    asyncio.run(main())
+    supervisor().keep("path", asyncio.sleep(0)).cancel()
+    watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
+    with pytest.raises(Ended, match="path has ended: it was cancelled"):
+        await fleet_watch.follow(watch, lambda told: None, asyncio.Event())
 
 
 def test_without_a_terminal_it_says_what_works(run: Run) -> None:

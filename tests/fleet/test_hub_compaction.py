@@ -164,16 +164,12 @@ def test_files_are_no_larger_than_may_be(
 
 
 @pytest.mark.long
-def test_a_hub_has_it_done_beside_its_reading(sink: ParquetSink, tmp_path: Path) -> None:
+async def test_a_hub_has_it_done_beside_its_reading(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
-
-    async def live() -> None:
-        task = asyncio.create_task(compact_for_ever(tmp_path, every=0.01))
-        async with asyncio.timeout(60.0):
-            while len(names(tmp_path, "rows")) > 6:
-                await asyncio.sleep(random.uniform(0.01, 0.05))
-        task.cancel()
-        await asyncio.wait([task])
-
-    asyncio.run(live())
+    task = asyncio.create_task(compact_for_ever(tmp_path, every=0.01))
+    async with asyncio.timeout(60.0):
+        while len(names(tmp_path, "rows")) > 6:
+            await asyncio.sleep(random.uniform(0.01, 0.05))
+    task.cancel()
+    await asyncio.wait([task])
     check(tmp_path, FILES)

@@ -162,7 +162,7 @@ def test_a_port_that_is_taken() -> None:
             listen(f"127.0.0.1:{port}")
 
 
-def test_a_silent_namesake_does_not_block_forever() -> None:
+async def test_a_silent_namesake_does_not_block_forever() -> None:
     """Clients above the limit, or with too much data, are dropped at once; none delays the end."""
 
     async def ask(port: int, data: bytes) -> bytes:
@@ -175,18 +175,15 @@ def test_a_silent_namesake_does_not_block_forever() -> None:
         finally:
             writer.close()
 
-    async def main() -> None:
-        listener = listen("127.0.0.1:0")
-        port = listener.getsockname()[1]
-        async with serving(listener, lambda: families_of(STATE, "1.0")):
-            assert (await ask(port, asked())).startswith(b"HTTP/1.1 200 OK\r\n")
-            assert await ask(port, b"x" * 4 * MOST_HEAD) == b""
-            silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST_CLIENTS)]
-            assert await ask(port, asked()) == b""
-            silent.pop()[1].close()
-            while not await ask(port, asked()):
-                await asyncio.sleep(0.01)
-        for _, writer in silent:
-            writer.close()
-
-    asyncio.run(main())
+    listener = listen("127.0.0.1:0")
+    port = listener.getsockname()[1]
+    async with serving(listener, lambda: families_of(STATE, "1.0")):
+        assert (await ask(port, asked())).startswith(b"HTTP/1.1 200 OK\r\n")
+        assert await ask(port, b"x" * 4 * MOST_HEAD) == b""
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST_CLIENTS)]
+        assert await ask(port, asked()) == b""
+        silent.pop()[1].close()
+        while not await ask(port, asked()):
+            await asyncio.sleep(0.01)
+    for _, writer in silent:
+        writer.close()

@@ -32,33 +32,24 @@ async def _begun(times: int) -> asyncio.Task[str]:
     return task
 
 
-def test_a_task_is_cancelled_until_it_is_over() -> None:
-    async def main() -> None:
-        tasks = [await _begun(times) for times in (0, 1, 3)]
-        found = await asyncio.wait_for(end_tasks(*tasks), PATIENCE_S)
-        assert [type(one) for one in found] == [asyncio.CancelledError] * 3
-        assert await end_tasks() == []
-
-    asyncio.run(main())
+async def test_a_task_is_cancelled_until_it_is_over() -> None:
+    tasks = [await _begun(times) for times in (0, 1, 3)]
+    found = await asyncio.wait_for(end_tasks(*tasks), PATIENCE_S)
+    assert [type(one) for one in found] == [asyncio.CancelledError] * 3
+    assert await end_tasks() == []
 
 
-def test_an_ended_session_stays_ended() -> None:
-    async def main() -> None:
-        async def failing() -> None:
-            raise OSError("the disk is full")
+async def test_an_ended_session_stays_ended() -> None:
+    async def failing() -> None:
+        raise OSError("the disk is full")
 
-        failed = asyncio.create_task(failing())
-        await asyncio.wait({failed})
-        (found,) = await end_tasks(failed)
-        assert str(found) == "the disk is full"
-
-    asyncio.run(main())
+    failed = asyncio.create_task(failing())
+    await asyncio.wait({failed})
+    (found,) = await end_tasks(failed)
+    assert str(found) == "the disk is full"
 
 
-def test_a_command_s_end_waits_for_no_path_that_was_deaf_once(tmp_path: Path) -> None:
-    async def main() -> None:
-        fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
-        fleet._keeping = [await _begun(1)]  # type: ignore[list-item]
-        await asyncio.wait_for(fleet.close(), PATIENCE_S)
-
-    asyncio.run(main())
+async def test_a_command_s_end_waits_for_no_path_that_was_deaf_once(tmp_path: Path) -> None:
+    fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
+    fleet._keeping = [await _begun(1)]  # type: ignore[list-item]
+    await asyncio.wait_for(fleet.close(), PATIENCE_S)

@@ -230,36 +230,33 @@ def test_an_offer_is_of_no_use_to_another_gateway(tell: Callable[[Story], None])
     tell(story)
 
 
-def test_subscriptions_follow_their_path(fleet: Cluster) -> None:
-    async def main() -> None:
-        path, asker = (ServerPath(fleet.urls[number:]) for number in (0, 1))
-        heard: list[str] = []
+async def test_subscriptions_follow_their_path(fleet: Cluster) -> None:
+    path, asker = (ServerPath(fleet.urls[number:]) for number in (0, 1))
+    heard: list[str] = []
 
-        async def take(subject: str, message: object) -> None:
-            heard.append(subject)
+    async def take(subject: str, message: object) -> None:
+        heard.append(subject)
 
-        try:
-            await asyncio.gather(path.open(), asker.open())
-            for subject in ("test.a", "test.b", "test.c"):
-                await path.subscribe(subject, partial(take, subject))
-            await path.unsubscribe("test.a")
-            move = asyncio.create_task(path._move(fleet.urls[1]))
-            await path.unsubscribe("test.b")
-            await path.subscribe("test.d", partial(take, "test.d"))
-            await move
-            assert path._client is not None
-            assert asker._client is not None
-            await path._client.flush()
-            for subject in ("test.a", "test.b", "test.c", "test.d"):
-                await asker._client.publish(subject, b"")
-            await asker._client.flush()
-            await path._client.flush()
-            await asyncio.wait_for(_until(lambda: len(heard) >= 2), PATIENCE_S)
-            assert sorted(heard) == ["test.c", "test.d"]
-        finally:
-            await asyncio.gather(path.close(), asker.close())
-
-    asyncio.run(main())
+    try:
+        await asyncio.gather(path.open(), asker.open())
+        for subject in ("test.a", "test.b", "test.c"):
+            await path.subscribe(subject, partial(take, subject))
+        await path.unsubscribe("test.a")
+        move = asyncio.create_task(path._move(fleet.urls[1]))
+        await path.unsubscribe("test.b")
+        await path.subscribe("test.d", partial(take, "test.d"))
+        await move
+        assert path._client is not None
+        assert asker._client is not None
+        await path._client.flush()
+        for subject in ("test.a", "test.b", "test.c", "test.d"):
+            await asker._client.publish(subject, b"")
+        await asker._client.flush()
+        await path._client.flush()
+        await asyncio.wait_for(_until(lambda: len(heard) >= 2), PATIENCE_S)
+        assert sorted(heard) == ["test.c", "test.d"]
+    finally:
+        await asyncio.gather(path.close(), asker.close())
 
 
 async def _until(met: Callable[[], bool]) -> None:

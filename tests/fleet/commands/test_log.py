@@ -67,16 +67,12 @@ def test_a_killed_log_thread_keeps_a_command_back_and_no_stop(tmp_path: Path) ->
         asyncio.run(_write_and_stop(desk))
 
 
-def test_records_are_in_the_order_of_the_calls_and_none_follows_the_closing(tmp_path: Path) -> None:
+async def test_records_are_in_the_order_of_the_calls_and_none_follows_the_closing(tmp_path: Path) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
-
-    async def main() -> None:
-        await asyncio.gather(*(log.note({"step": number}) for number in range(5)))
-        log.close()
-        with pytest.raises(OSError, match=r"commands\.jsonl is closed"):
-            await log.note({})
-
-    asyncio.run(main())
+    await asyncio.gather(*(log.note({"step": number}) for number in range(5)))
+    log.close()
+    with pytest.raises(OSError, match=r"commands\.jsonl is closed"):
+        await log.note({})
     lines = (tmp_path / "commands.jsonl").read_text().splitlines()
     assert [line.partition('"step": ')[2] for line in lines] == ["0}", "1}", "2}", "3}", "4}"]
 

@@ -54,94 +54,78 @@ async def look(observer: Observer) -> None:
         await observer.look(path)
 
 
-def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> None:
-    async def main() -> None:
-        trial = Trial()
-        for bucket in trial.buckets:
-            bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes its time
-        lease, began = trial.lease(), trial.clock.now
-        assert await lease.try_to_begin()
-        assert lease.session == 1
-        assert lease.until <= began + 0.25 * SECOND + USUAL.lease
-        assert trial.masterships[0].until == lease.until
-
-    asyncio.run(main())
+async def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> None:
+    trial = Trial()
+    for bucket in trial.buckets:
+        bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes its time
+    lease, began = trial.lease(), trial.clock.now
+    assert await lease.try_to_begin()
+    assert lease.session == 1
+    assert lease.until <= began + 0.25 * SECOND + USUAL.lease
+    assert trial.masterships[0].until == lease.until
 
 
-def test_a_renewal_counts_from_its_sending() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        trial.clock.pass_s(1)
-        sent = trial.clock.now
-        for bucket in trial.buckets:
-            bucket.before_put = lambda key: trial.clock.pass_s(0.25)
-        await lease.renew_once(0)
-        await lease.renew_once(1)
-        assert lease.until == trial.masterships[0].until == sent + USUAL.lease
-
-    asyncio.run(main())
+async def test_a_renewal_counts_from_its_sending() -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    trial.clock.pass_s(1)
+    sent = trial.clock.now
+    for bucket in trial.buckets:
+        bucket.before_put = lambda key: trial.clock.pass_s(0.25)
+    await lease.renew_once(0)
+    await lease.renew_once(1)
+    assert lease.until == trial.masterships[0].until == sent + USUAL.lease
 
 
-def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
+async def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
     """The time of its sending is unknown."""
+    trial = Trial()
+    trial.buckets[2].loses_answers = True
+    lease, began = trial.lease(), trial.clock.now
+    assert await lease.try_to_begin()
+    trial.buckets[2].loses_answers = False
+    trial.clock.pass_s(1)
+    await lease.renew_once(2)  # finds its record
+    assert lease.held[2] is not None
+    trial.clock.pass_s(0.5)
+    await lease.renew_once(1)
+    assert lease.until == began + USUAL.lease
+    await lease.renew_once(2)
+    assert lease.until == began + 1.5 * SECOND + USUAL.lease
 
-    async def main() -> None:
-        trial = Trial()
-        trial.buckets[2].loses_answers = True
-        lease, began = trial.lease(), trial.clock.now
-        assert await lease.try_to_begin()
-        trial.buckets[2].loses_answers = False
-        trial.clock.pass_s(1)
-        await lease.renew_once(2)  # finds its record
-        assert lease.held[2] is not None
+
+async def test_the_deadline_is_the_second_latest() -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    began = trial.clock.now
+    trial.clock.pass_s(1)
+    await lease.renew_once(0)
+    assert lease.until == began + USUAL.lease
+    trial.clock.pass_s(1)
+    await lease.renew_once(1)
+    assert lease.until == began + SECOND + USUAL.lease
+
+
+async def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    trial.buckets[1].is_down = True
+    for _ in range(20):
         trial.clock.pass_s(0.5)
-        await lease.renew_once(1)
-        assert lease.until == began + USUAL.lease
-        await lease.renew_once(2)
-        assert lease.until == began + 1.5 * SECOND + USUAL.lease
-
-    asyncio.run(main())
-
-
-def test_the_deadline_is_the_second_latest() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        began = trial.clock.now
-        trial.clock.pass_s(1)
-        await lease.renew_once(0)
-        assert lease.until == began + USUAL.lease
-        trial.clock.pass_s(1)
-        await lease.renew_once(1)
-        assert lease.until == began + SECOND + USUAL.lease
-
-    asyncio.run(main())
-
-
-def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        trial.buckets[1].is_down = True
-        for _ in range(20):
-            trial.clock.pass_s(0.5)
-            await renew(lease)
-            assert lease.is_valid
-        trial.buckets[2].is_down = True
-        for _ in range(6):
-            trial.clock.pass_s(0.5)
-            await renew(lease)
-        assert not lease.is_valid
-        trial.buckets[1].is_down = False  # no one has ended it: the same session continues
         await renew(lease)
         assert lease.is_valid
-        assert lease.session == 1
-
-    asyncio.run(main())
+    trial.buckets[2].is_down = True
+    for _ in range(6):
+        trial.clock.pass_s(0.5)
+        await renew(lease)
+    assert not lease.is_valid
+    trial.buckets[1].is_down = False  # no one has ended it: the same session continues
+    await renew(lease)
+    assert lease.is_valid
+    assert lease.session == 1
 
 
 def test_a_renewal_that_failed_is_tried_again_soon() -> None:
@@ -168,127 +152,107 @@ def test_a_renewal_that_failed_is_tried_again_soon() -> None:
     run_controlled(main())
 
 
-def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        until = lease.until
-        for bucket in trial.buckets:
-            bucket.loses_answers = True
-        trial.clock.pass_s(1)
-        for _ in range(2):
-            await renew(lease)
-            lease._extend()  # as after the next answer
-            assert lease.until == until
-        for bucket in trial.buckets:
-            bucket.loses_answers = False
+async def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    until = lease.until
+    for bucket in trial.buckets:
+        bucket.loses_answers = True
+    trial.clock.pass_s(1)
+    for _ in range(2):
         await renew(lease)
-        assert lease.until == until + SECOND
-
-    asyncio.run(main())
-
-
-def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        trial.clock.pass_s(1)
-
-        async def end_meanwhile() -> None:
-            trial.buckets[0].before_put = lambda key: None
-            await lease.end()
-
-        ending: list[asyncio.Task[None]] = []
-        trial.buckets[0].before_put = lambda key: ending.append(asyncio.ensure_future(end_meanwhile()))
-        await lease.renew_once(0)
-        await ending[0]
-        assert lease.until == 0
-        assert not lease.is_valid
-
-    asyncio.run(main())
+        lease._extend()  # as after the next answer
+        assert lease.until == until
+    for bucket in trial.buckets:
+        bucket.loses_answers = False
+    await renew(lease)
+    assert lease.until == until + SECOND
 
 
-def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> None:
-    """Else the next gateway would wait until the lease has run out, though this one left in order."""
+async def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    trial.clock.pass_s(1)
 
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        for bucket, value in zip(trial.buckets, trial.values(), strict=True):
-            bucket.store("a", value)
+    async def end_meanwhile() -> None:
+        trial.buckets[0].before_put = lambda key: None
         await lease.end()
-        assert [value["ended"] for value in trial.values()] == [True, True, True]
-        assert await trial.lease().try_to_begin()
 
-    asyncio.run(main())
+    ending: list[asyncio.Task[None]] = []
+    trial.buckets[0].before_put = lambda key: ending.append(asyncio.ensure_future(end_meanwhile()))
+    await lease.renew_once(0)
+    await ending[0]
+    assert lease.until == 0
+    assert not lease.is_valid
+
+
+async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> None:
+    """Else the next gateway would wait until the lease has run out, though this one left in order."""
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    for bucket, value in zip(trial.buckets, trial.values(), strict=True):
+        bucket.store("a", value)
+    await lease.end()
+    assert [value["ended"] for value in trial.values()] == [True, True, True]
+    assert await trial.lease().try_to_begin()
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-def test_the_end_of_a_session_is_written_over_its_own_renewals_alone(later: dict[str, Any]) -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        trial.buckets[0].store("a", {**trial.values()[0], **later})
-        await lease.end()
-        assert [value["ended"] for value in trial.values()] == [later.get("ended", False), True, True]
-        assert trial.buckets[0].records["a"].value.get("by") == later.get("by")
-
-    asyncio.run(main())
+async def test_the_end_of_a_session_is_written_over_its_own_renewals_alone(later: dict[str, Any]) -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    trial.buckets[0].store("a", {**trial.values()[0], **later})
+    await lease.end()
+    assert [value["ended"] for value in trial.values()] == [later.get("ended", False), True, True]
+    assert trial.buckets[0].records["a"].value.get("by") == later.get("by")
 
 
-def test_unanswered_renewals_at_the_end_start_no_session() -> None:
+async def test_unanswered_renewals_at_the_end_start_no_session() -> None:
     """Else the engine might send again, and the kernel's timer would run for a gateway without a session."""
-
-    async def main() -> None:
-        trial = Trial()
-        gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
-        trial.buckets = [*gates]
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        trial.clock.pass_s(1)
-        for bucket in gates:
-            bucket.shut()
-        renewals = [asyncio.create_task(lease.renew_once(path)) for path in range(3)]
-        await asyncio.gather(*(bucket.arrived.wait() for bucket in gates))
-        await lease.end()
-        for bucket in gates:
-            bucket.open()
-        await asyncio.gather(*renewals)
-        assert (lease.until, lease.held) == (0, [None, None, None])
-        assert trial.masterships[0].events == ["extend", "end"]
-
-    asyncio.run(main())
+    trial = Trial()
+    gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
+    trial.buckets = [*gates]
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    trial.clock.pass_s(1)
+    for bucket in gates:
+        bucket.shut()
+    renewals = [asyncio.create_task(lease.renew_once(path)) for path in range(3)]
+    await asyncio.gather(*(bucket.arrived.wait() for bucket in gates))
+    await lease.end()
+    for bucket in gates:
+        bucket.open()
+    await asyncio.gather(*renewals)
+    assert (lease.until, lease.held) == (0, [None, None, None])
+    assert trial.masterships[0].events == ["extend", "end"]
 
 
-def test_a_late_path_of_an_ended_session_is_not_used_by_the_next() -> None:
-    async def main() -> None:
-        trial = Trial()
-        late = GatedBucket("lease_2", answers=True)
-        trial.buckets[2] = late
-        late.is_down = True
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        late.is_down = False
-        late.shut()
-        taking = asyncio.create_task(lease.renew_once(2))
-        await late.arrived.wait()
-        await lease.end()
-        assert await lease.try_to_begin()
-        before = lease.held[2]
-        late.open()
-        await taking
-        assert trial.values()[2]["session"] == 1
-        assert before is None
-        assert lease.held[2] is None
-
-    asyncio.run(main())
+async def test_a_late_path_of_an_ended_session_is_not_used_by_the_next() -> None:
+    trial = Trial()
+    late = GatedBucket("lease_2", answers=True)
+    trial.buckets[2] = late
+    late.is_down = True
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    late.is_down = False
+    late.shut()
+    taking = asyncio.create_task(lease.renew_once(2))
+    await late.arrived.wait()
+    await lease.end()
+    assert await lease.try_to_begin()
+    before = lease.held[2]
+    late.open()
+    await taking
+    assert trial.values()[2]["session"] == 1
+    assert before is None
+    assert lease.held[2] is None
 
 
-def test_a_suspension_between_clock_and_timer_is_survived() -> None:
+async def test_a_suspension_between_clock_and_timer_is_survived() -> None:
     """A timer in the past would kill the process; the engine refuses it."""
 
     class StandingStill(RecordingMastership):
@@ -296,232 +260,191 @@ def test_a_suspension_between_clock_and_timer_is_survived() -> None:
             self.clock.pass_s(3)
             raise ValueError("past")
 
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        lease._mastership = StandingStill(trial.clock)
-        assert await lease.try_to_begin()
-        await renew(lease)
-        assert lease.until == 0
-        assert not lease.is_valid
-
-    asyncio.run(main())
+    trial = Trial()
+    lease = trial.lease()
+    lease._mastership = StandingStill(trial.clock)
+    assert await lease.try_to_begin()
+    await renew(lease)
+    assert lease.until == 0
+    assert not lease.is_valid
 
 
-def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
+async def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     """CLOCK_BOOTTIME starts again when a machine does."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        await lease.end()
-        trial.clock.now = 3 * SECOND
-        after = trial.lease()
-        assert await after.try_to_begin()
-        assert after.session == 2
-        assert [value["session"] for value in trial.values()] == [2, 2, 2]
-
-    asyncio.run(main())
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    await lease.end()
+    trial.clock.now = 3 * SECOND
+    after = trial.lease()
+    assert await after.try_to_begin()
+    assert after.session == 2
+    assert [value["session"] for value in trial.values()] == [2, 2, 2]
 
 
-def test_no_number_of_a_session_is_used_twice_whatever_others_write() -> None:
+async def test_no_number_of_a_session_is_used_twice_whatever_others_write() -> None:
     """Otherwise lines that others consider free could belong to a session that polls them."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        for number in (1, 2, 3):
-            assert await lease.try_to_begin()
-            assert lease.session == number
-            old = trial.values()[0]
-            await lease.end()
-        for bucket in trial.buckets:
-            bucket.store("a", {**old, "session": 1, "ended": True})
+    trial = Trial()
+    lease = trial.lease()
+    for number in (1, 2, 3):
         assert await lease.try_to_begin()
-        assert lease.session == 4
+        assert lease.session == number
+        old = trial.values()[0]
         await lease.end()
-        for bucket in trial.buckets:
-            bucket.store("a", None)  # as a record that is none of ours is read
-        after, newest = trial.lease(), trial.buckets[0].last  # of another process
-        assert not await after.try_to_begin()
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        assert await after.try_to_begin()
-        assert after.session == newest + 1 > 4
+    for bucket in trial.buckets:
+        bucket.store("a", {**old, "session": 1, "ended": True})
+    assert await lease.try_to_begin()
+    assert lease.session == 4
+    await lease.end()
+    for bucket in trial.buckets:
+        bucket.store("a", None)  # as a record that is none of ours is read
+    after, newest = trial.lease(), trial.buckets[0].last  # of another process
+    assert not await after.try_to_begin()
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert await after.try_to_begin()
+    assert after.session == newest + 1 > 4
 
-    asyncio.run(main())
 
-
-def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
-    async def main() -> None:
-        trial = Trial()
-        first, second = trial.lease(), trial.lease()
-        assert await first.try_to_begin()
-        for _ in range(10):
-            trial.clock.pass_s(0.5)
-            await renew(first)
-            assert not await second.try_to_begin()
-        assert "a gateway called a runs on" in second.trouble
-        assert not await second.try_to_begin()
-        trial.clock.pass_s(USUAL.lease / SECOND - 0.01)
-        assert not await second.try_to_begin()
-        trial.clock.pass_s(0.02)
-        assert not first.is_valid
-        assert await second.try_to_begin()
-        assert second.session == 2
+async def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
+    trial = Trial()
+    first, second = trial.lease(), trial.lease()
+    assert await first.try_to_begin()
+    for _ in range(10):
+        trial.clock.pass_s(0.5)
         await renew(first)
-        assert first.is_over
-        assert not first.is_valid
+        assert not await second.try_to_begin()
+    assert "a gateway called a runs on" in second.trouble
+    assert not await second.try_to_begin()
+    trial.clock.pass_s(USUAL.lease / SECOND - 0.01)
+    assert not await second.try_to_begin()
+    trial.clock.pass_s(0.02)
+    assert not first.is_valid
+    assert await second.try_to_begin()
+    assert second.session == 2
+    await renew(first)
+    assert first.is_over
+    assert not first.is_valid
 
-    asyncio.run(main())
 
-
-def test_one_path_that_is_free_is_not_taken() -> None:
+async def test_one_path_that_is_free_is_not_taken() -> None:
     """Else a gateway that waits would take the paths of another one of its name one after the other."""
-
-    async def main() -> None:
-        trial = Trial()
-        first, second = trial.lease(), trial.lease()
-        assert await first.try_to_begin()
-        for _ in range(8):
-            assert not await second.try_to_begin()
-            trial.clock.pass_s(0.5)
-            await first.renew_once(0)
-            await first.renew_once(2)
-        assert [value["nonce"] for value in trial.values()] == [first._nonce] * 3
-        assert first.is_valid
-
-    asyncio.run(main())
+    trial = Trial()
+    first, second = trial.lease(), trial.lease()
+    assert await first.try_to_begin()
+    for _ in range(8):
+        assert not await second.try_to_begin()
+        trial.clock.pass_s(0.5)
+        await first.renew_once(0)
+        await first.renew_once(2)
+    assert [value["nonce"] for value in trial.values()] == [first._nonce] * 3
+    assert first.is_valid
 
 
-def test_two_simultaneous_starts_are_never_both_valid() -> None:
-    async def main() -> None:
-        trial = Trial()
-        first, second = trial.lease(), trial.lease()
-        begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
-        assert sum(begun) == 1
-        assert [first.is_valid, second.is_valid] == begun
-
-    asyncio.run(main())
+async def test_two_simultaneous_starts_are_never_both_valid() -> None:
+    trial = Trial()
+    first, second = trial.lease(), trial.lease()
+    begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
+    assert sum(begun) == 1
+    assert [first.is_valid, second.is_valid] == begun
 
 
-def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() -> None:
+async def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() -> None:
     """The first one's renewal of path 0 comes before the second one's taking of it; path 2 was renewed all
     the time."""
-
-    async def main() -> None:
-        trial = Trial()
-        gate = trial.buckets[0] = GatedBucket("lease_0")
-        first, second = trial.lease(), trial.lease()
-        assert await first.try_to_begin()
-        for _ in range(5):
-            assert not await second.try_to_begin()
-            trial.clock.pass_s(0.5)
-            await first.renew_once(2)
-        assert not first.is_valid
-        gate.shut()
-        beginning = asyncio.create_task(second.try_to_begin())
-        await gate.arrived.wait()
-        await first.renew_once(0)
-        await second.renew_once(2)
-        gate.open()
-        assert not await beginning
-        assert first.is_valid
-        await renew(first)
-        assert first.is_valid
-        assert not second.is_valid
-
-    asyncio.run(main())
+    trial = Trial()
+    gate = trial.buckets[0] = GatedBucket("lease_0")
+    first, second = trial.lease(), trial.lease()
+    assert await first.try_to_begin()
+    for _ in range(5):
+        assert not await second.try_to_begin()
+        trial.clock.pass_s(0.5)
+        await first.renew_once(2)
+    assert not first.is_valid
+    gate.shut()
+    beginning = asyncio.create_task(second.try_to_begin())
+    await gate.arrived.wait()
+    await first.renew_once(0)
+    await second.renew_once(2)
+    gate.open()
+    assert not await beginning
+    assert first.is_valid
+    await renew(first)
+    assert first.is_valid
+    assert not second.is_valid
 
 
-def test_the_lock_file_proves_the_predecessors_death(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_lock_file_proves_the_predecessors_death(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
-
-    async def main() -> None:
-        trial = Trial()
-        lock = LifeLock(tmp_path / "a.lock")
-        assert await trial.lease(lock=lock).try_to_begin()
-        with pytest.raises(FleetError, match="another gateway of this machine uses"):
-            LifeLock(tmp_path / "a.lock")
-        lock.close()  # as the kernel does for a process that is killed
-        with closing(LifeLock(tmp_path / "a.lock")) as lock:
-            again = trial.lease(lock=lock)
-            assert await again.try_to_begin()
-            assert again.session == 2
-
-    asyncio.run(main())
+    trial = Trial()
+    lock = LifeLock(tmp_path / "a.lock")
+    assert await trial.lease(lock=lock).try_to_begin()
+    with pytest.raises(FleetError, match="another gateway of this machine uses"):
+        LifeLock(tmp_path / "a.lock")
+    lock.close()  # as the kernel does for a process that is killed
+    with closing(LifeLock(tmp_path / "a.lock")) as lock:
+        again = trial.lease(lock=lock)
+        assert await again.try_to_begin()
+        assert again.session == 2
 
 
 @pytest.mark.parametrize("machine", ["another machine", ""])
-def test_a_lock_file_of_another_machine_proves_nothing(
+async def test_a_lock_file_of_another_machine_proves_nothing(
     machine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def main() -> None:
-        trial = Trial()
-        monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
-        lock = LifeLock(tmp_path / "a.lock")
-        assert await trial.lease(lock=lock).try_to_begin()
-        lock.close()
-        monkeypatch.setattr(file_lock, "machine_id", lambda: machine)
-        with closing(LifeLock(tmp_path / "a.lock")) as lock:
-            assert not await trial.lease(lock=lock).try_to_begin()
-
-    asyncio.run(main())
+    trial = Trial()
+    monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
+    lock = LifeLock(tmp_path / "a.lock")
+    assert await trial.lease(lock=lock).try_to_begin()
+    lock.close()
+    monkeypatch.setattr(file_lock, "machine_id", lambda: machine)
+    with closing(LifeLock(tmp_path / "a.lock")) as lock:
+        assert not await trial.lease(lock=lock).try_to_begin()
 
 
-def test_another_file_at_the_same_path_proves_nothing(
+async def test_another_file_at_the_same_path_proves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two containers of one machine may both have /var/lib/multidrop/a.lock."""
     monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
-
-    async def main() -> None:
-        trial = Trial()
-        with closing(LifeLock(tmp_path / "a.lock")) as lock:
-            assert await trial.lease(lock=lock).try_to_begin()
-            (tmp_path / "a.lock").unlink()
-            with closing(LifeLock(tmp_path / "a.lock")) as other:
-                assert not await trial.lease(lock=other).try_to_begin()
-
-    asyncio.run(main())
+    trial = Trial()
+    with closing(LifeLock(tmp_path / "a.lock")) as lock:
+        assert await trial.lease(lock=lock).try_to_begin()
+        (tmp_path / "a.lock").unlink()
+        with closing(LifeLock(tmp_path / "a.lock")) as other:
+            assert not await trial.lease(lock=other).try_to_begin()
 
 
-def test_two_machines_without_an_id_prove_nothing_to_each_other(
+async def test_two_machines_without_an_id_prove_nothing_to_each_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def main() -> None:
-        trial = Trial()
-        monkeypatch.setattr(file_lock, "machine_id", lambda: "")
-        lock = LifeLock(tmp_path / "a.lock")
-        assert await trial.lease(lock=lock).try_to_begin()
-        lock.close()
-        with closing(LifeLock(tmp_path / "a.lock")) as lock:
-            assert not await trial.lease(lock=lock).try_to_begin()
-
-    asyncio.run(main())
+    trial = Trial()
+    monkeypatch.setattr(file_lock, "machine_id", lambda: "")
+    lock = LifeLock(tmp_path / "a.lock")
+    assert await trial.lease(lock=lock).try_to_begin()
+    lock.close()
+    with closing(LifeLock(tmp_path / "a.lock")) as lock:
+        assert not await trial.lease(lock=lock).try_to_begin()
 
 
-def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_started_again(
+async def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The machine's id, the path and the lock's own id are copied; the kernel's boot is not."""
-
-    async def main() -> None:
-        trial = Trial()
-        machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
-        machine.write_text("copied\n", "utf-8")
+    trial = Trial()
+    machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
+    machine.write_text("copied\n", "utf-8")
+    boot.write_text("first\n", "utf-8")
+    monkeypatch.setattr(file_lock, "IDS", (machine, boot))
+    lock = LifeLock(tmp_path / "a.lock")
+    assert await trial.lease(lock=lock).try_to_begin()
+    lock.close()
+    boot.write_text("second\n", "utf-8")
+    with closing(LifeLock(tmp_path / "a.lock")) as lock:
+        assert not await trial.lease(lock=lock).try_to_begin()
         boot.write_text("first\n", "utf-8")
-        monkeypatch.setattr(file_lock, "IDS", (machine, boot))
-        lock = LifeLock(tmp_path / "a.lock")
         assert await trial.lease(lock=lock).try_to_begin()
-        lock.close()
-        boot.write_text("second\n", "utf-8")
-        with closing(LifeLock(tmp_path / "a.lock")) as lock:
-            assert not await trial.lease(lock=lock).try_to_begin()
-            boot.write_text("first\n", "utf-8")
-            assert await trial.lease(lock=lock).try_to_begin()
-
-    asyncio.run(main())
 
 
 def test_a_machines_id_has_the_kernels_boot_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -550,200 +473,166 @@ def test_without_one_of_its_ids_a_machine_has_none(
 # ---- those who watch ----
 
 
-def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        trial.clock.pass_s(100)  # the watcher comes late: it cannot know when the record was written
-        await look(observer)
-        assert observer.dead() == {}
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        await look(observer)
-        await observer.end_the_dead()
-        assert observer.is_over("a", 1)
-        assert [value["ended"] for value in trial.values()] == [True, True, True]
-        assert observer.sessions() == {}
-
-    asyncio.run(main())
+async def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    trial.clock.pass_s(100)  # the watcher comes late: it cannot know when the record was written
+    await look(observer)
+    assert observer.dead() == {}
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    await look(observer)
+    await observer.end_the_dead()
+    assert observer.is_over("a", 1)
+    assert [value["ended"] for value in trial.values()] == [True, True, True]
+    assert observer.sessions() == {}
 
 
 @pytest.mark.parametrize("has_rival", [False, True])
-def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bool) -> None:
+async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bool) -> None:
     """Its server may have died with the gateway. Another observer may have ended one of the others."""
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    await look(observer)
+    asked: list[str] = []
 
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        await look(observer)
-        asked: list[str] = []
+    async def give_no_answer(key: str, value: Any, revision: int) -> int:
+        asked.append(key)
+        await asyncio.Event().wait()
+        return 0
 
-        async def give_no_answer(key: str, value: Any, revision: int) -> int:
-            asked.append(key)
-            await asyncio.Event().wait()
-            return 0
-
-        trial.buckets[0].put = give_no_answer  # type: ignore[method-assign]
-        if has_rival:
-            trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "c"})
-        assert await asyncio.wait_for(observer.end_the_dead(), 10)
-        assert asked == ["a"]
-        await look(observer)
-        assert observer.is_over("a", 1)
-
-    asyncio.run(main())
+    trial.buckets[0].put = give_no_answer  # type: ignore[method-assign]
+    if has_rival:
+        trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "c"})
+    assert await asyncio.wait_for(observer.end_the_dead(), 10)
+    assert asked == ["a"]
+    await look(observer)
+    assert observer.is_over("a", 1)
 
 
-def test_only_the_judged_revision_is_ended() -> None:
+async def test_only_the_judged_revision_is_ended() -> None:
     """A record that is renewed between the judgement and its end stays, even if it was read again."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        await look(observer)
-        judged = observer.dead()["a"]
-        await renew(lease)  # the network heals just now
-        await look(observer)
-        assert lease.is_valid
-        for path, record in judged.items():
-            assert not await observer._end(path, record)
-        await observer.end_the_dead()
-        assert not observer.is_over("a", 1)
-        await renew(lease)
-        assert not lease.is_over
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    await look(observer)
+    judged = observer.dead()["a"]
+    await renew(lease)  # the network heals just now
+    await look(observer)
+    assert lease.is_valid
+    for path, record in judged.items():
+        assert not await observer._end(path, record)
+    await observer.end_the_dead()
+    assert not observer.is_over("a", 1)
+    await renew(lease)
+    assert not lease.is_over
 
 
-def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
+async def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
     """Some records are read while others are asked for; a gateway may be judged in between."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        await look(observer)
-        assert [*observer.dead()] == ["a"]
-        await renew(lease)
-        for path in range(2):
-            observer.paths[path].take(trial.buckets[path].records["a"])
-        assert not observer.dead()
-        assert not await observer.end_the_dead()
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    await look(observer)
+    assert [*observer.dead()] == ["a"]
+    await renew(lease)
+    for path in range(2):
+        observer.paths[path].take(trial.buckets[path].records["a"])
+    assert not observer.dead()
+    assert not await observer.end_the_dead()
 
 
-def test_no_gateway_ends_itself() -> None:
+async def test_no_gateway_ends_itself() -> None:
     """Such an end would count for all others at once."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease("b"), trial.observer("b")
-        assert await lease.try_to_begin()
-        await look(observer)
-        trial.clock.pass_s(2 * USUAL.lease / SECOND)
-        await look(observer)
-        assert not await observer.end_the_dead()
-        assert not any(value["ended"] for value in trial.values("b"))
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer = trial.lease("b"), trial.observer("b")
+    assert await lease.try_to_begin()
+    await look(observer)
+    trial.clock.pass_s(2 * USUAL.lease / SECOND)
+    await look(observer)
+    assert not await observer.end_the_dead()
+    assert not any(value["ended"] for value in trial.values("b"))
 
 
-def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
+async def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
     """Else all gateways would end each other when servers that were away come back."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        trial.clock.pass_s(60)
-        observer.begin_anew()
-        await look(observer)
-        await observer.end_the_dead()
-        assert not observer.is_over("a", 1)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        await look(observer)
-        await observer.end_the_dead()
-        assert observer.is_over("a", 1)
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    trial.clock.pass_s(60)
+    observer.begin_anew()
+    await look(observer)
+    await observer.end_the_dead()
+    assert not observer.is_over("a", 1)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    await look(observer)
+    await observer.end_the_dead()
+    assert observer.is_over("a", 1)
 
 
-def test_an_ended_session_stays_ended_after_a_cut() -> None:
+async def test_an_ended_session_stays_ended_after_a_cut() -> None:
     """Else it counts a dead gateway among the living for a while, and gives lines away to it."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        await look(observer)
-        assert await observer.end_the_dead()
-        await observer.end_the_dead()
-        trial.clock.pass_s(60)
-        observer.begin_anew()
-        await look(observer)
-        assert observer.is_over("a", 1)
-        assert observer.sessions() == {}
-        second = trial.lease()
-        assert not await second.try_to_begin()  # others wrote the end, and it did not see for how long
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        assert await second.try_to_begin()
-        await look(observer)
-        assert not observer.is_over("a", second.session)
-        assert observer.sessions().keys() == {"a"}
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    await look(observer)
+    assert await observer.end_the_dead()
+    await observer.end_the_dead()
+    trial.clock.pass_s(60)
+    observer.begin_anew()
+    await look(observer)
+    assert observer.is_over("a", 1)
+    assert observer.sessions() == {}
+    second = trial.lease()
+    assert not await second.try_to_begin()  # others wrote the end, and it did not see for how long
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert await second.try_to_begin()
+    await look(observer)
+    assert not observer.is_over("a", second.session)
+    assert observer.sessions().keys() == {"a"}
 
 
-def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
+async def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
     """Its last renewal may have been a moment ago."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        await observer.end_the_dead()
-        trial.clock.pass_s(60)
-        for bucket in trial.buckets:
-            bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
-        await look(observer)  # its last renewal that was seen is long past
-        observer.begin_anew()
-        await observer.end_the_dead()
-        assert not observer.is_over("a", 1)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        assert observer.is_over("a", 1)
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    await observer.end_the_dead()
+    trial.clock.pass_s(60)
+    for bucket in trial.buckets:
+        bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
+    await look(observer)  # its last renewal that was seen is long past
+    observer.begin_anew()
+    await observer.end_the_dead()
+    assert not observer.is_over("a", 1)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert observer.is_over("a", 1)
 
 
-def test_a_read_reports_sessions_that_ended_or_may_be_ended() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        assert [await observer.look(path) for path in range(3)] == [False, False, False]
-        await renew(lease)
-        assert [await observer.look(path) for path in range(3)] == [False, False, False]
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two are enough
-        await observer.end_the_dead()
-        assert [await observer.look(path) for path in range(3)] == [False, False, False]
-        other = trial.observer("c")
-        assert [await other.look(path) for path in range(3)] == [True, True, True]
-
-    asyncio.run(main())
+async def test_a_read_reports_sessions_that_ended_or_may_be_ended() -> None:
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    assert [await observer.look(path) for path in range(3)] == [False, False, False]
+    await renew(lease)
+    assert [await observer.look(path) for path in range(3)] == [False, False, False]
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two are enough
+    await observer.end_the_dead()
+    assert [await observer.look(path) for path in range(3)] == [False, False, False]
+    other = trial.observer("c")
+    assert [await other.look(path) for path in range(3)] == [True, True, True]
 
 
 @table(("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)])
@@ -763,202 +652,165 @@ def test_a_possibly_dead_gateway_is_read_at_once(since_s: float, rests_s: float)
     run_controlled(main())
 
 
-def test_without_answers_no_gateway_is_judged() -> None:
+async def test_without_answers_no_gateway_is_judged() -> None:
     """The server that it reads from may be suspended while others renew the leases."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        for bucket in trial.buckets:
-            bucket.is_down = True
-        for _ in range(60):
-            trial.clock.pass_s(0.1)
-            for path in range(3):
-                with pytest.raises(Unsure):
-                    await observer.look(path)
-            assert observer.dead() == {}
-        for bucket in trial.buckets:
-            bucket.is_down = False
-        await observer.look(0)
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    for bucket in trial.buckets:
+        bucket.is_down = True
+    for _ in range(60):
+        trial.clock.pass_s(0.1)
+        for path in range(3):
+            with pytest.raises(Unsure):
+                await observer.look(path)
         assert observer.dead() == {}
-        await observer.look(1)
-        assert observer.dead().keys() == {"a"}
+    for bucket in trial.buckets:
+        bucket.is_down = False
+    await observer.look(0)
+    assert observer.dead() == {}
+    await observer.look(1)
+    assert observer.dead().keys() == {"a"}
 
-    asyncio.run(main())
 
-
-def test_an_end_by_another_counts_when_the_lease_must_have_run_out() -> None:
+async def test_an_end_by_another_counts_when_the_lease_must_have_run_out() -> None:
     """Its writer may be hasty, wrong, or worse: until then the ended one may still send."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
-        assert await lease.try_to_begin()
-        await look(observer)
-        for bucket in trial.buckets:
-            bucket.store("a", {**bucket.records["a"].value, "session": 9, "ended": True, "by": "rogue"})
-        trial.clock.pass_s(1.0)
-        await look(observer)
-        await look(late)
-        assert lease.is_valid
-        assert not observer.is_over("a", 1)
-        assert not observer.is_over("a", 9)
-        trial.clock.pass_s(USUAL.lease / SECOND - 1.0)  # since the observer saw the last renewal
-        assert observer.is_over("a", 1)
-        assert observer.sessions() == {}
-        assert not late.is_over("a", 1)
-        trial.clock.pass_s(1.0)
-        assert late.is_over("a", 1)
-
-    asyncio.run(main())
+    trial = Trial()
+    lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
+    assert await lease.try_to_begin()
+    await look(observer)
+    for bucket in trial.buckets:
+        bucket.store("a", {**bucket.records["a"].value, "session": 9, "ended": True, "by": "rogue"})
+    trial.clock.pass_s(1.0)
+    await look(observer)
+    await look(late)
+    assert lease.is_valid
+    assert not observer.is_over("a", 1)
+    assert not observer.is_over("a", 9)
+    trial.clock.pass_s(USUAL.lease / SECOND - 1.0)  # since the observer saw the last renewal
+    assert observer.is_over("a", 1)
+    assert observer.sessions() == {}
+    assert not late.is_over("a", 1)
+    trial.clock.pass_s(1.0)
+    assert late.is_over("a", 1)
 
 
-def test_an_end_of_ones_own_session_counts_at_once() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        await look(observer)
-        await lease.end()
-        await look(observer)
-        assert observer.is_over("a", 1)
-        assert await trial.lease().try_to_begin()
-
-    asyncio.run(main())
+async def test_an_end_of_ones_own_session_counts_at_once() -> None:
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    await lease.end()
+    await look(observer)
+    assert observer.is_over("a", 1)
+    assert await trial.lease().try_to_begin()
 
 
-def test_a_gateway_of_this_name_waits_where_another_one_wrote_the_end() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease, second = trial.lease(), trial.lease()
-        assert await lease.try_to_begin()
-        for bucket in trial.buckets:
-            bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
-        assert not await second.try_to_begin()
-        assert lease.is_valid
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        assert await second.try_to_begin()
-
-    asyncio.run(main())
+async def test_a_gateway_of_this_name_waits_where_another_one_wrote_the_end() -> None:
+    trial = Trial()
+    lease, second = trial.lease(), trial.lease()
+    assert await lease.try_to_begin()
+    for bucket in trial.buckets:
+        bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
+    assert not await second.try_to_begin()
+    assert lease.is_valid
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert await second.try_to_begin()
 
 
-def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
+async def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
     """Its path would stay ended for as long as it lives."""
-
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
-        for _ in range(20):
-            await look(observer)
-            trial.clock.pass_s(0.5)
-            await lease.renew_once(0)
-            await lease.renew_once(2)
-            await look(observer)
-            assert observer.dead() == {}
-
-    asyncio.run(main())
-
-
-def test_an_ended_path_stays_ended_for_this_session() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        value = trial.values()[1]
-        trial.buckets[1].store("a", {**value, "ended": True})
-        for _ in range(3):
-            await renew(lease)
-        assert lease.held[1] is None
-        assert trial.values()[1]["ended"]
-        assert lease.is_valid
-
-    asyncio.run(main())
-
-
-def test_a_session_that_lost_a_path_is_weak_until_a_whole_one_follows() -> None:
-    async def main() -> None:
-        trial = Trial()
-        lease, observer = trial.lease(), trial.observer()
-        assert await lease.try_to_begin()
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    for _ in range(20):
         await look(observer)
-        assert (lease.is_weak, observer.weak()) == (False, [])
-        trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
-        await renew(lease)
+        trial.clock.pass_s(0.5)
+        await lease.renew_once(0)
+        await lease.renew_once(2)
         await look(observer)
-        assert lease.is_valid
-        assert (lease.is_weak, observer.weak()) == (True, ["a"])
-        trial.buckets[1].is_down = True
-        assert not await lease.could_be_whole()
-        trial.buckets[1].is_down = False
-        assert await lease.could_be_whole()
-        await lease.end()
-        assert await lease.try_to_begin()
+        assert observer.dead() == {}
+
+
+async def test_an_ended_path_stays_ended_for_this_session() -> None:
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    value = trial.values()[1]
+    trial.buckets[1].store("a", {**value, "ended": True})
+    for _ in range(3):
         await renew(lease)
-        await look(observer)
-        assert lease.session == 2
-        assert None not in lease.held
-        assert (lease.is_weak, observer.weak()) == (False, [])
-
-    asyncio.run(main())
+    assert lease.held[1] is None
+    assert trial.values()[1]["ended"]
+    assert lease.is_valid
 
 
-def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
-    async def main() -> None:
-        trial = Trial()
-        trial.buckets[2].is_down = True
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        assert lease.held[2] is None
-        trial.buckets[2].is_down = False
-        await renew(lease)
-        assert lease.held[2] is not None
+async def test_a_session_that_lost_a_path_is_weak_until_a_whole_one_follows() -> None:
+    trial = Trial()
+    lease, observer = trial.lease(), trial.observer()
+    assert await lease.try_to_begin()
+    await look(observer)
+    assert (lease.is_weak, observer.weak()) == (False, [])
+    trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
+    await renew(lease)
+    await look(observer)
+    assert lease.is_valid
+    assert (lease.is_weak, observer.weak()) == (True, ["a"])
+    trial.buckets[1].is_down = True
+    assert not await lease.could_be_whole()
+    trial.buckets[1].is_down = False
+    assert await lease.could_be_whole()
+    await lease.end()
+    assert await lease.try_to_begin()
+    await renew(lease)
+    await look(observer)
+    assert lease.session == 2
+    assert None not in lease.held
+    assert (lease.is_weak, observer.weak()) == (False, [])
 
-    asyncio.run(main())
+
+async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
+    trial = Trial()
+    trial.buckets[2].is_down = True
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    assert lease.held[2] is None
+    trial.buckets[2].is_down = False
+    await renew(lease)
+    assert lease.held[2] is not None
 
 
-def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
+async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
     """A gateway of this name that died while it started has left it; two paths are ours, so it is over."""
-
-    async def main() -> None:
-        trial = Trial()
-        trial.buckets[2].is_down = True
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        trial.buckets[2].is_down = False
-        trial.buckets[2].store("a", {**trial.buckets[0].records["a"].value, "nonce": "of another"})
-        await renew(lease)
-        assert lease.held[2] is not None
-        assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
-
-    asyncio.run(main())
+    trial = Trial()
+    trial.buckets[2].is_down = True
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    trial.buckets[2].is_down = False
+    trial.buckets[2].store("a", {**trial.buckets[0].records["a"].value, "nonce": "of another"})
+    await renew(lease)
+    assert lease.held[2] is not None
+    assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-def test_a_path_that_was_ended_before_its_taking_was_known_makes_a_session_weak() -> None:
-    async def main() -> None:
-        trial = Trial()
-        trial.buckets[2].loses_answers = True
-        lease = trial.lease()
-        assert await lease.try_to_begin()
-        assert lease.held[2] is None
-        trial.buckets[2].loses_answers = False
-        trial.buckets[2].store("a", {**trial.values()[2], "ended": True, "by": "b"})
-        assert not lease.is_weak
-        await renew(lease)
-        assert lease.held[2] is None
-        assert lease.is_weak
-
-    asyncio.run(main())
+async def test_a_path_that_was_ended_before_its_taking_was_known_makes_a_session_weak() -> None:
+    trial = Trial()
+    trial.buckets[2].loses_answers = True
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    assert lease.held[2] is None
+    trial.buckets[2].loses_answers = False
+    trial.buckets[2].store("a", {**trial.values()[2], "ended": True, "by": "b"})
+    assert not lease.is_weak
+    await renew(lease)
+    assert lease.held[2] is None
+    assert lease.is_weak
 
 
-def test_without_two_paths_no_session_starts() -> None:
-    async def main() -> None:
-        trial = Trial()
-        trial.buckets[1].is_down = trial.buckets[2].is_down = True
-        lease = trial.lease()
-        assert not await lease.try_to_begin()
-        assert lease.trouble == "1 of 3 lease records can be read, 2 are needed"
-
-    asyncio.run(main())
+async def test_without_two_paths_no_session_starts() -> None:
+    trial = Trial()
+    trial.buckets[1].is_down = trial.buckets[2].is_down = True
+    lease = trial.lease()
+    assert not await lease.try_to_begin()
+    assert lease.trouble == "1 of 3 lease records can be read, 2 are needed"

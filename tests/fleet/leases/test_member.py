@@ -169,22 +169,19 @@ async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> As
             await path.close()
 
 
-def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluster) -> None:
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", "c") as running:
-            await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
-            dead = running.members["b"]
-            assert dead.polled
-            begun, left_s = time.monotonic(), dead.lease.left_s
-            await running.die("b")
-            await until(running.all_are_polled, "takeover")
-            assert time.monotonic() - begun > left_s
-            again = await running.join("b")
-            assert not again.polled
-            await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
-            assert again.lease.session >= 2  # more if the machine was suspended
-
-    asyncio.run(main())
+async def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluster) -> None:
+    async with gateways(fleet, "a", "b", "c") as running:
+        await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
+        dead = running.members["b"]
+        assert dead.polled
+        begun, left_s = time.monotonic(), dead.lease.left_s
+        await running.die("b")
+        await until(running.all_are_polled, "takeover")
+        assert time.monotonic() - begun > left_s
+        again = await running.join("b")
+        assert not again.polled
+        await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
+        assert again.lease.session >= 2  # more if the machine was suspended
 
 
 class Ports:
@@ -205,7 +202,7 @@ class Ports:
         await self._take(line, description)
 
 
-def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
+async def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is cut off from its lines, and not from the servers; its lease stays valid."""
@@ -216,41 +213,34 @@ def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
     ):  # a failed trial takes up to 2 s
         monkeypatch.setattr(unopened_lines, wait, 3 * SECOND)
     monkeypatch.setattr(line_keeper, "TAKE_AGAIN_S", 0.1)
-
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
-            await until(running.are_shared, "shares")
-            ports = {name: Ports(member) for name, member in running.members.items()}
-            a, b, c = (running.members[name] for name in "abc")  # they joined in any order
-            ports["a"].is_cut = True
-            await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
-            assert a.lease.is_valid
-            ports["b"].is_cut = True
-            await until(lambda: len(c.polled) == len(LINES), "c has all")
-            ports["c"].is_cut = True
-            await until(lambda: len(c.keeper.lost) > 1, "nobody polls")
-            ports["b"].is_cut = False
-            await until(lambda: len(b.polled) == len(LINES) and not b.keeper.lost, "b has all")
-            for one in ports.values():
-                one.is_cut = False
-            await until(running.are_shared, "all are home")
-            assert not any(member.keeper.lost for member in (a, b, c))
-
-    asyncio.run(main())
+    async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
+        await until(running.are_shared, "shares")
+        ports = {name: Ports(member) for name, member in running.members.items()}
+        a, b, c = (running.members[name] for name in "abc")  # they joined in any order
+        ports["a"].is_cut = True
+        await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
+        assert a.lease.is_valid
+        ports["b"].is_cut = True
+        await until(lambda: len(c.polled) == len(LINES), "c has all")
+        ports["c"].is_cut = True
+        await until(lambda: len(c.keeper.lost) > 1, "nobody polls")
+        ports["b"].is_cut = False
+        await until(lambda: len(b.polled) == len(LINES) and not b.keeper.lost, "b has all")
+        for one in ports.values():
+            one.is_cut = False
+        await until(running.are_shared, "all are home")
+        assert not any(member.keeper.lost for member in (a, b, c))
 
 
-def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None:
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
-            drained = running.members["c"]
-            drained.drain()
-            await until(lambda: not drained.polled and running.all_are_polled(), "drain")
-            assert drained.state is MemberState.DRAINING
-            assert drained.lease.is_valid
-            await asyncio.sleep(0.5)
-            assert not drained.polled
-
-    asyncio.run(main())
+async def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None:
+    async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
+        drained = running.members["c"]
+        drained.drain()
+        await until(lambda: not drained.polled and running.all_are_polled(), "drain")
+        assert drained.state is MemberState.DRAINING
+        assert drained.lease.is_valid
+        await asyncio.sleep(0.5)
+        assert not drained.polled
 
 
 def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
@@ -276,107 +266,91 @@ def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
     asyncio.run(main())
 
 
-def test_an_orderly_end_is_not_waited_for(fleet: Cluster) -> None:
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", terms=LONG) as running:
-            await running.leave("a")
-            await until(running.all_are_polled, "leave")
-
-    asyncio.run(main())
+async def test_an_orderly_end_is_not_waited_for(fleet: Cluster) -> None:
+    async with gateways(fleet, "a", "b", terms=LONG) as running:
+        await running.leave("a")
+        await until(running.all_are_polled, "leave")
 
 
-def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
-    async def main() -> None:
-        async with gateways(fleet, "a", terms=LONG) as running:
-            lines, member = running.hall.gateways[0], running.members["a"]
-            bucket = Bucket(names.PLANT, member.best)
-            records = {line: {"line": {"name": line}, "files": {}} for line in LINES}
-            records["line-1"] = {"line": {"name": "line-1", "port": "another"}, "files": {}}
-            del records["line-2"]
-            records["line-new"] = {"line": {"name": "line-new"}, "files": {}}
-            before = dict(member.polled)
-            told = await store(bucket, records)
-            assert told == {"new": 1, "changed": 1, "removed": 1, "kept": 28}
-            await until(lambda: lines.taken == set(records), "the lines of the other plant")
-            await until(lambda: member.polled["line-1"] != before["line-1"], "the changed line")
-            assert all(
-                member.polled[line] == before[line] for line in LINES if line not in ("line-1", "line-2")
-            )
-            owned = [name for one in member.records.owners.values() for name, record in one.records.items()]
-            assert "line-new" in owned
-            del records["line-new"]
-            await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
-            await until(running.all_are_polled, "the plant as before")
-
-    asyncio.run(main())
+async def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
+    async with gateways(fleet, "a", terms=LONG) as running:
+        lines, member = running.hall.gateways[0], running.members["a"]
+        bucket = Bucket(names.PLANT, member.best)
+        records = {line: {"line": {"name": line}, "files": {}} for line in LINES}
+        records["line-1"] = {"line": {"name": "line-1", "port": "another"}, "files": {}}
+        del records["line-2"]
+        records["line-new"] = {"line": {"name": "line-new"}, "files": {}}
+        before = dict(member.polled)
+        told = await store(bucket, records)
+        assert told == {"new": 1, "changed": 1, "removed": 1, "kept": 28}
+        await until(lambda: lines.taken == set(records), "the lines of the other plant")
+        await until(lambda: member.polled["line-1"] != before["line-1"], "the changed line")
+        assert all(member.polled[line] == before[line] for line in LINES if line not in ("line-1", "line-2"))
+        owned = [name for one in member.records.owners.values() for name, record in one.records.items()]
+        assert "line-new" in owned
+        del records["line-new"]
+        await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
+        await until(running.all_are_polled, "the plant as before")
 
 
-def test_beside_gateways_with_other_rules_no_line_is_taken(
+async def test_beside_gateways_with_other_rules_no_line_is_taken(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither at a gateway's start, nor when an incompatible one joins."""
-
-    async def main() -> None:
-        async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
-            await other.begin()
-            member = await running.join("a")
-            await until(lambda: "until other is stopped" in member.trouble, "a word about it")
-            await until(lambda: member.records.is_complete, "all records")
-            await asyncio.sleep(0.5)
-            assert member.lease.session == 0
-            await other.end()
-            await until(running.all_are_polled, "start")
-            await other.begin()
-            await until(lambda: "until other is stopped" in member.trouble, "a word about it")
-            bucket = Bucket(names.PLANT, member.best)
-            more = [*LINES, "line-new"]
-            await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in more})
-            await until(lambda: "line-new" in member.wanted, "its share")
-            await asyncio.sleep(0.5)
-            assert running.all_are_polled()
-            await other.end()
-            await until(lambda: "line-new" in member.polled, "the new line")
-
-    asyncio.run(main())
+    async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
+        await other.begin()
+        member = await running.join("a")
+        await until(lambda: "until other is stopped" in member.trouble, "a word about it")
+        await until(lambda: member.records.is_complete, "all records")
+        await asyncio.sleep(0.5)
+        assert member.lease.session == 0
+        await other.end()
+        await until(running.all_are_polled, "start")
+        await other.begin()
+        await until(lambda: "until other is stopped" in member.trouble, "a word about it")
+        bucket = Bucket(names.PLANT, member.best)
+        more = [*LINES, "line-new"]
+        await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in more})
+        await until(lambda: "line-new" in member.wanted, "its share")
+        await asyncio.sleep(0.5)
+        assert running.all_are_polled()
+        await other.end()
+        await until(lambda: "line-new" in member.polled, "the new line")
 
 
 @pytest.mark.long
-def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
+async def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
     """Two of three paths are renewed as before while the third waits for another leader: 4 to 9 s."""
+    async with gateways(fleet, "a", "b", terms=LONG) as running:
+        member = running.members["a"]
+        await until(running.are_shared, "shares")
+        await until_leaders_are_home(fleet)
+        before, moves = dict(member.polled), member.keeper.moves
+        leases = [one.lease for one in running.members.values()]
+        node = fleet.nodes[1]
+        [dead] = [at for at, bucket in enumerate(names.LEASES) if f"KV_{bucket}" in node.leads()]
+        node.kill()
+        killed = boottime_ns()
+        renewals: dict[tuple[Lease, int], set[int]] = {
+            (lease, path): set() for lease in leases for path in range(len(names.LEASES))
+        }
 
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", terms=LONG) as running:
-            member = running.members["a"]
-            await until(running.are_shared, "shares")
-            await until_leaders_are_home(fleet)
-            before, moves = dict(member.polled), member.keeper.moves
-            leases = [one.lease for one in running.members.values()]
-            node = fleet.nodes[1]
-            [dead] = [at for at, bucket in enumerate(names.LEASES) if f"KV_{bucket}" in node.leads()]
-            node.kill()
-            killed = boottime_ns()
-            renewals: dict[tuple[Lease, int], set[int]] = {
-                (lease, path): set() for lease in leases for path in range(len(names.LEASES))
-            }
+        def is_led_again() -> bool:
+            for lease, path in renewals:
+                held = lease.held[path]
+                if held and held.sent > killed:
+                    renewals[lease, path].add(held.sent)
+            return all(renewals[lease, dead] for lease in leases)
 
-            def is_led_again() -> bool:
-                for lease, path in renewals:
-                    held = lease.held[path]
-                    if held and held.sent > killed:
-                        renewals[lease, path].add(held.sent)
-                return all(renewals[lease, dead] for lease in leases)
-
-            await until(is_led_again, "another leader")
-            assert all(len(sent) > 2 for (_, path), sent in renewals.items() if path != dead)
-            assert (member.polled, member.keeper.moves) == (before, moves)
-            fleet.nodes[1].start()
-            await asyncio.to_thread(fleet.wait)
-            await until(lambda: all(path.url == path.urls[0] for path in member.paths), "home again")
-
-    asyncio.run(main())
+        await until(is_led_again, "another leader")
+        assert all(len(sent) > 2 for (_, path), sent in renewals.items() if path != dead)
+        assert (member.polled, member.keeper.moves) == (before, moves)
+        fleet.nodes[1].start()
+        await asyncio.to_thread(fleet.wait)
+        await until(lambda: all(path.url == path.urls[0] for path in member.paths), "home again")
 
 
-def test_weak_sessions_are_given_up_one_after_another(
+async def test_weak_sessions_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it would fall silent with the next server that dies."""
@@ -390,46 +364,37 @@ def test_weak_sessions_are_given_up_one_after_another(
                 await other.put(member.name, {**record.value, "ended": True}, record.revision)
             await member.lease.renew_once(1)
 
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", terms=LONG) as running:
-            members = running.members
-            for member in members.values():
-                await lose_a_path(member)
-                assert "a new lease starts soon" in member.trouble
-            monkeypatch.setattr(member_module, "WEAK_NS", 0)
-            began = {name: member.lease.session for name, member in members.items()}
-            await until(lambda: members["a"].lease.session > began["a"], "a's new session")
-            assert members["b"].lease.session == began["b"]
-            await until(lambda: members["b"].lease.session > began["b"], "b's new session")
-            await until(lambda: all(None not in one.lease.held for one in members.values()), "all paths")
-            assert [member.trouble for member in members.values()] == ["", ""]
-            await until(running.are_shared, "shares")
-            assert running.hall.overlaps == []
-
-    asyncio.run(main())
+    async with gateways(fleet, "a", "b", terms=LONG) as running:
+        members = running.members
+        for member in members.values():
+            await lose_a_path(member)
+            assert "a new lease starts soon" in member.trouble
+        monkeypatch.setattr(member_module, "WEAK_NS", 0)
+        began = {name: member.lease.session for name, member in members.items()}
+        await until(lambda: members["a"].lease.session > began["a"], "a's new session")
+        assert members["b"].lease.session == began["b"]
+        await until(lambda: members["b"].lease.session > began["b"], "b's new session")
+        await until(lambda: all(None not in one.lease.held for one in members.values()), "all paths")
+        assert [member.trouble for member in members.values()] == ["", ""]
+        await until(running.are_shared, "shares")
+        assert running.hall.overlaps == []
 
 
-def test_without_servers_all_lines_are_silent_and_no_gateway_is_killed(
+async def test_without_servers_all_lines_are_silent_and_no_gateway_is_killed(
     fleet: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The timer is cancelled after the lines were closed, and never set to the past."""
-
-    async def main() -> None:
-        async with gateways(fleet, "a", "b") as running:
-            await until(running.are_shared, "shares")  # or one has never had a lease, and no timer
-            with fleet.paused():
-                await until(lambda: not any(running.taken().values()), "silence")
-                masterships = [lines.mastership for lines in running.hall.gateways]
-                await until(lambda: all(one.ends > 0 for one in masterships), "the timer")
-                assert [one.events[-1] for one in masterships] == ["end", "end"]
-                members = running.members.values()
-                await until(lambda: not any(member.lease.is_valid for member in members), "the leases' end")
-                assert {member.state for member in members} == {MemberState.NO_LEASE}
-            await until(running.all_are_polled, "they come back")
-            await until(lambda: {member.state for member in members} == {MemberState.WORKING}, "work")
-            for name in ("a", "b"):
-                await until(
-                    lambda name=name: f"{name}: the lease is valid again" in caplog.messages, "a word"
-                )
-
-    asyncio.run(main())
+    async with gateways(fleet, "a", "b") as running:
+        await until(running.are_shared, "shares")  # or one has never had a lease, and no timer
+        with fleet.paused():
+            await until(lambda: not any(running.taken().values()), "silence")
+            masterships = [lines.mastership for lines in running.hall.gateways]
+            await until(lambda: all(one.ends > 0 for one in masterships), "the timer")
+            assert [one.events[-1] for one in masterships] == ["end", "end"]
+            members = running.members.values()
+            await until(lambda: not any(member.lease.is_valid for member in members), "the leases' end")
+            assert {member.state for member in members} == {MemberState.NO_LEASE}
+        await until(running.all_are_polled, "they come back")
+        await until(lambda: {member.state for member in members} == {MemberState.WORKING}, "work")
+        for name in ("a", "b"):
+            await until(lambda name=name: f"{name}: the lease is valid again" in caplog.messages, "a word")

@@ -123,156 +123,130 @@ class DeadTrial(Trial):
         await asyncio.wait_for(self.is_polled(), 10)
 
 
-def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        assert trial.lines.taken == {"hall"}
+async def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
+    trial = Trial()
+    await trial.claim()
+    assert trial.lines.taken == {"hall"}
 
-        def may() -> tuple[bool, bool]:
-            return trial.keeper.may_stop("hall"), trial.keeper.may_command("hall")
+    def may() -> tuple[bool, bool]:
+        return trial.keeper.may_stop("hall"), trial.keeper.may_command("hall")
 
-        assert may() == (True, False)
-        trial.clock.pass_s(USUAL.guard / SECOND - 0.001)
-        assert may() == (True, False)
-        trial.clock.pass_s(0.001)
-        assert may() == (True, True)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        assert may() == (False, False)
-
-    asyncio.run(main())
+    assert may() == (True, False)
+    trial.clock.pass_s(USUAL.guard / SECOND - 0.001)
+    assert may() == (True, False)
+    trial.clock.pass_s(0.001)
+    assert may() == (True, True)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert may() == (False, False)
 
 
-def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands() -> None:
+async def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands() -> None:
     """It is about to be let go, and its new master answers."""
-
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        trial.clock.pass_s(1)
-        assert trial.keeper.may_command("hall")
-        trial.is_taken_by_another(0)
-        assert "hall" in trial.keeper.polled
-        assert not trial.keeper.may_stop("hall")
-        assert not trial.keeper.may_command("hall")
-
-    asyncio.run(main())
+    trial = Trial()
+    await trial.claim()
+    trial.clock.pass_s(1)
+    assert trial.keeper.may_command("hall")
+    trial.is_taken_by_another(0)
+    assert "hall" in trial.keeper.polled
+    assert not trial.keeper.may_stop("hall")
+    assert not trial.keeper.may_command("hall")
 
 
-def test_lines_are_released_while_there_is_time_to_close_them() -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
-        trial.keeper.reconcile()
-        assert trial.keeper.polled
-        assert not trial.keeper._at_work
-        trial.clock.pass_s(0.001)
-        assert trial.lease.is_valid
-        trial.keeper.reconcile()
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.lines.taken == set()
-
-    asyncio.run(main())
+async def test_lines_are_released_while_there_is_time_to_close_them() -> None:
+    trial = Trial()
+    await trial.claim()
+    trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
+    trial.keeper.reconcile()
+    assert trial.keeper.polled
+    assert not trial.keeper._at_work
+    trial.clock.pass_s(0.001)
+    assert trial.lease.is_valid
+    trial.keeper.reconcile()
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.lines.taken == set()
 
 
-def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() -> None:
-    async def main() -> None:
-        trial = Trial()
-        bucket = trial.buckets[0]
-        writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
-        openings = trial.keeper._openings = asyncio.Semaphore(0)
-        await trial.read_and_begin()
-        trial.claim_now()
-        await asyncio.sleep(0)
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        writing.release()
-        await until(lambda: trial.keeper.is_silent)
-        assert bucket.records == {}
-        for path in range(3):
-            await trial.lease.renew_once(path)
-        trial.claim_now()
-        await until(lambda: bool(trial.records.owner("hall")))
-        trial.clock.pass_s(USUAL.lease / SECOND)
-        openings.release()
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.lines.taken == set()
-
-    asyncio.run(main())
+async def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() -> None:
+    trial = Trial()
+    bucket = trial.buckets[0]
+    writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
+    openings = trial.keeper._openings = asyncio.Semaphore(0)
+    await trial.read_and_begin()
+    trial.claim_now()
+    await asyncio.sleep(0)
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    writing.release()
+    await until(lambda: trial.keeper.is_silent)
+    assert bucket.records == {}
+    for path in range(3):
+        await trial.lease.renew_once(path)
+    trial.claim_now()
+    await until(lambda: bool(trial.records.owner("hall")))
+    trial.clock.pass_s(USUAL.lease / SECOND)
+    openings.release()
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.lines.taken == set()
 
 
-def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
-    async def main() -> None:
-        trial = Trial()
-        openings = trial.keeper._openings = asyncio.Semaphore(0)
-        await trial.read_and_begin()
-        trial.claim_now()
-        await until(lambda: bool(trial.records.owner("hall")))
-        trial.is_taken_by_another(0)
-        openings.release()
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.lines.taken == set()
-
-    asyncio.run(main())
+async def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
+    trial = Trial()
+    openings = trial.keeper._openings = asyncio.Semaphore(0)
+    await trial.read_and_begin()
+    trial.claim_now()
+    await until(lambda: bool(trial.records.owner("hall")))
+    trial.is_taken_by_another(0)
+    openings.release()
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.lines.taken == set()
 
 
-def test_a_closed_line_takes_no_stops() -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        trial.keeper.releasing = {"hall"}
-        trial.keeper.reconcile()
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.keeper.is_mine("hall")
-        assert not trial.keeper.may_stop("hall")
-
-    asyncio.run(main())
+async def test_a_closed_line_takes_no_stops() -> None:
+    trial = Trial()
+    await trial.claim()
+    trial.keeper.releasing = {"hall"}
+    trial.keeper.reconcile()
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.keeper.is_mine("hall")
+    assert not trial.keeper.may_stop("hall")
 
 
-def test_a_line_is_closed_before_it_is_released() -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        trial.keeper.releasing = {"hall"}
-        trial.keeper.reconcile()
-        assert trial.owner() == ("a", 1)
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.lines.taken == set()
-        assert trial.owner() == ("a", 1)
-        trial.keeper.reconcile()
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.owner() == ("", 0)
-
-    asyncio.run(main())
+async def test_a_line_is_closed_before_it_is_released() -> None:
+    trial = Trial()
+    await trial.claim()
+    trial.keeper.releasing = {"hall"}
+    trial.keeper.reconcile()
+    assert trial.owner() == ("a", 1)
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.lines.taken == set()
+    assert trial.owner() == ("a", 1)
+    trial.keeper.reconcile()
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.owner() == ("", 0)
 
 
-def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
+async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
     """An unanswered write may still be stored later, until a newer record rules that out."""
-
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        bucket = trial.buckets[0]
-        trial.keeper.releasing = {"hall"}
+    trial = Trial()
+    await trial.claim()
+    bucket = trial.buckets[0]
+    trial.keeper.releasing = {"hall"}
+    trial.keeper.reconcile()
+    await until(lambda: trial.keeper.is_silent)
+    for one in trial.buckets:
+        one.is_down = True
+    trial.keeper.reconcile()  # released, without an answer
+    await until(lambda: trial.keeper.is_silent)
+    trial.keeper.releasing = set()  # it is to stay after all
+    for _ in range(3):
         trial.keeper.reconcile()
         await until(lambda: trial.keeper.is_silent)
-        for one in trial.buckets:
-            one.is_down = True
-        trial.keeper.reconcile()  # released, without an answer
-        await until(lambda: trial.keeper.is_silent)
-        trial.keeper.releasing = set()  # it is to stay after all
-        for _ in range(3):
-            trial.keeper.reconcile()
-            await until(lambda: trial.keeper.is_silent)
-            assert trial.lines.taken == set()
-        for one in trial.buckets:
-            one.is_down = False
-        trial.keeper.reconcile()
-        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
-        assert owner_of(bucket.records["hall"]) == ("a", 1)
-        assert bucket.revision("hall") == 2  # the release at revision 1 can no longer be stored
-
-    asyncio.run(main())
+        assert trial.lines.taken == set()
+    for one in trial.buckets:
+        one.is_down = False
+    trial.keeper.reconcile()
+    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    assert owner_of(bucket.records["hall"]) == ("a", 1)
+    assert bucket.revision("hall") == 2  # the release at revision 1 can no longer be stored
 
 
 def owners(trial: Trial) -> list[tuple[str, int]]:
@@ -283,258 +257,208 @@ def owners(trial: Trial) -> list[tuple[str, int]]:
 ME, NOBODY = ("a", 1), ("", 0)
 
 
-def test_a_new_line_is_claimed_by_one_record() -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        assert owners(trial) == [ME, NOBODY, NOBODY]
-        assert trial.keeper.moves == 1
-
-    asyncio.run(main())
+async def test_a_new_line_is_claimed_by_one_record() -> None:
+    trial = Trial()
+    await trial.claim()
+    assert owners(trial) == [ME, NOBODY, NOBODY]
+    assert trial.keeper.moves == 1
 
 
-def test_a_line_of_a_dead_master_is_claimed_by_two() -> None:
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.claim()
-        assert owners(trial) == [ME, ME, NOBODY]
-        assert trial.keeper.moves == 1
-
-    asyncio.run(main())
+async def test_a_line_of_a_dead_master_is_claimed_by_two() -> None:
+    trial = DeadTrial()
+    await trial.claim()
+    assert owners(trial) == [ME, ME, NOBODY]
+    assert trial.keeper.moves == 1
 
 
 @pytest.mark.parametrize("place", [0, 1])
-def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.read_and_begin()
-        trial.buckets[place].is_down = True
-        trial.claim_now()
-        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
-        assert owners(trial)[place] == NOBODY
-        assert owners(trial).count(ME) == 2
-
-    asyncio.run(main())
+async def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
+    trial = DeadTrial()
+    await trial.read_and_begin()
+    trial.buckets[place].is_down = True
+    trial.claim_now()
+    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    assert owners(trial)[place] == NOBODY
+    assert owners(trial).count(ME) == 2
 
 
-def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
-
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.claim_without_the_first()
-        assert owners(trial) == [NOBODY, ME, ME]
-        trial.buckets[0].open()
-        await until(lambda: not trial.keeper._tasks)
-        assert owners(trial) == [ME, ME, ME]
-        assert trial.keeper.moves == 1
-
-    asyncio.run(main())
+    trial = DeadTrial()
+    await trial.claim_without_the_first()
+    assert owners(trial) == [NOBODY, ME, ME]
+    trial.buckets[0].open()
+    await until(lambda: not trial.keeper._tasks)
+    assert owners(trial) == [ME, ME, ME]
+    assert trial.keeper.moves == 1
 
 
-def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Retry at once with newer records: a server that is cut off does not answer for long."""
     monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
-
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.read_and_begin()
-        trial.buckets[1].store("hall", owner_value(("", 0), 2, 0))
-        trial.buckets[0].shut()
-        trial.claim_now()
-        await asyncio.wait_for(trial.is_at_rest(), 10)
-        assert owners(trial) == [NOBODY, NOBODY, NOBODY]
-        assert all(trial.records.owners[bucket.name]._doubted for bucket in trial.buckets[:2])
-        await trial.read()
-        trial.buckets[0].open()
-        trial.claim_now()
-        await asyncio.wait_for(trial.is_polled(), 10)
-        assert owners(trial) == [ME, ME, NOBODY]
-
-    asyncio.run(main())
+    trial = DeadTrial()
+    await trial.read_and_begin()
+    trial.buckets[1].store("hall", owner_value(("", 0), 2, 0))
+    trial.buckets[0].shut()
+    trial.claim_now()
+    await asyncio.wait_for(trial.is_at_rest(), 10)
+    assert owners(trial) == [NOBODY, NOBODY, NOBODY]
+    assert all(trial.records.owners[bucket.name]._doubted for bucket in trial.buckets[:2])
+    await trial.read()
+    trial.buckets[0].open()
+    trial.claim_now()
+    await asyncio.wait_for(trial.is_polled(), 10)
+    assert owners(trial) == [ME, ME, NOBODY]
 
 
-def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.read_and_begin()
-        await trial.let_the_first_lag()
-        trial.claim_now()
-        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
-        assert owners(trial) == [NOBODY, ME, ME]
-
-    asyncio.run(main())
+async def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
+    trial = DeadTrial()
+    await trial.read_and_begin()
+    await trial.let_the_first_lag()
+    trial.claim_now()
+    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    assert owners(trial) == [NOBODY, ME, ME]
 
 
-def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
+async def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
     """Servers that are busy are slow in all buckets."""
-
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.read_and_begin()
-        trial.clock.pass_s(1.5)
-        await trial.lease.renew_once(names.OWNERS.index(trial.buckets[2].name))
-        trial.claim_now()
-        await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
-        assert owners(trial) == [ME, ME, NOBODY]
-
-    asyncio.run(main())
+    trial = DeadTrial()
+    await trial.read_and_begin()
+    trial.clock.pass_s(1.5)
+    await trial.lease.renew_once(names.OWNERS.index(trial.buckets[2].name))
+    trial.claim_now()
+    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    assert owners(trial) == [ME, ME, NOBODY]
 
 
-def test_a_bucket_with_a_lost_home_does_not_delay_claims(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_bucket_with_a_lost_home_does_not_delay_claims(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was the only one left to be written as long as another was not read."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
-
-    async def main() -> None:
-        trial = Trial()
-        await trial.read_and_begin()
-        await trial.let_the_first_lag()
-        trial.buckets[0].shut()
-        trial.claim_now()
-        await asyncio.wait_for(trial.is_at_rest(), 10)
-        trial.buckets[0].open()
-        trial.claim_now()
-        await asyncio.wait_for(trial.is_polled(), 10)
-
-    asyncio.run(main())
+    trial = Trial()
+    await trial.read_and_begin()
+    await trial.let_the_first_lag()
+    trial.buckets[0].shut()
+    trial.claim_now()
+    await asyncio.wait_for(trial.is_at_rest(), 10)
+    trial.buckets[0].open()
+    trial.claim_now()
+    await asyncio.wait_for(trial.is_polled(), 10)
 
 
-def test_where_another_was_first_nothing_more_is_written() -> None:
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.read_and_begin()
-        trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
-        trial.claim_now()
-        await until(lambda: not trial.keeper._tasks)
-        assert owners(trial) == [ME, ("b", 1), NOBODY]
-        assert not trial.keeper.polled
-
-    asyncio.run(main())
+async def test_where_another_was_first_nothing_more_is_written() -> None:
+    trial = DeadTrial()
+    await trial.read_and_begin()
+    trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
+    trial.claim_now()
+    await until(lambda: not trial.keeper._tasks)
+    assert owners(trial) == [ME, ("b", 1), NOBODY]
+    assert not trial.keeper.polled
 
 
-def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would be opened between the two records that give it away, and be another's in the next moment."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
-
-    async def main() -> None:
-        trial = DeadTrial()
-        await trial.claim_without_the_first()
-        trial.keeper.releasing = {"hall"}
+    trial = DeadTrial()
+    await trial.claim_without_the_first()
+    trial.keeper.releasing = {"hall"}
+    trial.keeper.reconcile()
+    await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
+    writers = trial.keeper._owners._writing[trial.buckets[1].name]
+    async with writers, writers:  # all that may write there are at work
         trial.keeper.reconcile()
-        await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
-        writers = trial.keeper._owners._writing[trial.buckets[1].name]
-        async with writers, writers:  # all that may write there are at work
-            trial.keeper.reconcile()
-            await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
-            trial.buckets[0].open()
-            await until(lambda: owners(trial)[0] == ME)
-            for _ in range(100):
-                await asyncio.sleep(0)
-            assert not trial.keeper.is_mine("hall")
-            assert trial.lines.taken == set()
-        await until(lambda: not trial.keeper._tasks)
+        await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
+        trial.buckets[0].open()
+        await until(lambda: owners(trial)[0] == ME)
+        for _ in range(100):
+            await asyncio.sleep(0)
+        assert not trial.keeper.is_mine("hall")
         assert trial.lines.taken == set()
-        assert owners(trial) == [ME, NOBODY, NOBODY]
-        trial.keeper.reconcile()
-        await until(lambda: owners(trial) == [NOBODY] * 3)
+    await until(lambda: not trial.keeper._tasks)
+    assert trial.lines.taken == set()
+    assert owners(trial) == [ME, NOBODY, NOBODY]
+    trial.keeper.reconcile()
+    await until(lambda: owners(trial) == [NOBODY] * 3)
 
-    asyncio.run(main())
 
-
-def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
+async def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
     """The record was read before its answer came, and given away at once."""
+    trial = Trial()
+    await trial.read_and_begin()
+    bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
+    trial.records.owners[bucket.name].bucket = bucket  # type: ignore[assignment]
+    bucket.shut()
+    trial.claim_now()
+    await asyncio.wait_for(bucket.arrived.wait(), 10)
+    trial.records.doubt(bucket.name, ["hall"])
+    await trial.read()
+    assert trial.keeper.is_mine("hall")
+    bucket.is_down = True
+    await trial.keeper._owners.give_away(["hall"])
+    bucket.open()
+    await until(lambda: not trial.keeper._tasks)
+    assert not trial.keeper.is_mine("hall")
+    assert trial.lines.taken == set()
 
-    async def main() -> None:
-        trial = Trial()
-        await trial.read_and_begin()
-        bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
-        trial.records.owners[bucket.name].bucket = bucket  # type: ignore[assignment]
-        bucket.shut()
-        trial.claim_now()
-        await asyncio.wait_for(bucket.arrived.wait(), 10)
-        trial.records.doubt(bucket.name, ["hall"])
-        await trial.read()
-        assert trial.keeper.is_mine("hall")
+
+async def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
+    trial = Trial()
+    await trial.claim()
+    for bucket in trial.buckets:
         bucket.is_down = True
-        await trial.keeper._owners.give_away(["hall"])
-        bucket.open()
-        await until(lambda: not trial.keeper._tasks)
-        assert not trial.keeper.is_mine("hall")
-        assert trial.lines.taken == set()
-
-    asyncio.run(main())
-
-
-def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        for bucket in trial.buckets:
-            bucket.is_down = True
-        trial.keeper.releasing = {"hall"}
-        for _ in range(2):  # it is closed first
-            trial.keeper.reconcile()
-            await until(lambda: not trial.keeper._tasks)
-        assert not trial.keeper.is_mine("hall")
-        for bucket in trial.buckets:
-            bucket.is_down = False
-        trial.keeper.releasing, trial.keeper.may_claim = set(), False
+    trial.keeper.releasing = {"hall"}
+    for _ in range(2):  # it is closed first
         trial.keeper.reconcile()
         await until(lambda: not trial.keeper._tasks)
-        assert not trial.keeper.is_mine("hall")
-        trial.keeper.may_claim = True
-        trial.keeper.reconcile()
-        await until(lambda: "hall" in trial.keeper.polled)
+    assert not trial.keeper.is_mine("hall")
+    for bucket in trial.buckets:
+        bucket.is_down = False
+    trial.keeper.releasing, trial.keeper.may_claim = set(), False
+    trial.keeper.reconcile()
+    await until(lambda: not trial.keeper._tasks)
+    assert not trial.keeper.is_mine("hall")
+    trial.keeper.may_claim = True
+    trial.keeper.reconcile()
+    await until(lambda: "hall" in trial.keeper.polled)
 
-    asyncio.run(main())
 
-
-def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
+async def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
     """Its session is not ended: the others wait for as long as if it had died."""
+    trial = Trial()
+    await trial.claim()
 
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
+    async def fail(line: str) -> None:
+        raise RuntimeError("the port is stuck")
 
-        async def fail(line: str) -> None:
-            raise RuntimeError("the port is stuck")
-
-        trial.lines.let_go = fail  # type: ignore[method-assign]
-        failing = asyncio.create_task(trial.keeper.fail())
-        with pytest.raises(RuntimeError, match="the port is stuck"):
-            await asyncio.wait_for(trial.keeper.let_all_go(), 10)
-        with pytest.raises(RuntimeError, match="the port is stuck"):
-            await asyncio.wait_for(failing, 10)
-        assert trial.keeper.polled
-
-    asyncio.run(main())
+    trial.lines.let_go = fail  # type: ignore[method-assign]
+    failing = asyncio.create_task(trial.keeper.fail())
+    with pytest.raises(RuntimeError, match="the port is stuck"):
+        await asyncio.wait_for(trial.keeper.let_all_go(), 10)
+    with pytest.raises(RuntimeError, match="the port is stuck"):
+        await asyncio.wait_for(failing, 10)
+    assert trial.keeper.polled
 
 
-def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogCaptureFixture) -> None:
     """Such as a user's own class: it is logged with its cause, and tried again."""
+    trial = Trial()
+    take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
 
-    async def main() -> None:
-        trial = Trial()
-        take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
+    async def fail(line: str, description: Any) -> None:
+        if failures:
+            raise failures.pop()
+        await take(line, description)
 
-        async def fail(line: str, description: Any) -> None:
-            if failures:
-                raise failures.pop()
-            await take(line, description)
-
-        trial.lines.take = fail  # type: ignore[method-assign]
-        await trial.read_and_begin()
-        trial.claim_now()
-        await until(lambda: bool(trial.keeper.troubles))
-        assert trial.keeper.troubles == {"hall": "ZeroDivisionError: of a user's class"}
-        assert (trial.keeper.lost, trial.keeper._failure) == ({}, None)
-        await until(lambda: not trial.keeper._tasks)
-        trial.keeper._again_at["hall"] = 0.0
-        trial.keeper.reconcile()
-        await until(lambda: "hall" in trial.keeper.polled)
-        assert trial.keeper.troubles == {}
-
-    asyncio.run(main())
+    trial.lines.take = fail  # type: ignore[method-assign]
+    await trial.read_and_begin()
+    trial.claim_now()
+    await until(lambda: bool(trial.keeper.troubles))
+    assert trial.keeper.troubles == {"hall": "ZeroDivisionError: of a user's class"}
+    assert (trial.keeper.lost, trial.keeper._failure) == ({}, None)
+    await until(lambda: not trial.keeper._tasks)
+    trial.keeper._again_at["hall"] = 0.0
+    trial.keeper.reconcile()
+    await until(lambda: "hall" in trial.keeper.polled)
+    assert trial.keeper.troubles == {}
     assert "Traceback" in caplog.text
 
 
@@ -574,25 +498,21 @@ class BrokenTrial(Trial):
         await until(lambda: not self.keeper._at_work)
 
 
-def test_an_unopened_line_is_logged_once_per_reason_and_when_it_opens(
+async def test_an_unopened_line_is_logged_once_per_reason_and_when_it_opens(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-
-    async def main() -> None:
-        trial = BrokenTrial(monkeypatch)
-        await trial.claim()
-        await trial.try_again()
-        await trial.try_again()
-        trial.broken.why = "no route to host"
-        await trial.try_again()
-        assert trial.keeper.troubles == {"hall": "no route to host"}
-        trial.broken.why = ""
-        await trial.try_again()
-        assert trial.keeper.troubles == {}
-        assert "hall" in trial.keeper.polled
-
-    asyncio.run(main())
+    trial = BrokenTrial(monkeypatch)
+    await trial.claim()
+    await trial.try_again()
+    await trial.try_again()
+    trial.broken.why = "no route to host"
+    await trial.try_again()
+    assert trial.keeper.troubles == {"hall": "no route to host"}
+    trial.broken.why = ""
+    await trial.try_again()
+    assert trial.keeper.troubles == {}
+    assert "hall" in trial.keeper.polled
     assert [message for message in caplog.messages if "line hall" in message] == [
         "line hall cannot be opened; retrying: nothing listens there",
         "line hall cannot be opened; retrying: no route to host",
@@ -600,17 +520,14 @@ def test_an_unopened_line_is_logged_once_per_reason_and_when_it_opens(
     ]
 
 
-def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def main() -> None:
-        trial = BrokenTrial(monkeypatch)
-        await trial.claim()
-        trial.keeper.releasing = {"hall"}
-        trial.keeper.reconcile()
-        assert trial.keeper.troubles == {}
-        await until(lambda: trial.keeper.is_silent)
-        assert trial.owner() == ("", 0)
-
-    asyncio.run(main())
+async def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = BrokenTrial(monkeypatch)
+    await trial.claim()
+    trial.keeper.releasing = {"hall"}
+    trial.keeper.reconcile()
+    assert trial.keeper.troubles == {}
+    await until(lambda: trial.keeper.is_silent)
+    assert trial.owner() == ("", 0)
 
 
 @pytest.mark.parametrize(
@@ -622,14 +539,13 @@ def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: pytest.M
         (PortLoss("no route to host", SECOND), "no route to host"),
     ],
 )
-def test_a_lost_port_is_reported_before_a_long_reopening_fails(loss: PortLoss, reported: str | None) -> None:
-    async def main() -> None:
-        trial = Trial()
-        await trial.claim()
-        await until(lambda: "hall" in trial.keeper.polled)
-        await until(lambda: not trial.keeper._at_work)
-        trial.keeper._port_loss = lambda line: loss
-        trial.keeper._look_at_ports()
-        assert trial.keeper.lost.get("hall") == reported
-
-    asyncio.run(main())
+async def test_a_lost_port_is_reported_before_a_long_reopening_fails(
+    loss: PortLoss, reported: str | None
+) -> None:
+    trial = Trial()
+    await trial.claim()
+    await until(lambda: "hall" in trial.keeper.polled)
+    await until(lambda: not trial.keeper._at_work)
+    trial.keeper._port_loss = lambda line: loss
+    trial.keeper._look_at_ports()
+    assert trial.keeper.lost.get("hall") == reported

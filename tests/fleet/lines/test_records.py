@@ -124,18 +124,15 @@ def test_an_older_record_of_a_server_that_is_behind_changes_nothing() -> None:
     assert is_mine(trial.follower.records["line"])
 
 
-def test_a_larger_share_is_asked_for_at_once() -> None:
-    async def main() -> None:
-        trial = Trial()
-        trial.follower.want(["line"])
-        await trial.follower.look()
-        resting = asyncio.create_task(trial.follower.rest())
-        trial.follower.want(["line", "another"])
-        for _ in range(5):  # turns of the loop, and no time
-            await asyncio.sleep(0)
-        assert resting.done()
-
-    asyncio.run(main())
+async def test_a_larger_share_is_asked_for_at_once() -> None:
+    trial = Trial()
+    trial.follower.want(["line"])
+    await trial.follower.look()
+    resting = asyncio.create_task(trial.follower.rest())
+    trial.follower.want(["line", "another"])
+    for _ in range(5):  # turns of the loop, and no time
+        await asyncio.sleep(0)
+    assert resting.done()
 
 
 FIRST, SECOND, _ = names.owner_buckets("line")
@@ -234,24 +231,21 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.mark.long
-def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
-    async def main() -> None:
-        path = paths_of(one.urls)[0]
-        await path.open()
-        await set_up([path])
-        bucket = Bucket("own_0", lambda: path)
-        lines = [f"line-{at}" for at in range(1200)]
-        stored, _ = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
-        some = [record._replace(value=NOBODY) for record in stored[:10]]
-        again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
-        assert refused == {"line-20"}
-        follower = ShareFollower(bucket, lambda *_: follower.look_anew(), is_mine, lambda line: False)
-        follower.want([*lines[:1100], "never had"])
-        changed = await asyncio.wait_for(follower.look(), 60)
-        newest = {record.key: record for record in (*stored[:1100], *again)}
-        assert follower.records == {**newest, "never had": Record("never had", 0, None)}
-        assert len(changed) == 1101
-        assert len(await follower.look()) == 0
-        await path.close()
-
-    asyncio.run(main())
+async def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
+    path = paths_of(one.urls)[0]
+    await path.open()
+    await set_up([path])
+    bucket = Bucket("own_0", lambda: path)
+    lines = [f"line-{at}" for at in range(1200)]
+    stored, _ = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
+    some = [record._replace(value=NOBODY) for record in stored[:10]]
+    again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
+    assert refused == {"line-20"}
+    follower = ShareFollower(bucket, lambda *_: follower.look_anew(), is_mine, lambda line: False)
+    follower.want([*lines[:1100], "never had"])
+    changed = await asyncio.wait_for(follower.look(), 60)
+    newest = {record.key: record for record in (*stored[:1100], *again)}
+    assert follower.records == {**newest, "never had": Record("never had", 0, None)}
+    assert len(changed) == 1101
+    assert len(await follower.look()) == 0
+    await path.close()

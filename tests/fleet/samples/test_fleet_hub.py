@@ -154,54 +154,43 @@ def test_a_server_that_is_behind_ends_no_reading_of_all(
 
 @pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
-def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            for number in range(1, 31):
-                await say(client, number, message(number * 5))
-            sink = Memory(fates)
-            state = await read_all(client, sink, 30)
-        assert exchanges_in(sorted(sink.rows())) == list(range(5, 155))
-        assert state[:5] == (30, 0, 30 * 50 if not fates else state.rows, 0, 0)
-        assert sink.commits[-1].sources == {f"gateway-1.{LOG}": 30}
-
-    asyncio.run(live())
+async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
+    async with client_of(running) as client:
+        for number in range(1, 31):
+            await say(client, number, message(number * 5))
+        sink = Memory(fates)
+        state = await read_all(client, sink, 30)
+    assert exchanges_in(sorted(sink.rows())) == list(range(5, 155))
+    assert state[:5] == (30, 0, 30 * 50 if not fates else state.rows, 0, 0)
+    assert sink.commits[-1].sources == {f"gateway-1.{LOG}": 30}
 
 
 @pytest.mark.slow
-def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
-
-    async def live() -> None:
-        async with client_of(running) as client:
-            for number in range(1, 12):
-                await say(client, number, message(number * 5))
-            sink = Memory()
-            hub = SampleHub(client, sink)
-            await hub.run(once=True)
-            assert hub.state().place == 11
-            assert exchanges_in(sorted(sink.rows())) == list(range(5, 60))
-
-    asyncio.run(live())
+    async with client_of(running) as client:
+        for number in range(1, 12):
+            await say(client, number, message(number * 5))
+        sink = Memory()
+        hub = SampleHub(client, sink)
+        await hub.run(once=True)
+        assert hub.state().place == 11
+        assert exchanges_in(sorted(sink.rows())) == list(range(5, 60))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("is_good", [True, False], ids=["rows", "garbage"])
-def test_a_commit_ends_where_it_has_much_in_memory(
+async def test_a_commit_ends_where_it_has_much_in_memory(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
     """Few rows may have long names, and ignored messages were read too."""
     monkeypatch.setattr(hub_module, "MOST_READ", 1)
     monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
     sink = Memory()
-
-    async def main() -> None:
-        async with client_of(running) as client:
-            for sequence in (1, 2, 3):
-                await say(client, sequence, message(sequence) if is_good else b"?" * 1000)
-            await read_all(client, sink, 3, every=3600.0)
-
-    asyncio.run(main())
+    async with client_of(running) as client:
+        for sequence in (1, 2, 3):
+            await say(client, sequence, message(sequence) if is_good else b"?" * 1000)
+        await read_all(client, sink, 3, every=3600.0)
     assert [commit.last for commit in sink.commits] == [1, 2, 3]
     assert len(sink.rows()) == (150 if is_good else 0)
 
@@ -240,34 +229,26 @@ def test_missing_or_doubled_messages_are_logged_and_counted(
     ]
 
 
-def test_messages_that_the_stream_removed_are_reported(
+async def test_messages_that_the_stream_removed_are_reported(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            for number in range(1, 6):
-                await say(client, number, message(number * 5))
-            await samples_stream._ask(client, "STREAM.PURGE.samples", {"seq": 4})
-            state = await read_all(client, Memory(), 5)
-            assert (state.alarms, state.missing) == (2, 3)
-
-    asyncio.run(live())
+    async with client_of(running) as client:
+        for number in range(1, 6):
+            await say(client, number, message(number * 5))
+        await samples_stream._ask(client, "STREAM.PURGE.samples", {"seq": 4})
+        state = await read_all(client, Memory(), 5)
+        assert (state.alarms, state.missing) == (2, 3)
     assert "messages 1 to 3 of the stream were removed before they were read" in caplog.text
     assert f"gateway-1.{LOG}: messages 1 to 3 are missing" in caplog.text
 
 
-def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            await say(client, 1, message(0))
-            sink = Memory()
-            sink.commits.append(Commit("", 1, 5, {}, [], 0))
-            with pytest.raises(
-                NotThisHubs, match="the stream ends at message 1, and 5 are stored: it lost some"
-            ):
-                await SampleHub(client, sink).run()
-
-    asyncio.run(live())
+async def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
+    async with client_of(running) as client:
+        await say(client, 1, message(0))
+        sink = Memory()
+        sink.commits.append(Commit("", 1, 5, {}, [], 0))
+        with pytest.raises(NotThisHubs, match="the stream ends at message 1, and 5 are stored: it lost some"):
+            await SampleHub(client, sink).run()
 
 
 # ---- Parquet ----
@@ -285,19 +266,15 @@ def kept_in_files(client: Client, folder: Path, place: int) -> Any:
 
 
 @pytest.mark.long
-def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
+async def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
     duckdb = require_module("duckdb")
-
-    async def live() -> None:
-        async with client_of(running) as client:
-            for number in range(1, 6):
-                await say(client, number, message(number * 5))
-            assert (await kept_in_files(client, tmp_path, 5)).rows == 250
-            for number in range(6, 9):
-                await say(client, number, message(number * 5))
-            assert (await kept_in_files(client, tmp_path, 8)).rows == 150
-
-    asyncio.run(live())
+    async with client_of(running) as client:
+        for number in range(1, 6):
+            await say(client, number, message(number * 5))
+        assert (await kept_in_files(client, tmp_path, 5)).rows == 250
+        for number in range(6, 9):
+            await say(client, number, message(number * 5))
+        assert (await kept_in_files(client, tmp_path, 8)).rows == 150
     files = sorted((tmp_path / "rows").glob("*.parquet"))
     ranges = [tuple(map(int, file.name.split(".")[0].split("-"))) for file in files]
     assert ranges[0][0] == 1
@@ -320,21 +297,17 @@ def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path
     assert told == (len(one_drive), sum(v is not None for v in one_drive), sum(filter(None, one_drive)))
 
 
-def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
+async def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
     """A killed hub leaves one: the rows are read again."""
-
-    async def live() -> None:
-        async with client_of(running) as client:
-            await say(client, 1, message(5))
-            await kept_in_files(client, tmp_path, 1)
-            part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.writing"
-            part.write_bytes(b"PAR1")
-            await say(client, 2, message(10))
-            state = await kept_in_files(client, tmp_path, 2)
-            assert (state.rows, state.alarms) == (50, 0)
-            assert not part.exists()
-
-    asyncio.run(live())
+    async with client_of(running) as client:
+        await say(client, 1, message(5))
+        await kept_in_files(client, tmp_path, 1)
+        part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.writing"
+        part.write_bytes(b"PAR1")
+        await say(client, 2, message(10))
+        state = await kept_in_files(client, tmp_path, 2)
+        assert (state.rows, state.alarms) == (50, 0)
+        assert not part.exists()
 
 
 def commit_of(
@@ -397,17 +370,14 @@ extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, driv
 
 
 @pytest.mark.long
-def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            for number in range(1, 6):
-                await say(client, number, message(number * 5))
-            sink = PostgresSink(empty.where)
-            state = await read_all(client, sink, 5)
-            assert (state.rows, state.alarms) == (250, 0)
-            sink.close()
-
-    asyncio.run(live())
+async def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
+    async with client_of(running) as client:
+        for number in range(1, 6):
+            await say(client, number, message(number * 5))
+        sink = PostgresSink(empty.where)
+        state = await read_all(client, sink, 5)
+        assert (state.rows, state.alarms) == (250, 0)
+        sink.close()
     wanted = sorted(row for number in range(1, 6) for row in rows_of(unpack(message(number * 5))))
     told = [
         (row[0], row[2] and row[2] // 1000, *row[3:7], row[0] // 1000)

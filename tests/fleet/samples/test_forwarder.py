@@ -85,41 +85,37 @@ def filled(folder: Path, messages: int) -> Spool:
     return spool
 
 
-def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
-    async def live() -> None:
-        spool = filled(tmp_path / "spool", 7)
-        async with client_of(running) as client, forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().last == 7)
-            spool.append(numbered(35, 5))
+async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
+    spool = filled(tmp_path / "spool", 7)
+    async with client_of(running) as client, forwarding(spool, client) as forwarder:
+        await until(lambda: forwarder.state().last == 7)
+        spool.append(numbered(35, 5))
+        assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+        await until(lambda: forwarder.state().last == 8)
+        assert forwarder.state() == (8, 8, None)
+        assert spool.state().acknowledged == 8
+        found = await stored(client)
+    assert [(one.gateway, one.log, one.sequence, one.lost) for one in found] == [
+        ("gateway-1", spool.log, number, 0) for number in range(1, 9)
+    ]
+    rows = [row for one in found for row in rows_of(unpack(one.data))]
+    assert exchanges_in(rows) == list(range(40))
+    spool.close()
+
+
+async def test_a_restarted_gateway_goes_on_behind_what_the_stream_has(
+    running: Cluster, tmp_path: Path
+) -> None:
+    async with client_of(running) as client:
+        for run in range(3):
+            spool = Spool(tmp_path / "spool", "gateway-1")
+            spool.append(numbered(run * 10, 10))
             assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-            await until(lambda: forwarder.state().last == 8)
-            assert forwarder.state() == (8, 8, None)
-            assert spool.state().acknowledged == 8
-            found = await stored(client)
-        assert [(one.gateway, one.log, one.sequence, one.lost) for one in found] == [
-            ("gateway-1", spool.log, number, 0) for number in range(1, 9)
-        ]
-        rows = [row for one in found for row in rows_of(unpack(one.data))]
-        assert exchanges_in(rows) == list(range(40))
-        spool.close()
-
-    asyncio.run(live())
-
-
-def test_a_restarted_gateway_goes_on_behind_what_the_stream_has(running: Cluster, tmp_path: Path) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            for run in range(3):
-                spool = Spool(tmp_path / "spool", "gateway-1")
-                spool.append(numbered(run * 10, 10))
-                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-                async with forwarding(spool, client) as forwarder:
-                    await until(lambda forwarder=forwarder, run=run: forwarder.state().last == run + 1)
-                    assert forwarder.state().sent == 1
-                spool.close()
-            assert [one.sequence for one in await stored(client)] == [1, 2, 3]
-
-    asyncio.run(live())
+            async with forwarding(spool, client) as forwarder:
+                await until(lambda forwarder=forwarder, run=run: forwarder.state().last == run + 1)
+                assert forwarder.state().sent == 1
+            spool.close()
+        assert [one.sequence for one in await stored(client)] == [1, 2, 3]
 
 
 class Lossy:
@@ -148,39 +144,36 @@ class Lossy:
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
-def test_after_any_doubt_each_message_is_there_once(running: Cluster, tmp_path: Path, fates: str) -> None:
-    async def live() -> None:
-        spool = filled(tmp_path / "spool", 6)
-        async with client_of(running) as client, forwarding(spool, Lossy(client, fates)) as forwarder:
-            await until(lambda: forwarder.state().last == 6)
-            await asyncio.sleep(0.1)  # for late ones to be refused
-            assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4, 5, 6]
-        spool.close()
+async def test_after_any_doubt_each_message_is_there_once(
+    running: Cluster, tmp_path: Path, fates: str
+) -> None:
+    spool = filled(tmp_path / "spool", 6)
+    async with client_of(running) as client, forwarding(spool, Lossy(client, fates)) as forwarder:
+        await until(lambda: forwarder.state().last == 6)
+        await asyncio.sleep(0.1)  # for late ones to be refused
+        assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4, 5, 6]
+    spool.close()
 
-    asyncio.run(live())
 
-
-def test_answers_of_servers_among_a_logs_messages_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+async def test_answers_of_servers_among_a_logs_messages_are_passed_over(
+    running: Cluster, tmp_path: Path
+) -> None:
     """Whoever asks a server anything may have its answer sent there: nothing is sent again, and nothing kept
     back."""
-
-    async def live() -> None:
-        spool = filled(tmp_path / "spool", 2)
-        subject = subject_of("gateway-1", spool.log)
-        answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
-        async with client_of(running) as client, forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().last == 2)
-            for number, headers in enumerate(answers, 3):
-                assert await publish(client, subject, b"{}", headers)
-                spool.append(numbered(number * 5, 5))
-                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-                await until(lambda number=number: forwarder.state().last == number)
-            assert (forwarder.state().sent, spool.state().acknowledged) == (4, 4)
-            sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
-            assert sequences == [1, 2, 3, 4]
-        spool.close()
-
-    asyncio.run(live())
+    spool = filled(tmp_path / "spool", 2)
+    subject = subject_of("gateway-1", spool.log)
+    answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
+    async with client_of(running) as client, forwarding(spool, client) as forwarder:
+        await until(lambda: forwarder.state().last == 2)
+        for number, headers in enumerate(answers, 3):
+            assert await publish(client, subject, b"{}", headers)
+            spool.append(numbered(number * 5, 5))
+            assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+            await until(lambda number=number: forwarder.state().last == number)
+        assert (forwarder.state().sent, spool.state().acknowledged) == (4, 4)
+        sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
+        assert sequences == [1, 2, 3, 4]
+    spool.close()
 
 
 class Refusing:
@@ -199,61 +192,52 @@ class Refusing:
         return await self._client.request(subject, data, **details)
 
 
-def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
+async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def live() -> None:
-        spool = filled(tmp_path / "spool", 2)
-        async with client_of(running) as client, forwarding(spool, Refusing(client, 5)) as forwarder:
-            await until(lambda: forwarder.state().last == 2)
-            await until(lambda: forwarder.state().trouble is None)
-        spool.close()
-
-    asyncio.run(live())
+    spool = filled(tmp_path / "spool", 2)
+    async with client_of(running) as client, forwarding(spool, Refusing(client, 5)) as forwarder:
+        await until(lambda: forwarder.state().last == 2)
+        await until(lambda: forwarder.state().trouble is None)
+    spool.close()
     assert [record.getMessage() for record in caplog.records] == [
         "samples are not forwarded: the stream 'samples' refuses a message: no room",
         "samples are forwarded again, behind message 1",
     ]
 
 
-def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_path: Path) -> None:
-    async def live() -> None:
-        filled(tmp_path / "spool", 5).close()
-        spool = Spool(tmp_path / "spool", "gateway-1", most=1)
-        spool.append(numbered(25, 5))
-        assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-        await until(lambda: spool.state().oldest == 6)
-        async with client_of(running) as client, forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().last == 6)
-            (found,) = await stored(client)
-        assert (found.sequence, found.lost) == (6, 250)
-        spool.close()
-
-    asyncio.run(live())
+async def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+    filled(tmp_path / "spool", 5).close()
+    spool = Spool(tmp_path / "spool", "gateway-1", most=1)
+    spool.append(numbered(25, 5))
+    assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+    await until(lambda: spool.state().oldest == 6)
+    async with client_of(running) as client, forwarding(spool, client) as forwarder:
+        await until(lambda: forwarder.state().last == 6)
+        (found,) = await stored(client)
+    assert (found.sequence, found.lost) == (6, 250)
+    spool.close()
 
 
-def test_a_restored_old_folder_is_logged_and_not_forwarded(
+async def test_a_restored_old_folder_is_logged_and_not_forwarded(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def live() -> None:
-        spool = filled(tmp_path / "spool", 2)
-        async with client_of(running) as client:
+    spool = filled(tmp_path / "spool", 2)
+    async with client_of(running) as client:
+        async with forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 2)
+        spool.close()
+        (tmp_path / "spool" / "000000000002-50.arrows").unlink()
+        spool = Spool(tmp_path / "spool", "gateway-1")
+        for number in (100, 200):  # first as long as the stream, and then longer
             async with forwarding(spool, client) as forwarder:
-                await until(lambda: forwarder.state().last == 2)
-            spool.close()
-            (tmp_path / "spool" / "000000000002-50.arrows").unlink()
-            spool = Spool(tmp_path / "spool", "gateway-1")
-            for number in (100, 200):  # first as long as the stream, and then longer
-                async with forwarding(spool, client) as forwarder:
-                    await until(lambda forwarder=forwarder: forwarder.state().trouble)
-                spool.append(numbered(number, 5))
-                assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-            async with forwarding(spool, client) as forwarder:
-                await until(lambda: forwarder.state().trouble)
-            assert [one.sequence for one in await stored(client)] == [1, 2]
-            spool.close()
-
-    asyncio.run(live())
+                await until(lambda forwarder=forwarder: forwarder.state().trouble)
+            spool.append(numbered(number, 5))
+            assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+        async with forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().trouble)
+        assert [one.sequence for one in await stored(client)] == [1, 2]
+        spool.close()
     told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     ends = ": its folder was copied or set back; move it away to start a new log"
     assert len(told) == 3
@@ -263,38 +247,32 @@ def test_a_restored_old_folder_is_logged_and_not_forwarded(
 
 
 @pytest.mark.long
-def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def live() -> None:
-        spool = filled(tmp_path / "spool", 3)
-        with cluster(tmp_path / "nats", 1) as servers:
-            async with client_of(servers) as client, forwarding(spool, client) as forwarder:
-                await until(lambda: forwarder.state().last == 3)
-                servers.nodes[0].kill()
-                spool.append(numbered(15, 5))
-                await until(lambda: forwarder.state().trouble)
-                servers.nodes[0].start()
-                await until(lambda: forwarder.state().last == 4)
-                assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4]
-        spool.close()
-
-    asyncio.run(live())
+async def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    spool = filled(tmp_path / "spool", 3)
+    with cluster(tmp_path / "nats", 1) as servers:
+        async with client_of(servers) as client, forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().last == 3)
+            servers.nodes[0].kill()
+            spool.append(numbered(15, 5))
+            await until(lambda: forwarder.state().trouble)
+            servers.nodes[0].start()
+            await until(lambda: forwarder.state().last == 4)
+            assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4]
+    spool.close()
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
     assert told[0].startswith("samples are not forwarded: ")
     # The fourth may have come before the server was gone, and its answer not.
     assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
 
 
-def test_the_largest_message_comes_back(running: Cluster) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            data = random.Random(1).randbytes(MOST_BYTES)
-            headers = {samples_stream.SEQUENCE: "7", samples_stream.DIGEST: digest_of(data)}
-            for place in (1, 2, 3):
-                assert await publish(client, "samples.a.b", data, headers) == place
-            assert await last_of(client, "samples.a.b") == (3, 7, digest_of(data))
-            assert [one.data == data for one in await stored(client)] == [True] * 3
-
-    asyncio.run(live())
+async def test_the_largest_message_comes_back(running: Cluster) -> None:
+    async with client_of(running) as client:
+        data = random.Random(1).randbytes(MOST_BYTES)
+        headers = {samples_stream.SEQUENCE: "7", samples_stream.DIGEST: digest_of(data)}
+        for place in (1, 2, 3):
+            assert await publish(client, "samples.a.b", data, headers) == place
+        assert await last_of(client, "samples.a.b") == (3, 7, digest_of(data))
+        assert [one.data == data for one in await stored(client)] == [True] * 3
 
 
 # ---- mistakes ----
@@ -323,25 +301,22 @@ def test_an_old_server(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
-    async def live() -> None:
-        async with client_of(running) as client:
-            await samples_stream._ask(client, "STREAM.DELETE.samples", {})
-            for asked in (about(client), last_of(client, "samples.a.b")):
-                with pytest.raises(StreamError, match="there is no stream 'samples': create it with"):
-                    await asked
-            with pytest.raises(StreamError, match="there is no stream 'samples', or it has no leader now"):
-                await read_after(client, 0, 10, 1000)
-            with pytest.raises(StreamError, match=r"no stream takes samples\.a\.b"):
-                await publish(client, subject_of("a", "b"), b"", {})
-            spool = filled(tmp_path / "spool", 1)
-            async with forwarding(spool, client) as forwarder:
-                await until(lambda: forwarder.state().trouble)
-                await create_stream(client, replicas=1)
-                await until(lambda: forwarder.state().last == 1)
-            spool.close()
-
-    asyncio.run(live())
+async def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
+    async with client_of(running) as client:
+        await samples_stream._ask(client, "STREAM.DELETE.samples", {})
+        for asked in (about(client), last_of(client, "samples.a.b")):
+            with pytest.raises(StreamError, match="there is no stream 'samples': create it with"):
+                await asked
+        with pytest.raises(StreamError, match="there is no stream 'samples', or it has no leader now"):
+            await read_after(client, 0, 10, 1000)
+        with pytest.raises(StreamError, match=r"no stream takes samples\.a\.b"):
+            await publish(client, subject_of("a", "b"), b"", {})
+        spool = filled(tmp_path / "spool", 1)
+        async with forwarding(spool, client) as forwarder:
+            await until(lambda: forwarder.state().trouble)
+            await create_stream(client, replicas=1)
+            await until(lambda: forwarder.state().last == 1)
+        spool.close()
 
 
 @pytest.mark.long

@@ -69,18 +69,14 @@ def test_nats_py_has_the_place_where_answers_are_taken() -> None:
     assert inspect.iscoroutinefunction(Client._process_msg)
 
 
-def test_answers_are_taken_at_once(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_answers_are_taken_at_once(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     async def fail(self: BatchClient, message: object) -> None:
         raise AssertionError("it came in nats-py's own way")
 
     monkeypatch.setattr(BatchClient, "_take_message", fail)
-
-    async def main() -> None:
-        client = await connect(one.urls[0], {})
-        assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
-        await client.close()
-
-    asyncio.run(main())
+    client = await connect(one.urls[0], {})
+    assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
+    await client.close()
 
 
 def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) -> None:
@@ -171,27 +167,24 @@ def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluste
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("way")
-def test_unanswered_requests_are_distinguished_from_answered_ones(one: Cluster) -> None:
-    async def main() -> None:
-        client = await connect(one.urls[0], {})
-        deaf = await client.subscribe("deaf")
-        mute = Request("deaf", b"")
-        nobody = Request("nobody.there", b"")
-        info = Request("$JS.API.INFO", b"")
-        found = await client.replies([mute, nobody, info], 0.2)
-        assert found[0] is None
-        assert found[1] == b""  # the server says so
-        assert found[2] is not None
-        assert found[2].startswith(b"{")
-        with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
-            await client.batch(mute, DirectGet(), 0.2)
-        with pytest.raises(OSError, match="it ended with 503"):
-            await client.batch(nobody, DirectGet(), 5.0)
-        assert client._takers == {}
-        await deaf.unsubscribe()
-        await client.close()
-
-    asyncio.run(main())
+async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Cluster) -> None:
+    client = await connect(one.urls[0], {})
+    deaf = await client.subscribe("deaf")
+    mute = Request("deaf", b"")
+    nobody = Request("nobody.there", b"")
+    info = Request("$JS.API.INFO", b"")
+    found = await client.replies([mute, nobody, info], 0.2)
+    assert found[0] is None
+    assert found[1] == b""  # the server says so
+    assert found[2] is not None
+    assert found[2].startswith(b"{")
+    with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
+        await client.batch(mute, DirectGet(), 0.2)
+    with pytest.raises(OSError, match="it ended with 503"):
+        await client.batch(nobody, DirectGet(), 5.0)
+    assert client._takers == {}
+    await deaf.unsubscribe()
+    await client.close()
 
 
 @pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
@@ -228,67 +221,58 @@ def test_what_a_server_that_is_cut_off_got_is_asked_again(
     _with_path(one, work)
 
 
-def test_reads_of_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
-    async def main() -> None:
-        paths = paths_of(one.urls)
-        await asyncio.gather(*(path.open() for path in paths))
-        asked: list[Request] = []
+async def test_reads_of_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
+    paths = paths_of(one.urls)
+    await asyncio.gather(*(path.open() for path in paths))
+    asked: list[Request] = []
 
-        async def swallow(request: Request, get: DirectGet, silence_s: float) -> None:
-            asked.append(request)
-            await asyncio.Event().wait()
+    async def swallow(request: Request, get: DirectGet, silence_s: float) -> None:
+        asked.append(request)
+        await asyncio.Event().wait()
 
-        _rested(paths[0])
-        deaf = paths[0]._client
-        assert deaf
-        deaf.batch = swallow  # type: ignore[method-assign]
-        bucket = Bucket("plant", lambda: paths[0])
-        assert await asyncio.wait_for(bucket.changes(0), 60) == []
-        assert asked
-        await asyncio.gather(*(path.close() for path in paths))
-
-    asyncio.run(main())
+    _rested(paths[0])
+    deaf = paths[0]._client
+    assert deaf
+    deaf.batch = swallow  # type: ignore[method-assign]
+    bucket = Bucket("plant", lambda: paths[0])
+    assert await asyncio.wait_for(bucket.changes(0), 60) == []
+    assert asked
+    await asyncio.gather(*(path.close() for path in paths))
 
 
 @pytest.mark.usefixtures("way")
-def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> None:
-    async def main() -> None:
-        client, other = await connect(one.urls[0], {}), await connect(one.urls[0], {})
-        asked: asyncio.Queue[str] = asyncio.Queue()
+async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> None:
+    client, other = await connect(one.urls[0], {}), await connect(one.urls[0], {})
+    asked: asyncio.Queue[str] = asyncio.Queue()
 
-        async def keep(message: object) -> None:
-            asked.put_nowait(message.reply)  # type: ignore[attr-defined]
+    async def keep(message: object) -> None:
+        asked.put_nowait(message.reply)  # type: ignore[attr-defined]
 
-        await other.subscribe("slow", cb=keep)
-        await other.flush()  # this ping may leave before the subscription, the next one does not
-        await other.flush()
-        assert await client.replies([Request("slow", b"first")], 0.2) == [None]
-        second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))
-        first_inbox, second_inbox = (
-            await asyncio.wait_for(asked.get(), 30),
-            await asyncio.wait_for(asked.get(), 30),
-        )
-        await other.publish(first_inbox, b"late")
-        await other.publish(second_inbox, b"right")
-        assert await second == [b"right"]
-        for one_of in (client, other):
-            await one_of.close()
-
-    asyncio.run(main())
+    await other.subscribe("slow", cb=keep)
+    await other.flush()  # this ping may leave before the subscription, the next one does not
+    await other.flush()
+    assert await client.replies([Request("slow", b"first")], 0.2) == [None]
+    second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))
+    first_inbox, second_inbox = (
+        await asyncio.wait_for(asked.get(), 30),
+        await asyncio.wait_for(asked.get(), 30),
+    )
+    await other.publish(first_inbox, b"late")
+    await other.publish(second_inbox, b"right")
+    assert await second == [b"right"]
+    for one_of in (client, other):
+        await one_of.close()
 
 
-def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
-    async def main() -> None:
-        client = await connect(one.urls[0], {})
-        given_up = asyncio.get_running_loop().create_future()
-        given_up.cancel()  # as a flush leaves it that timed out
-        await client._send_ping(given_up)
-        await client.flush(30)
-        assert client.is_reading
-        assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
-        await client.close()
-
-    asyncio.run(main())
+async def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
+    client = await connect(one.urls[0], {})
+    given_up = asyncio.get_running_loop().create_future()
+    given_up.cancel()  # as a flush leaves it that timed out
+    await client._send_ping(given_up)
+    await client.flush(30)
+    assert client.is_reading
+    assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
+    await client.close()
 
 
 def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
@@ -308,13 +292,10 @@ def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
 
 
 @pytest.mark.usefixtures("way")
-def test_other_messages_go_where_they_went(one: Cluster) -> None:
-    async def main() -> None:
-        client = await connect(one.urls[0], {})
-        assert isinstance(client, BatchClient)
-        await client.replies([Request("$JS.API.INFO", b"")], 5.0)
-        answer = await client.request("$JS.API.INFO", b"", 5.0, headers={"a": "b"})
-        assert answer.data.startswith(b"{")
-        await client.close()
-
-    asyncio.run(main())
+async def test_other_messages_go_where_they_went(one: Cluster) -> None:
+    client = await connect(one.urls[0], {})
+    assert isinstance(client, BatchClient)
+    await client.replies([Request("$JS.API.INFO", b"")], 5.0)
+    answer = await client.request("$JS.API.INFO", b"", 5.0, headers={"a": "b"})
+    assert answer.data.startswith(b"{")
+    await client.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -101,21 +100,18 @@ def test_a_record_writes_no_file_outside_of_its_folder(tmp_path: Path, name: str
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-def test_lines_that_are_as_before_keep_their_revision() -> None:
-    async def main() -> None:
-        memory = MemoryBucket("plant")
-        bucket: Any = memory
-        first = {name: {"line": {"name": name}, "files": {}} for name in ("a", "b", "c")}
-        assert await store(bucket, first) == {"new": 3, "changed": 0, "removed": 0, "kept": 0}
-        before = {name: memory.revision(name) for name in first}
-        second = {**first, "b": {"line": {"name": "b", "port": "x"}, "files": {}}}
-        del second["c"]
-        assert await store(bucket, second) == {"new": 0, "changed": 1, "removed": 1, "kept": 1}
-        assert memory.revision("a") == before["a"]
-        assert memory.records["c"].value is None
-        assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
-
-    asyncio.run(main())
+async def test_lines_that_are_as_before_keep_their_revision() -> None:
+    memory = MemoryBucket("plant")
+    bucket: Any = memory
+    first = {name: {"line": {"name": name}, "files": {}} for name in ("a", "b", "c")}
+    assert await store(bucket, first) == {"new": 3, "changed": 0, "removed": 0, "kept": 0}
+    before = {name: memory.revision(name) for name in first}
+    second = {**first, "b": {"line": {"name": "b", "port": "x"}, "files": {}}}
+    del second["c"]
+    assert await store(bucket, second) == {"new": 0, "changed": 1, "removed": 1, "kept": 1}
+    assert memory.revision("a") == before["a"]
+    assert memory.records["c"].value is None
+    assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
 
 
 def test_a_line_s_record_has_its_own_lists_alone(tmp_path: Path) -> None:

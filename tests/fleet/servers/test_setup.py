@@ -41,24 +41,21 @@ def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
 
 
 @pytest.mark.slow
-def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluster) -> None:
-    async def main() -> None:
-        paths = paths_of(fleet.urls)
-        await setup.open_all(paths)
-        assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
-        ends = time.monotonic() + 20
-        while True:
-            await setup.bring_leaders_home(paths[0], await setup.led_clusters(paths[0]))
-            infos = [await ask(paths[0], f"STREAM.INFO.KV_lease_{at}") for at in range(3)]
-            leaders = [info["cluster"].get("leader") for info in infos]
-            if leaders == ["n1", "n2", "n3"]:
-                break
-            assert time.monotonic() < ends, leaders
-            await asyncio.sleep(0.2)
-        for path in paths:
-            await path.close()
-
-    asyncio.run(main())
+async def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluster) -> None:
+    paths = paths_of(fleet.urls)
+    await setup.open_all(paths)
+    assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
+    ends = time.monotonic() + 20
+    while True:
+        await setup.bring_leaders_home(paths[0], await setup.led_clusters(paths[0]))
+        infos = [await ask(paths[0], f"STREAM.INFO.KV_lease_{at}") for at in range(3)]
+        leaders = [info["cluster"].get("leader") for info in infos]
+        if leaders == ["n1", "n2", "n3"]:
+            break
+        assert time.monotonic() < ends, leaders
+        await asyncio.sleep(0.2)
+    for path in paths:
+        await path.close()
 
 
 class Deaf:
