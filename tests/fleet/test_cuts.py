@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from fleet_drills import FleetDrill, cut, drilled_in_network
-from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -16,8 +15,6 @@ CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody"
 
 @pytest.fixture(scope="module")
 def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
-    require_module("nats")
-    require_module("pyarrow")
     with drilled_in_network(tmp_path_factory.mktemp("cuts")) as found:
         yield found
 

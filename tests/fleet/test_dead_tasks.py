@@ -22,31 +22,28 @@ from peers import require_module
 from spooled import numbered
 from toy import Toy
 
-require_module("nats")
-require_module("pyarrow")
-
-import multidrop.fleet  # noqa: E402
-from multidrop import Poller, PollingFailed  # noqa: E402
-from multidrop.cli.fleet.tables import count_sentence, failing_lines  # noqa: E402
-from multidrop.core import Mastership  # noqa: E402
-from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
-from multidrop.fleet import metrics  # noqa: E402
-from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.commands.log import CommandLog  # noqa: E402
-from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
-from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  # noqa: E402
-from multidrop.fleet.gateway import FleetGateway  # noqa: E402
-from multidrop.fleet.lines import fleet_lines  # noqa: E402
-from multidrop.fleet.lines.fleet_lines import FleetLines  # noqa: E402
-from multidrop.fleet.samples import forwarder as forwarder_module  # noqa: E402
-from multidrop.fleet.samples import parquet_sink  # noqa: E402
-from multidrop.fleet.samples import spool as spool_module  # noqa: E402
-from multidrop.fleet.samples.forwarder import Forwarder  # noqa: E402
-from multidrop.fleet.samples.polled_units import PolledUnits  # noqa: E402
-from multidrop.fleet.samples.spool import Spool  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.sim import Simulator, Wire, simulated  # noqa: E402
-from multidrop.supervisor import Ended, supervisor  # noqa: E402
+import multidrop.fleet
+from multidrop import Poller, PollingFailed
+from multidrop.cli.fleet.tables import count_sentence, failing_lines
+from multidrop.core import Mastership
+from multidrop.fleet import gateway as fleet_gateway
+from multidrop.fleet import metrics
+from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.messages import CommandOutcome
+from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
+from multidrop.fleet.gateway import FleetGateway
+from multidrop.fleet.lines import fleet_lines
+from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.samples import forwarder as forwarder_module
+from multidrop.fleet.samples import parquet_sink
+from multidrop.fleet.samples import spool as spool_module
+from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.servers import names
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.supervisor import Ended, supervisor
 
 STARTERS = {
     *("Thread", "ThreadPoolExecutor", "TaskGroup", "Timer"),

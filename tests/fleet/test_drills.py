@@ -11,7 +11,6 @@ from collections.abc import Iterator
 
 import pytest
 from fleet_drills import DEEDS, PATIENCE_S, FleetDrill, drilled
-from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -27,8 +26,6 @@ DONE = (
 
 @pytest.fixture(scope="module")
 def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
-    require_module("nats")
-    require_module("pyarrow")
     with drilled(tmp_path_factory.mktemp("drill")) as found:
         found.settle()
         yield found

@@ -15,7 +15,6 @@ import pytest
 from commands import Run
 from examples import usually
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
-from peers import require_module
 from tables import table
 
 from multidrop.control import eeprom_ledger
@@ -54,8 +53,6 @@ def nobody() -> str:
 
 @pytest.fixture(autouse=True)
 def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    require_module("nats")
-    require_module("pyarrow")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 

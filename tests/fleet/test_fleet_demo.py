@@ -18,12 +18,9 @@ from lines import PATIENCE, until
 from peers import require_module
 from terminals import on_terminal
 
-require_module("nats")
-require_module("pyarrow")
-
-from multidrop.cli.fleet import demo_processes  # noqa: E402
-from multidrop.cli.fleet.demo import Stage, gap_s, plant_file  # noqa: E402
-from multidrop.plant.loader import load_plant  # noqa: E402
+from multidrop.cli.fleet import demo_processes
+from multidrop.cli.fleet.demo import Stage, gap_s, plant_file
+from multidrop.plant.loader import load_plant
 
 
 async def test_the_fleet_is_calm_when_no_line_has_moved_between_two_views() -> None:

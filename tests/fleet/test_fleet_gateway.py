@@ -15,16 +15,12 @@ from typing import Any
 
 import pytest
 from nats_clusters import cluster
-from peers import require_module
 from serial_hall import SerialHall
 
-require_module("nats")
-require_module("pyarrow")
-
-from multidrop.fleet import gateway as fleet_gateway  # noqa: E402
-from multidrop.fleet.gateway import FleetGateway  # noqa: E402
-from multidrop.fleet.samples.forwarder import ForwarderState  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet import gateway as fleet_gateway
+from multidrop.fleet.gateway import FleetGateway
+from multidrop.fleet.samples.forwarder import ForwarderState
+from multidrop.fleet.servers import names
 
 PATIENCE_S = 60.0
 

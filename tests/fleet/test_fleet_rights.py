@@ -15,21 +15,16 @@ from typing import Any, NamedTuple
 
 import pytest
 from commands import Run
-from peers import require_module
+from nats.aio.client import Client
+from secured_clusters import SecuredCluster, secured_cluster
 
-require_module("nats")
-require_module("nkeys")
-
-from nats.aio.client import Client  # noqa: E402
-from secured_clusters import SecuredCluster, secured_cluster  # noqa: E402
-
-from multidrop.fleet.errors import (  # noqa: E402
+from multidrop.fleet.errors import (
     Denials,
     MayNotSend,
     NoRight,
 )
-from multidrop.fleet.servers.credentials import connect_options, inbox_of, public_key  # noqa: E402
-from multidrop.fleet.servers.rights import OTHERS, rights_of  # noqa: E402
+from multidrop.fleet.servers.credentials import connect_options, inbox_of, public_key
+from multidrop.fleet.servers.rights import OTHERS, rights_of
 
 GATEWAYS = ("gw-a", "gw-b")
 USERS = (*GATEWAYS, *OTHERS)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import pytest
 from fleet_scale import groups, large_fleet, plant_of_fake_lines, until
 from nats_clusters import Cluster
-from peers import require_module
-
-require_module("nats")
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

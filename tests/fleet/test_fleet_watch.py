@@ -18,22 +18,18 @@ import pytest
 from commands import Run
 from kills import BoundProcess
 from nats_clusters import Cluster
-from peers import require_module
 from tables import table
 from terminals import on_terminal
 
-require_module("nats")
-require_module("rich")
-
-from multidrop.cli.fleet import look  # noqa: E402
-from multidrop.cli.fleet import watch as fleet_watch  # noqa: E402
-from multidrop.cli.fleet.screen import picture  # noqa: E402
-from multidrop.cli.fleet.tables import moment, move_table, size  # noqa: E402
-from multidrop.fleet.overview import (  # noqa: E402
+from multidrop.cli.fleet import look
+from multidrop.cli.fleet import watch as fleet_watch
+from multidrop.cli.fleet.screen import picture
+from multidrop.cli.fleet.tables import moment, move_table, size
+from multidrop.fleet.overview import (
     FleetWatch,
     is_shown,
 )
-from multidrop.supervisor import Ended, supervisor  # noqa: E402
+from multidrop.supervisor import Ended, supervisor
 
 SPOOL = {"bytes": 81234, "lost": 0, "behind": 2, "lag_s": 1.5, "trouble": None}
 SAYS = {"state": "working", "margin_s": 1.94, "troubles": {}, "trouble": "", "spool": SPOOL}

@@ -6,15 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 from fleet_drills import MachineDrill, drilled_on_machines
-from peers import require_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")
 def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineDrill]:
-    require_module("nats")
-    require_module("pyarrow")
     with drilled_on_machines(tmp_path_factory.mktemp("machines")) as found:
         yield found
 

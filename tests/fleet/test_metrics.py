@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from peers import require_module, require_program
 from tables import table
 
-require_module("nats")
-
-from multidrop.exposition import expose_metrics  # noqa: E402
-from multidrop.fleet.metrics import (  # noqa: E402
+from multidrop.exposition import expose_metrics
+from multidrop.fleet.metrics import (
     MOST_CLIENTS,
     MOST_HEAD,
     answer,

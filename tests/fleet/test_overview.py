@@ -10,15 +10,12 @@ from typing import Any
 
 import pytest
 from fleets import HandClock, MemoryBucket
-from peers import require_module
 from tables import table
 
-require_module("nats")
-
-from multidrop.fleet.errors import FleetError  # noqa: E402
-from multidrop.fleet.lines.ownership import owner_value  # noqa: E402
-from multidrop.fleet.overview import MISSED_MS, FleetView  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.lines.ownership import owner_value
+from multidrop.fleet.overview import MISSED_MS, FleetView
+from multidrop.fleet.servers import names
 
 SPOOL = {"bytes": 1, "lost": 0, "behind": 0, "lag_s": 0.0, "trouble": None}
 STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "trouble": "", "spool": SPOOL}

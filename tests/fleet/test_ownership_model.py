@@ -8,12 +8,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import pytest
-from peers import require_module
 from tables import table
 
-require_module("nats")
-
-from multidrop.fleet.lines.ownership import (  # noqa: E402
+from multidrop.fleet.lines.ownership import (
     NEEDED,
     NOBODY,
     LineRecords,
@@ -21,7 +18,7 @@ from multidrop.fleet.lines.ownership import (  # noqa: E402
     claim_of,
     owner_value,
 )
-from multidrop.fleet.servers.buckets import NONE_YET, Record  # noqa: E402
+from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 BUCKETS = 3
 

@@ -12,19 +12,15 @@ import pytest
 from gateways import served, written
 from lines import until
 from nats_clusters import Cluster, free_ports
-from peers import require_module
 
-require_module("nats")
-require_module("starlette")
-
-from multidrop import PlantError  # noqa: E402
-from multidrop.fleet.overview import (  # noqa: E402
+from multidrop import PlantError
+from multidrop.fleet.overview import (
     FleetView,
     FleetWatch,
 )
-from multidrop.fleet.page_part import FleetPart  # noqa: E402
-from multidrop.fleet.servers.connections import ServerPath  # noqa: E402
-from multidrop.gateway.settings import read_settings  # noqa: E402
+from multidrop.fleet.page_part import FleetPart
+from multidrop.fleet.servers.connections import ServerPath
+from multidrop.gateway.settings import read_settings
 
 
 @pytest.mark.parametrize(
@@ -147,7 +143,6 @@ def test_the_page_shows_a_real_fleet_and_a_missing_one(fleet: Cluster, tmp_path:
 
 @pytest.mark.long
 def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
-    require_module("nkeys")
     from secured_clusters import multidrop, secured_cluster
 
     plant = written(tmp_path, port="socket://127.0.0.1:4001")
@@ -167,7 +162,6 @@ def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("user", ["viewer", "commander"])
 def test_the_page_stops_the_fleet_with_a_commanders_key_alone(tmp_path: Path, user: str) -> None:
-    require_module("nkeys")
     from secured_clusters import secured_fleet
 
     with secured_fleet(tmp_path / "fleet", 1) as fleet:

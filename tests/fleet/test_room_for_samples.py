@@ -10,14 +10,10 @@ from pathlib import Path
 import nats_clusters
 import pytest
 from commands import Run
+from nats.aio.client import Client
 from nats_clusters import Cluster, cluster
-from peers import require_module
 
-require_module("nats")
-
-from nats.aio.client import Client  # noqa: E402
-
-from multidrop.fleet.samples.samples_stream import about, connect, create_stream, publish  # noqa: E402
+from multidrop.fleet.samples.samples_stream import about, connect, create_stream, publish
 
 MESSAGE = 500_000  # bytes
 PLANT = """

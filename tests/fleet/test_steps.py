@@ -9,14 +9,11 @@ from itertools import pairwise
 import pytest
 from controlled_loop import run_controlled
 from fleets import Hall, HandClock, RecordingMastership
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.leases.lease import Held, boottime_ns  # noqa: E402
-from multidrop.fleet.leases.member import Member  # noqa: E402
-from multidrop.fleet.leases.rules import SECOND  # noqa: E402
-from multidrop.fleet.servers.connections import paths_of  # noqa: E402
+from multidrop.fleet.leases.lease import Held, boottime_ns
+from multidrop.fleet.leases.member import Member
+from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.servers.connections import paths_of
 
 
 def a_member() -> Member:

@@ -8,20 +8,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
-from multidrop.fleet.samples import samples_stream  # noqa: E402
-from multidrop.fleet.samples.samples_stream import StreamError  # noqa: E402
-from multidrop.fleet.servers import (  # noqa: E402
+from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.samples import samples_stream
+from multidrop.fleet.samples.samples_stream import StreamError
+from multidrop.fleet.servers import (
     names,
     setup,
 )
-from multidrop.fleet.servers.buckets import Bucket, Record, ask  # noqa: E402
-from multidrop.fleet.servers.leaders import cluster_at, has_leader, led_clusters  # noqa: E402
-from multidrop.fleet.servers.setup import check_buckets  # noqa: E402
+from multidrop.fleet.servers.buckets import Bucket, Record, ask
+from multidrop.fleet.servers.leaders import cluster_at, has_leader, led_clusters
+from multidrop.fleet.servers.setup import check_buckets
 
 STRANGE = {
     "nothing": b"",

@@ -11,30 +11,26 @@ from typing import Any
 
 import pytest
 from fleets import Hall, RecordingMastership
+from nats.aio.msg import Msg
 from nats_clusters import Cluster, cluster
-from peers import require_module
 from tables import table
 
-require_module("nats")
-
-from nats.aio.msg import Msg  # noqa: E402
-
-from multidrop.fleet.errors import FleetError  # noqa: E402
-from multidrop.fleet.gateway import ask_gateway  # noqa: E402
-from multidrop.fleet.leases import member as member_module  # noqa: E402
-from multidrop.fleet.leases.lease import boottime_ns  # noqa: E402
-from multidrop.fleet.leases.member import Member  # noqa: E402
-from multidrop.fleet.leases.rules import SECOND, USUAL  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import (  # noqa: E402
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.gateway import ask_gateway
+from multidrop.fleet.leases import member as member_module
+from multidrop.fleet.leases.lease import boottime_ns
+from multidrop.fleet.leases.member import Member
+from multidrop.fleet.leases.rules import SECOND, USUAL
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import (
     Bucket,
     LeaseBucket,
     ServerError,
 )
-from multidrop.fleet.servers.connections import ServerPath, paths_of  # noqa: E402
-from multidrop.fleet.servers.plant_store import store  # noqa: E402
-from multidrop.fleet.servers.record_shapes import LARGE, SMALL, parsed  # noqa: E402
-from multidrop.fleet.servers.setup import open_all, set_up  # noqa: E402
+from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.plant_store import store
+from multidrop.fleet.servers.record_shapes import LARGE, SMALL, parsed
+from multidrop.fleet.servers.setup import open_all, set_up
 
 LEASE = {
     **{

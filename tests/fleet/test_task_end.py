@@ -5,12 +5,8 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from peers import require_module
-
-require_module("nats")
-
-from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.supervisor import end_tasks  # noqa: E402
+from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.supervisor import end_tasks
 
 PATIENCE_S = 60.0
 

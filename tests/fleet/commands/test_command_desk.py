@@ -14,17 +14,13 @@ import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
 from examples import every_third
 from lines import patient
-from peers import require_module
 from tables import table
 
 from multidrop import Stopped
 from multidrop.control import Seen, audit_log, read_audit
-
-require_module("nats")
-
-from multidrop.fleet.commands import stop_desk  # noqa: E402
-from multidrop.fleet.commands.desk import MOST_WRITES  # noqa: E402
-from multidrop.fleet.commands.messages import (  # noqa: E402
+from multidrop.fleet.commands import stop_desk
+from multidrop.fleet.commands.desk import MOST_WRITES
+from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandOutcome,
     Offered,

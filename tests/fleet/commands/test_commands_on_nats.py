@@ -13,21 +13,17 @@ import pytest
 from command_desks import LINE, MAY, Desks, desks
 from command_drills import CommandDrill, command_drill
 from nats_clusters import Cluster
-from peers import require_module
 
-require_module("nats")
-require_module("pyarrow")
-
-from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.commands.messages import CommandOutcome, Offered  # noqa: E402
-from multidrop.fleet.commands.subjects import CommandSubjects  # noqa: E402
-from multidrop.fleet.errors import NobodyThere, Unsure  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
-from multidrop.fleet.servers.connections import ServerPath, paths_of  # noqa: E402
-from multidrop.fleet.servers.plant_store import store  # noqa: E402
-from multidrop.fleet.servers.setup import open_all  # noqa: E402
-from multidrop.supervisor import supervisor  # noqa: E402
+from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.commands.messages import CommandOutcome, Offered
+from multidrop.fleet.commands.subjects import CommandSubjects
+from multidrop.fleet.errors import NobodyThere, Unsure
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Bucket
+from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.plant_store import store
+from multidrop.fleet.servers.setup import open_all
+from multidrop.supervisor import supervisor
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

@@ -11,16 +11,13 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.control import read_audit  # noqa: E402
-from multidrop.fleet.commands import fleet_commands as asker_module  # noqa: E402
-from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome  # noqa: E402
-from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure  # noqa: E402
-from multidrop.fleet.servers.buckets import Record  # noqa: E402
+from multidrop.control import read_audit
+from multidrop.fleet.commands import fleet_commands as asker_module
+from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
+from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure
+from multidrop.fleet.servers.buckets import Record
 
 DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
 OFFER = {"token": "t", "subject": "do.gw-1.run", "text": "pump-1: frequency = 20.00 Hz", "gateway": "gw-1"}

@@ -12,12 +12,9 @@ import pytest
 from command_desks import Desks, desks
 from kills import BoundProcess
 from lines import PATIENCE
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.commands.log import CommandLog  # noqa: E402
-from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.messages import CommandOutcome
 
 HANGING_LOG = """
 import asyncio, sys, threading

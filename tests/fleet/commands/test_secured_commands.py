@@ -9,25 +9,20 @@ from pathlib import Path
 
 import pytest
 from command_desks import LINE, MAY, Desks, desks
-from peers import require_module
+from nats.aio.client import Client
+from nats.errors import NoRespondersError
+from nats.errors import TimeoutError as NatsTimeout
+from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 
-require_module("nats")
-require_module("nkeys")
-
-from nats.aio.client import Client  # noqa: E402
-from nats.errors import NoRespondersError  # noqa: E402
-from nats.errors import TimeoutError as NatsTimeout  # noqa: E402
-from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster  # noqa: E402
-
-from multidrop.fleet.commands.fleet_commands import FleetCommands  # noqa: E402
-from multidrop.fleet.commands.messages import CommandOutcome  # noqa: E402
-from multidrop.fleet.commands.subjects import CommandSubjects  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import Bucket  # noqa: E402
-from multidrop.fleet.servers.connections import connect, paths_of  # noqa: E402
-from multidrop.fleet.servers.plant_store import store  # noqa: E402
-from multidrop.fleet.servers.setup import open_all, set_up  # noqa: E402
-from multidrop.supervisor import supervisor  # noqa: E402
+from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.commands.messages import CommandOutcome
+from multidrop.fleet.commands.subjects import CommandSubjects
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Bucket
+from multidrop.fleet.servers.connections import connect, paths_of
+from multidrop.fleet.servers.plant_store import store
+from multidrop.fleet.servers.setup import open_all, set_up
+from multidrop.supervisor import supervisor
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

@@ -10,17 +10,14 @@ from typing import Any
 import pytest
 from controlled_loop import run_controlled
 from fleets import GatedBucket, HandClock, MemoryBucket, RecordingMastership
-from peers import require_module
 from tables import table
 
-require_module("nats")
-
-from multidrop.fleet import file_lock  # noqa: E402
-from multidrop.fleet.errors import FleetError, Unsure  # noqa: E402
-from multidrop.fleet.file_lock import LifeLock  # noqa: E402
-from multidrop.fleet.leases.lease import Lease  # noqa: E402
-from multidrop.fleet.leases.observer import Observer  # noqa: E402
-from multidrop.fleet.leases.rules import SECOND, USUAL  # noqa: E402
+from multidrop.fleet import file_lock
+from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.file_lock import LifeLock
+from multidrop.fleet.leases.lease import Lease
+from multidrop.fleet.leases.observer import Observer
+from multidrop.fleet.leases.rules import SECOND, USUAL
 
 
 class Trial:

@@ -13,31 +13,28 @@ from itertools import count
 import pytest
 from fleets import Hall, RecordingMastership
 from nats_clusters import Cluster
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.errors import Conflict  # noqa: E402
-from multidrop.fleet.leases import member as member_module  # noqa: E402
-from multidrop.fleet.leases.lease import Lease, boottime_ns  # noqa: E402
-from multidrop.fleet.leases.member import Member, MemberState  # noqa: E402
-from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms  # noqa: E402
-from multidrop.fleet.lines import (  # noqa: E402
+from multidrop.fleet.errors import Conflict
+from multidrop.fleet.leases import member as member_module
+from multidrop.fleet.leases.lease import Lease, boottime_ns
+from multidrop.fleet.leases.member import Member, MemberState
+from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
+from multidrop.fleet.lines import (
     line_keeper,
     releases,
     unopened_lines,
 )
-from multidrop.fleet.lines.line_keeper import PortLoss  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import (  # noqa: E402
+from multidrop.fleet.lines.line_keeper import PortLoss
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import (
     Bucket,
     LeaseBucket,
 )
-from multidrop.fleet.servers.connections import paths_of  # noqa: E402
-from multidrop.fleet.servers.leaders import Cluster as Servers  # noqa: E402
-from multidrop.fleet.servers.leaders import Replica  # noqa: E402
-from multidrop.fleet.servers.plant_store import store  # noqa: E402
-from multidrop.fleet.servers.setup import open_all  # noqa: E402
+from multidrop.fleet.servers.connections import paths_of
+from multidrop.fleet.servers.leaders import Cluster as Servers
+from multidrop.fleet.servers.leaders import Replica
+from multidrop.fleet.servers.plant_store import store
+from multidrop.fleet.servers.setup import open_all
 
 LINES = [f"line-{at}" for at in range(30)]
 PATIENCE_S = 120.0

@@ -7,15 +7,12 @@ from typing import Any
 
 import pytest
 from fleets import HandClock, MemoryBucket, RecordingMastership
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.leases import rules as lease_rules  # noqa: E402
-from multidrop.fleet.leases.lease import Lease  # noqa: E402
-from multidrop.fleet.leases.member import OtherRules  # noqa: E402
-from multidrop.fleet.leases.observer import Observer  # noqa: E402
-from multidrop.fleet.leases.rules import RULES, USUAL  # noqa: E402
+from multidrop.fleet.leases import rules as lease_rules
+from multidrop.fleet.leases.lease import Lease
+from multidrop.fleet.leases.member import OtherRules
+from multidrop.fleet.leases.observer import Observer
+from multidrop.fleet.leases.rules import RULES, USUAL
 
 SENTENCE = "incompatible version of multidrop in this fleet: no line is taken until {} is stopped"
 

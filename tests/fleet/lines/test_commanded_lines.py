@@ -13,15 +13,12 @@ from typing import Any
 
 import pytest
 from command_desks import LINE, MAY, PATIENCE_S, desks
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.commands import desk as command_desk  # noqa: E402
-from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome  # noqa: E402
-from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.supervisor import supervisor  # noqa: E402
+from multidrop.fleet.commands import desk as command_desk
+from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
+from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
+from multidrop.fleet.servers import names
+from multidrop.supervisor import supervisor
 
 
 class HeardPath:

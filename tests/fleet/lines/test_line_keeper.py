@@ -10,21 +10,18 @@ from typing import Any
 
 import pytest
 from fleets import GatedBucket, Hall, HandClock, MemoryBucket, RecordingLines, RecordingMastership
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.leases.lease import Lease  # noqa: E402
-from multidrop.fleet.leases.rules import SECOND, USUAL  # noqa: E402
-from multidrop.fleet.lines import (  # noqa: E402
+from multidrop.fleet.leases.lease import Lease
+from multidrop.fleet.leases.rules import SECOND, USUAL
+from multidrop.fleet.lines import (
     line_keeper,
     owner_records,
 )
-from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss  # noqa: E402
-from multidrop.fleet.lines.ownership import owner_of, owner_value  # noqa: E402
-from multidrop.fleet.lines.records import ShareRecords  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import Record  # noqa: E402
+from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss
+from multidrop.fleet.lines.ownership import owner_of, owner_value
+from multidrop.fleet.lines.records import ShareRecords
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Record
 
 
 async def until(condition: Callable[[], bool]) -> None:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from peers import require_module
-
-require_module("nats")
-
-from multidrop.fleet.lines.moves import Move, Moves, move_of  # noqa: E402
+from multidrop.fleet.lines.moves import Move, Moves, move_of
 
 
 def told(*moves: Move) -> list[tuple[str | None, str]]:

@@ -7,12 +7,9 @@ import random
 from collections import Counter
 
 import pytest
-from peers import require_module
 from tables import table
 
-require_module("nats")
-
-from multidrop.fleet.lines.ownership import (  # noqa: E402
+from multidrop.fleet.lines.ownership import (
     NEEDED,
     Claim,
     Step,
@@ -21,9 +18,9 @@ from multidrop.fleet.lines.ownership import (  # noqa: E402
     owner_by,
     owner_value,
 )
-from multidrop.fleet.lines.shares import assign  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import Record  # noqa: E402
+from multidrop.fleet.lines.shares import assign
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Record
 
 LINES = [f"hall-{hall}-line-{line}" for hall in range(20) for line in range(50)]
 GATEWAYS = [f"gw{at:02}" for at in range(20)]

@@ -9,22 +9,19 @@ from typing import Any
 import pytest
 from fleets import MemoryBucket
 from nats_clusters import Cluster, cluster
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.errors import Unsure  # noqa: E402
-from multidrop.fleet.leases.rules import USUAL  # noqa: E402
-from multidrop.fleet.lines import records as line_records  # noqa: E402
-from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value  # noqa: E402
-from multidrop.fleet.lines.records import ShareFollower, ShareRecords  # noqa: E402
-from multidrop.fleet.servers import (  # noqa: E402
+from multidrop.fleet.errors import Unsure
+from multidrop.fleet.leases.rules import USUAL
+from multidrop.fleet.lines import records as line_records
+from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value
+from multidrop.fleet.lines.records import ShareFollower, ShareRecords
+from multidrop.fleet.servers import (
     buckets,
     names,
 )
-from multidrop.fleet.servers.buckets import Bucket, Record  # noqa: E402
-from multidrop.fleet.servers.connections import paths_of  # noqa: E402
-from multidrop.fleet.servers.setup import set_up  # noqa: E402
+from multidrop.fleet.servers.buckets import Bucket, Record
+from multidrop.fleet.servers.connections import paths_of
+from multidrop.fleet.servers.setup import set_up
 
 ME, OTHER, NOBODY = (owner_value(who, 1, 0) for who in (("a", 2), ("b", 1), ("", 0)))
 

@@ -6,14 +6,11 @@ import asyncio
 from typing import Any
 
 import pytest
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.lines import releases  # noqa: E402
-from multidrop.fleet.lines.releases import WAIT_S, Releases  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.leaders import Cluster, Replica  # noqa: E402
+from multidrop.fleet.lines import releases
+from multidrop.fleet.lines.releases import WAIT_S, Releases
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.leaders import Cluster, Replica
 
 FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # one of each
 LINES = set(FIRST.values())

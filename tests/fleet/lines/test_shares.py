@@ -7,14 +7,10 @@ from collections import Counter
 from typing import Any
 
 from fleets import Hall, HandClock, RecordingMastership
-from peers import require_module
 
-require_module("nats")
-
-
-from multidrop.fleet.leases.member import SETTLE_S, Member  # noqa: E402
-from multidrop.fleet.leases.rules import RULES, SECOND  # noqa: E402
-from multidrop.fleet.lines.shares import QUIET_NS  # noqa: E402
+from multidrop.fleet.leases.member import SETTLE_S, Member
+from multidrop.fleet.leases.rules import RULES, SECOND
+from multidrop.fleet.lines.shares import QUIET_NS
 
 VALUE: dict[str, Any] = {"session": 1, "draining": False, "rules": RULES}
 LINES = tuple(f"line-{at}" for at in range(40))

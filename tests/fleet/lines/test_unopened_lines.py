@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import pytest
 from fleets import HandClock
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.leases.rules import SECOND  # noqa: E402
-from multidrop.fleet.lines.shares import assign, hand_over  # noqa: E402
-from multidrop.fleet.lines.unopened_lines import (  # noqa: E402
+from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.lines.shares import assign, hand_over
+from multidrop.fleet.lines.unopened_lines import (
     FIRST_WAIT_NS,
     LAST_WAIT_NS,
     LOST_NS,

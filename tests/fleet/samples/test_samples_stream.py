@@ -11,15 +11,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from nats.aio.client import Client
 from nats_clusters import Cluster, cluster
-from peers import require_module
 from sample_streams import client_of
 
-require_module("nats")
-
-from nats.aio.client import Client  # noqa: E402
-
-from multidrop.fleet.samples.samples_stream import StreamMessage, read_after  # noqa: E402
+from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 
 pytestmark = pytest.mark.slow
 

@@ -15,21 +15,15 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
-from peers import require_module
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from secured_clusters import SecuredCluster, in_one_account, secured_cluster
 
-require_module("nats")
-require_module("nkeys")
-require_module("pyarrow")
-
-from nats.aio.client import Client  # noqa: E402
-from nats.aio.msg import Msg  # noqa: E402
-from secured_clusters import SecuredCluster, in_one_account, secured_cluster  # noqa: E402
-
-from multidrop.fleet.samples.samples_stream import STREAM, connect, create_stream  # noqa: E402
-from multidrop.fleet.servers.connections import paths_of  # noqa: E402
-from multidrop.fleet.servers.credentials import inbox_of, public_key  # noqa: E402
-from multidrop.fleet.servers.rights import OTHERS, rights_of  # noqa: E402
-from multidrop.fleet.servers.setup import set_up  # noqa: E402
+from multidrop.fleet.samples.samples_stream import STREAM, connect, create_stream
+from multidrop.fleet.servers.connections import paths_of
+from multidrop.fleet.servers.credentials import inbox_of, public_key
+from multidrop.fleet.servers.rights import OTHERS, rights_of
+from multidrop.fleet.servers.setup import set_up
 
 PATIENCE_S = 60.0
 GATEWAYS = ("gw-a", "gw-b")

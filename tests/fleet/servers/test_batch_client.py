@@ -8,29 +8,25 @@ from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import pytest
+from nats.aio.client import Client
 from nats_clusters import Cluster, cluster
-from peers import require_module
 from tables import table
 
-require_module("nats")
-
-from nats.aio.client import Client  # noqa: E402
-
-from multidrop.fleet.errors import Unsure  # noqa: E402
-from multidrop.fleet.servers import (  # noqa: E402
-    batch_client,  # noqa: E402, RUF100
-    direct_gets,  # noqa: E402, RUF100
+from multidrop.fleet.errors import Unsure
+from multidrop.fleet.servers import (
+    batch_client,
+    direct_gets,
 )
-from multidrop.fleet.servers.batch_client import (  # noqa: E402
+from multidrop.fleet.servers.batch_client import (
     BatchClient,
     DirectGet,
     DirectMessage,
     Request,
     stored_message,
 )
-from multidrop.fleet.servers.buckets import Bucket, Record  # noqa: E402
-from multidrop.fleet.servers.connections import ServerPath, connect, paths_of  # noqa: E402
-from multidrop.fleet.servers.setup import set_up  # noqa: E402
+from multidrop.fleet.servers.buckets import Bucket, Record
+from multidrop.fleet.servers.connections import ServerPath, connect, paths_of
+from multidrop.fleet.servers.setup import set_up
 
 OWNER = {"gateway": "gw-9", "session": 1, "votes": 1, "turn": 1, "since": 0}
 SERVERS = (

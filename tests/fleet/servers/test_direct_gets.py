@@ -7,13 +7,10 @@ from collections.abc import Sequence
 
 import pytest
 from controlled_loop import run_controlled
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.errors import FleetError, NoRight, Unsure  # noqa: E402
-from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request  # noqa: E402
-from multidrop.fleet.servers.direct_gets import AGAIN_S, EARNED, MOST_SPARE, Spare, first_answer  # noqa: E402
+from multidrop.fleet.errors import FleetError, NoRight, Unsure
+from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request
+from multidrop.fleet.servers.direct_gets import AGAIN_S, EARNED, MOST_SPARE, Spare, first_answer
 
 NEVER = 1e9
 REQUEST = Request("questions", b"")

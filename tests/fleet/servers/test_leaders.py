@@ -8,16 +8,13 @@ from typing import Any
 
 import pytest
 from controlled_loop import run_controlled
-from peers import require_module
 
-require_module("nats")
-
-from multidrop.fleet.errors import Unsure  # noqa: E402
-from multidrop.fleet.servers import (  # noqa: E402
+from multidrop.fleet.errors import Unsure
+from multidrop.fleet.servers import (
     leaders,
     names,
 )
-from multidrop.fleet.servers.leaders import (  # noqa: E402
+from multidrop.fleet.servers.leaders import (
     HAND_OVER_S,
     SILENT_FOR_S,
     SOON_S,

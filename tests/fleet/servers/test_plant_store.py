@@ -8,14 +8,10 @@ from typing import Any
 
 import pytest
 from fleets import MemoryBucket
-from peers import require_module
 
 from multidrop import Plant
-
-require_module("nats")
-
-from multidrop.fleet.servers.buckets import Record  # noqa: E402
-from multidrop.fleet.servers.plant_store import line_of, read_plant, store  # noqa: E402
+from multidrop.fleet.servers.buckets import Record
+from multidrop.fleet.servers.plant_store import line_of, read_plant, store
 
 PLANT = r"""
 [[line]]

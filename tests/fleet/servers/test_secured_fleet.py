@@ -16,13 +16,7 @@ from pathlib import Path
 import pytest
 from commands import Run
 from nats_clusters import cluster
-from peers import require_module
-
-require_module("nats")
-require_module("nkeys")
-require_module("pyarrow")
-
-from secured_clusters import (  # noqa: E402  # noqa: E402
+from secured_clusters import (
     GATEWAYS,
     PATIENCE_S,
     SecuredCluster,
@@ -35,11 +29,11 @@ from secured_clusters import (  # noqa: E402  # noqa: E402
     secured_fleet,
     until,
 )
-from spooled import numbered  # noqa: E402
+from spooled import numbered
 
-from multidrop.fleet.errors import Conflict  # noqa: E402
-from multidrop.fleet.samples.hub import SourceCheck  # noqa: E402
-from multidrop.fleet.samples.samples_stream import (  # noqa: E402
+from multidrop.fleet.errors import Conflict
+from multidrop.fleet.samples.hub import SourceCheck
+from multidrop.fleet.samples.samples_stream import (
     DIGEST,
     LOST,
     SEQUENCE,
@@ -50,10 +44,10 @@ from multidrop.fleet.samples.samples_stream import (  # noqa: E402
     read_after,
     subject_of,
 )
-from multidrop.fleet.samples.spool import Spool  # noqa: E402
-from multidrop.fleet.servers import names  # noqa: E402
-from multidrop.fleet.servers.buckets import LeaseBucket  # noqa: E402
-from multidrop.fleet.servers.connections import paths_of  # noqa: E402
+from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import LeaseBucket
+from multidrop.fleet.servers.connections import paths_of
 
 AN_HOUR_AHEAD = """
 import time
