@@ -147,7 +147,7 @@ def stores(folder: Path) -> Iterator[tuple[object, ...]]:
     units = units_of(found[0])  # all messages have the same drives
     sent = [one.data for columns in found for one in packed(columns, units)]
     rows = sum(len(columns.time) for columns in found)
-    spool = SpoolFolder(folder / "spool", "gateway-1", "fleet")
+    spool = SpoolFolder(folder / "spool", "gateway-1")
 
     def spooled() -> int:
         for columns in found:

@@ -203,7 +203,7 @@ def test_a_missing_extra(run: Run, monkeypatch: pytest.MonkeyPatch, library: str
 
 
 def test_two_gateways_of_one_name_on_one_machine(run: Run, tmp_path: Path, nobody: str) -> None:
-    from multidrop.fleet.file_lock import LifeLock
+    from multidrop.fleet.leases.life_lock import LifeLock
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
         said = one_sentence(run("fleet", "serve", "gw-1", "--folder", tmp_path, "--nats", nobody))

@@ -17,7 +17,7 @@ from multidrop.core import Mastership
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight
-from multidrop.fleet.file_lock import LifeLock
+from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines.fleet_lines import FleetLines

@@ -51,6 +51,7 @@ from multidrop.recording.format import Metadata as Metadata
 from multidrop.recording.format import RecordingError as RecordingError
 from multidrop.recording.format import RecordingReader as RecordingReader
 from multidrop.recording.format import RecordingWriter as RecordingWriter
+from multidrop.recording.segments import FileLock as FileLock
 from multidrop.recording.segments import SegmentWriter as SegmentWriter
 from multidrop.recording.segments import parse_age as parse_age
 from multidrop.recording.segments import parse_size as parse_size

@@ -12,10 +12,10 @@ from controlled_loop import run_controlled
 from fleets import GatedBucket, HandClock, MemoryBucket, RecordingMastership
 from tables import table
 
-from multidrop.fleet import file_lock
 from multidrop.fleet.errors import FleetError, Unsure
-from multidrop.fleet.file_lock import LifeLock
+from multidrop.fleet.leases import life_lock
 from multidrop.fleet.leases.lease import Lease
+from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import SECOND, USUAL
 
@@ -373,7 +373,7 @@ async def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives
 async def test_the_lock_file_proves_the_predecessors_death(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
     trial = Trial()
     lock = LifeLock(tmp_path / "a.lock")
     assert await trial.lease(lock=lock).try_to_begin()
@@ -391,11 +391,11 @@ async def test_a_lock_file_of_another_machine_proves_nothing(
     machine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
-    monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
     lock = LifeLock(tmp_path / "a.lock")
     assert await trial.lease(lock=lock).try_to_begin()
     lock.close()
-    monkeypatch.setattr(file_lock, "machine_id", lambda: machine)
+    monkeypatch.setattr(life_lock, "machine_id", lambda: machine)
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         assert not await trial.lease(lock=lock).try_to_begin()
 
@@ -404,7 +404,7 @@ async def test_another_file_at_the_same_path_proves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two containers of one machine may both have /var/lib/multidrop/a.lock."""
-    monkeypatch.setattr(file_lock, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
     trial = Trial()
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         assert await trial.lease(lock=lock).try_to_begin()
@@ -417,7 +417,7 @@ async def test_two_machines_without_an_id_prove_nothing_to_each_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
-    monkeypatch.setattr(file_lock, "machine_id", lambda: "")
+    monkeypatch.setattr(life_lock, "machine_id", lambda: "")
     lock = LifeLock(tmp_path / "a.lock")
     assert await trial.lease(lock=lock).try_to_begin()
     lock.close()
@@ -433,7 +433,7 @@ async def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_w
     machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
     machine.write_text("copied\n", "utf-8")
     boot.write_text("first\n", "utf-8")
-    monkeypatch.setattr(file_lock, "IDS", (machine, boot))
+    monkeypatch.setattr(life_lock, "IDS", (machine, boot))
     lock = LifeLock(tmp_path / "a.lock")
     assert await trial.lease(lock=lock).try_to_begin()
     lock.close()
@@ -447,9 +447,9 @@ async def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_w
 def test_a_machines_id_has_the_kernels_boot_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = tmp_path / "machine-id"
     own.write_text("of a trial", "utf-8")
-    monkeypatch.setattr(file_lock, "IDS", (own, *file_lock.IDS[1:]))
+    monkeypatch.setattr(life_lock, "IDS", (own, *life_lock.IDS[1:]))
     boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    assert file_lock.machine_id() == f"of a trial.{boot}"
+    assert life_lock.machine_id() == f"of a trial.{boot}"
 
 
 @pytest.mark.parametrize("empty", [0, 1])
@@ -459,12 +459,12 @@ def test_without_one_of_its_ids_a_machine_has_none(
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
     for path in ids:
         path.write_text("something\n", "utf-8")
-    monkeypatch.setattr(file_lock, "IDS", ids)
-    assert file_lock.machine_id() == "something.something"
+    monkeypatch.setattr(life_lock, "IDS", ids)
+    assert life_lock.machine_id() == "something.something"
     ids[empty].write_text("\n", "utf-8")
-    assert file_lock.machine_id() == ""
+    assert life_lock.machine_id() == ""
     ids[empty].unlink()
-    assert file_lock.machine_id() == ""
+    assert life_lock.machine_id() == ""
 
 
 # ---- those who watch ----

@@ -409,20 +409,10 @@ def test_values_that_are_missing_in_part(empty: Postgres) -> None:
     assert found[9] == ("value_10", None, "no valid value")
 
 
-OF_AN_OLDER_HUB = """
-create schema multidrop;
-create table multidrop.register_sets (id serial primary key, names text[] unique not null);
-insert into multidrop.register_sets (names)
-    values (array(select 'value_' || n from generate_series(1, 10) n));
-"""
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("before", ["", OF_AN_OLDER_HUB])
-def test_samples_have_their_units(empty: Postgres, before: str) -> None:
+def test_samples_have_their_units(empty: Postgres) -> None:
     import pyarrow as pa
 
-    empty.ask(f"{before} select 1")
     sink = PostgresSink(empty.where)
     sink.begin("then")
     for number, units in enumerate((None, "V", "A"), 1):

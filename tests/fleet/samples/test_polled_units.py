@@ -78,19 +78,6 @@ def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
     assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # without a description
 
 
-def test_a_message_of_before_has_unknown_units(tmp_path: Path) -> None:
-    buffer = RowBuffer()
-    assert buffer.add(numbered(0, 40).columns())
-    (message,) = buffer.messages(units=changed(tmp_path))
-    with pa.ipc.open_stream(message.data) as reader:
-        old = reader.read_all().drop_columns(["unit"])
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, old.schema) as writer:
-        writer.write_table(old)
-    table = unpack(bytes(sink.getvalue()))
-    assert table.column("unit").null_count == len(table) == 400
-
-
 def test_a_gateway_notes_the_units_of_a_line_that_it_takes(tmp_path: Path) -> None:
     units = PolledUnits()
     lines = FleetLines(Mastership(), tmp_path, units)
@@ -114,8 +101,6 @@ def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None
     hour = 3600 * 10**9 // STEP
     for at, units in ((0, None), (50, changed(tmp_path / "lines")), (hour, None)):
         found = tables(units, at)
-        if at == 0:
-            found = [table.drop_columns(["unit"]) for table in found]
         last = {0: 1, 50: 2}.get(at, 3)
         sink.write(Commit("made", last, last, {"a.x": last}, found, 400))
     sink.close()
@@ -135,15 +120,13 @@ def test_units_have_the_words_of_a_history() -> None:
 
 @pytest.fixture(params=["as they came", "merged"])
 def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """The folder of a hub, with a change within its first file, and later rows of an older gateway."""
+    """The folder of a hub, with a change within its first file, and later rows without units."""
     require_module("duckdb")
     folder, units = tmp_path / "kept", changed(tmp_path / "lines")
     sink = ParquetSink(folder)
     hour = 3600 * 10**9 // STEP
     for at, first in enumerate((0, 40, 80, hour), 1):
-        found = tables(units, first)
-        if first == 40:
-            found = [table.drop_columns(["unit"]) for table in found]
+        found = tables(None if first == 40 else units, first)
         sink.write(Commit("made", at, at, {"a.x": at}, found, 400))
     sink.close()
     if request.param == "merged":

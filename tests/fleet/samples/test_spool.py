@@ -179,7 +179,7 @@ def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch
 
         return act
 
-    files = SpoolFolder(folder, GATEWAY, "fleet")
+    files = SpoolFolder(folder, GATEWAY)
     monkeypatch.setattr(os, "open", opened)
     for call in ("write", "fsync", "rename"):
         monkeypatch.setattr(os, call, noted(call))
@@ -371,13 +371,8 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
 
 def test_another_gateways_spool_is_refused(folder: Path) -> None:
     filled(folder, 1)
-    with pytest.raises(
-        SpoolError,
-        match="is the spool of gateway 'gateway-1' in fleet 'fleet', not of 'gateway-2' in 'fleet'",
-    ):
+    with pytest.raises(SpoolError, match="is the spool of gateway 'gateway-1', not of 'gateway-2'"):
         Spool(folder, "gateway-2")
-    with pytest.raises(SpoolError, match="not of 'gateway-1' in 'plant-7'"):
-        Spool(folder, GATEWAY, fleet="plant-7")
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
-from multidrop.fleet import file_lock
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.file_lock import LifeLock
+from multidrop.fleet.leases import life_lock
 from multidrop.fleet.leases import rules as lease_rules
+from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 
@@ -193,7 +193,7 @@ class Lease:
             "ended": ended,
             "began": self.began_ms,
             "host": os.uname().nodename,
-            "machine": file_lock.machine_id(),
+            "machine": life_lock.machine_id(),
             "lock": str(self._lock.path) if self._lock else "",
             "lock_id": self._lock.id if self._lock else "",
             "pid": os.getpid(),

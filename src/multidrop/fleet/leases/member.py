@@ -23,8 +23,8 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from multidrop.fleet.file_lock import LifeLock
 from multidrop.fleet.leases.lease import Lease, MayPoll
+from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, PortLoss, TakenLine, no_loss

@@ -17,8 +17,7 @@ names in these rows. An uncertainty is rounded up to whole microseconds: the bou
 ten bits are noise.
 
 The unit comes from the description under which the row was polled: "" for a number without a unit, "raw
-count" if the step is unknown, "names of yd1000" if numbers stand for this family's names. Older messages have
-no such column.
+count" if the step is unknown, "names of yd1000" if numbers stand for this family's names.
 
 Any holder of a gateway's key may send other bytes as a message. A message that declares an unpacked size
 above 4 MiB is rejected before it is unpacked, and so are columns of other types, which may grow in a cast.
@@ -233,8 +232,7 @@ def unpack(data: bytes | memoryview) -> Any:
         uncertainty_us = table.column("uncertainty_us").cast(pa.int32()).cast(pa.int64())
         columns["uncertainty_ns"] = pc.multiply(uncertainty_us, 1000)
         columns["value"] = table.column("value")
-        has_units = "unit" in table.schema.names
-        columns["unit"] = table.column("unit") if has_units else pa.nulls(len(table), pa.utf8())
+        columns["unit"] = table.column("unit")
         rows = pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
         _check(rows)
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:

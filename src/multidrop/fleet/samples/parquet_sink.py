@@ -30,9 +30,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from multidrop.fleet.file_lock import lock
 from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
 from multidrop.fleet.samples.message import ROWS
+from multidrop.recording import FileLock
 
 KEY = "multidrop"  # key of the files' metadata, as in all recordings
 SECOND_NS = 1_000_000_000
@@ -55,14 +55,11 @@ class ParquetSink:
         self._rows = self.folder / "rows"
         try:
             self._rows.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(self.folder / ".hub.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            self._lock = FileLock(self.folder / ".hub.lock")
+        except BlockingIOError:
+            raise NotThisHubs(f"another hub writes into {self.folder}") from None
         except OSError as failure:
             raise SinkError(f"the folder {self.folder} cannot be written: {failure.strerror}") from failure
-        try:
-            lock(self._lock)
-        except BlockingIOError:
-            self.close()
-            raise NotThisHubs(f"another hub writes into {self.folder}") from None
         others = sorted(
             one.name for one in self.folder.iterdir() if one.name not in OWN and one.name[0] != "."
         )
@@ -73,9 +70,7 @@ class ParquetSink:
             )
 
     def close(self) -> None:
-        if self._lock >= 0:
-            os.close(self._lock)
-            self._lock = -1
+        self._lock.close()
 
     def begin(self, stream: str) -> KeptPlace:
         """Return the position that the newest file has, and remove unfinished files."""

@@ -189,13 +189,11 @@ create table if not exists multidrop.hub (
     stream text not null, place bigint not null, sources jsonb not null);
 create table if not exists multidrop.families (id serial primary key, name text unique not null);
 create table if not exists multidrop.register_sets (
-    id serial primary key, names text[] not null, units text[]);
+    id serial primary key, names text[] not null, units text[] not null);
 create table if not exists multidrop.exchanges (
     time timestamptz not null, time_ns bigint not null, uncertainty_us integer, drive integer not null,
     registers integer not null, values float8[] not null, misses text[]);
 create index if not exists exchanges_drive_time on multidrop.exchanges (drive, time);
-alter table multidrop.register_sets add column if not exists units text[];
-alter table multidrop.register_sets drop constraint if exists register_sets_names_key;
 create or replace view multidrop.samples as
     select e.time, e.time_ns, e.uncertainty_us, d.name as drive, v.register, v.value,
         coalesce(v.miss, 'ok') as status, v.unit
@@ -204,10 +202,7 @@ create or replace view multidrop.samples as
     join multidrop.register_sets r on r.id = e.registers
     cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
 """
-HAS_UNITS = (  # the view of an older hub has no column `unit`
-    "select from information_schema.columns"
-    " where table_schema = 'multidrop' and table_name = 'samples' and column_name = 'unit'"
-)
+HAS_TABLES = "select from pg_views where schemaname = 'multidrop' and viewname = 'samples'"
 COPY = (
     "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
     " from stdin (format binary)"
@@ -251,7 +246,7 @@ class PostgresSink:
             raise SinkError(f"PostgreSQL: {_sentence(failure)}") from failure
 
     def _begin(self, connection: psycopg.Connection[Any], stream: str) -> KeptPlace:
-        if connection.execute(HAS_UNITS).fetchone() is None:
+        if connection.execute(HAS_TABLES).fetchone() is None:
             connection.execute(TABLES)
         first = (
             "insert into multidrop.hub (stream, place, sources) values (%s, 0, '{}') on conflict do nothing"
@@ -266,10 +261,7 @@ class PostgresSink:
             )
         self._drives = dict(connection.execute("select name, id from multidrop.families").fetchall())
         sets = connection.execute("select names, units, id from multidrop.register_sets").fetchall()
-        self._sets = {
-            RegisterSet(tuple(names), tuple(units or [None] * len(names))): number
-            for names, units, number in sets
-        }
+        self._sets = {RegisterSet(tuple(names), tuple(units)): number for names, units, number in sets}
         return KeptPlace(found[1], found[2])
 
     def write(self, commit: Commit) -> None:

@@ -2,7 +2,7 @@
 
 | in the folder        | content                                                                |
 |----------------------|------------------------------------------------------------------------|
-| `spool.json`         | fleet, gateway, and the id of the log whose messages are numbered here |
+| `spool.json`         | gateway, and the id of the log whose messages are numbered here        |
 | `NUMBER-ROWS.arrows` | a message: its sequence in the log, and its rows                       |
 | `NUMBER-ROWS.damaged`| a message that was the newest, and that the disk stored only in part   |
 | `.spool.lock`        | locked by the process that writes here                                 |
@@ -23,15 +23,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from multidrop import Batch
-from multidrop.fleet.file_lock import lock
 from multidrop.fleet.samples.message import MessageError, Packed, RowBuffer, unpack
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.servers.names import checked_name
+from multidrop.recording import FileLock
 
 FORMAT = "multidrop spool 1"
 HEAD = "spool.json"
@@ -55,40 +55,26 @@ class StoredMessage(NamedTuple):
 class SpoolFolder:
     """The files of one log, owned by one process at a time.
 
-    Raises SpoolError if the folder holds other files, belongs to another gateway or fleet, is in use by
-    another process, or cannot be written.
+    Raises SpoolError if the folder holds other files, belongs to another gateway, is in use by another
+    process, or cannot be written.
     """
 
-    def __init__(self, path: Path, gateway: str, fleet: str) -> None:
+    def __init__(self, path: Path, gateway: str) -> None:
         self.path = path
         self.damage: str | None = None  # a sentence about an incomplete newest message
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(path / ".spool.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except OSError as failure:
-            raise SpoolError(f"the spool {path} cannot be written: {failure.strerror}") from failure
-        try:
-            self._own(gateway, fleet)
-        except BaseException:
-            os.close(self._lock)
-            raise
-
-    def _own(self, gateway: str, fleet: str) -> None:
-        try:
-            lock(self._lock)
-        except BlockingIOError:
-            raise SpoolError(f"the spool {self.path} is in use by another process") from None
-        try:
-            self.log = self._head({"format": FORMAT, "fleet": fleet, "gateway": gateway})
-            self.messages = self._listed()
-            self._check_newest()
-        except OSError as failure:
-            raise SpoolError(f"the spool {self.path} cannot be written: {failure.strerror}") from failure
-
-    def close(self) -> None:
-        if self._lock >= 0:
-            os.close(self._lock)
-            self._lock = -1
+        with ExitStack() as stack:
+            try:
+                path.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context(closing(FileLock(path / ".spool.lock")))
+                self.log = self._head({"format": FORMAT, "gateway": gateway})
+                self.messages = self._listed()
+                self._check_newest()
+            except BlockingIOError:
+                raise SpoolError(f"the spool {path} is in use by another process") from None
+            except OSError as failure:
+                raise SpoolError(f"the spool {path} cannot be written: {failure.strerror}") from failure
+            stack.pop_all()
+        self.close = lock.close
 
     def _head(self, wanted: dict[str, str]) -> str:
         """Return the log's id from the folder's `spool.json`; create both in an empty folder."""
@@ -105,12 +91,10 @@ class SpoolFolder:
         found = _parsed(path)
         if found.get("format") != FORMAT or not re.fullmatch(r"[0-9a-f]{16}", str(found.get("log"))):
             raise SpoolError(f"{path} is not the head of a spool of this version ({FORMAT!r})")
-        for key in ("fleet", "gateway"):
-            if found.get(key) != wanted[key]:
-                raise SpoolError(
-                    f"{self.path} is the spool of gateway {found.get('gateway')!r} in fleet "
-                    f"{found.get('fleet')!r}, not of {wanted['gateway']!r} in {wanted['fleet']!r}"
-                )
+        if found.get("gateway") != wanted["gateway"]:
+            raise SpoolError(
+                f"{self.path} is the spool of gateway {found.get('gateway')!r}, not of {wanted['gateway']!r}"
+            )
         return str(found["log"])
 
     def _listed(self) -> dict[int, StoredMessage]:
@@ -228,7 +212,7 @@ class Spool:
     counted as lost and logged. A full or slow disk does not delay the poller: up to a million rows wait in
     memory, further rows are lost and counted, and writing is retried each second.
 
-    Raises SpoolError as `SpoolFolder` does, and ValueError for an invalid gateway or fleet name.
+    Raises SpoolError as `SpoolFolder` does, and ValueError for an invalid name of the gateway.
     """
 
     def __init__(
@@ -236,12 +220,11 @@ class Spool:
         folder: str | os.PathLike[str],
         gateway: str,
         *,
-        fleet: str = "fleet",
         most: int = 10_000_000_000,
         units: PolledUnits | None = None,
     ) -> None:
         self.gateway = checked_name("gateway", gateway)
-        self._folder = SpoolFolder(Path(folder), gateway, checked_name("fleet", fleet))
+        self._folder = SpoolFolder(Path(folder), gateway)
         self.log = self._folder.log
         self.on_message: Callable[[], object] = lambda: None  # called in the thread, per message
         self._most = most
@@ -266,17 +249,7 @@ class Spool:
     # ---- for the poller: any thread ----
 
     def append(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write. It takes microseconds and never fails because of the disk.
-
-        Rows that cannot be copied, such as for lack of memory, are counted as lost.
-        """
-        try:
-            self._append(batch)
-        except Exception as failure:
-            with self._changing:
-                self._lose(len(batch), f"{type(failure).__name__}: {failure}")
-
-    def _append(self, batch: Batch) -> None:
+        """Copy the rows for the thread to write. It takes microseconds, whatever the disk does."""
         columns = batch.columns()
         with self._changing:
             rows = len(columns.time)

@@ -1,4 +1,4 @@
-"""Locks on files, which end with their process."""
+"""LifeLock: proves to a gateway that its predecessor on this computer is dead."""
 
 from __future__ import annotations
 
@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.fleet.errors import FleetError
-
-
-def lock(file: int) -> None:
-    """Lock an open file for this process. Raises BlockingIOError if another process has locked it."""
-    import fcntl  # missing on Windows
-
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
+from multidrop.recording import FileLock
 
 IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
@@ -32,20 +25,18 @@ class LifeLock:
     def __init__(self, path: Path) -> None:
         self.path = path.resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("a+b")
         try:
-            lock(self._file.fileno())
-        except OSError:
-            self._file.close()
+            self._lock = FileLock(path)
+        except BlockingIOError:
             sentence = f"another gateway of this machine uses {path}; stop that one first"
             raise FleetError(sentence) from None
-        self._file.seek(0)
-        self.id = self._file.read().decode("ascii", "replace").strip()
+        self.id = path.read_text("ascii", "replace").strip()
         if not self.id:
             self.id = uuid.uuid4().hex
-            self._file.write(self.id.encode())
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            with path.open("w", encoding="ascii") as file:
+                file.write(self.id)
+                file.flush()
+                os.fsync(file.fileno())
 
     def proves_death(self, value: Mapping[str, Any]) -> bool:
         """Return True if the process that wrote this record held exactly this lock, and so is dead."""
@@ -53,7 +44,7 @@ class LifeLock:
         return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
 
     def close(self) -> None:
-        self._file.close()
+        self._lock.close()
 
 
 def machine_id() -> str:
