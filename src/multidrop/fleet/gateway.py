@@ -78,6 +78,7 @@ class FleetGateway:
             may_stop=lambda line: self.member.keeper.may_stop(line),
         )
         self.log = CommandLog(folder / "commands.jsonl")
+        self.log.open()
         self.commands = CommandSubjects(name, self.paths, held, self.log)
         commanded = CommandedLines(self.lines, self.commands, lambda: self.member.lease.left_s > SILENT_S)
         self.member = Member(

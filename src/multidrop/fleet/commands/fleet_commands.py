@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from multidrop.fleet.commands.log import open_log
+from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     UNNAMED,
     CommandAnswer,
@@ -60,7 +60,7 @@ class FleetCommands:
     ) -> None:
         self.by = by
         self._paths = paths_of(urls, options)
-        self._log = open_log(log)
+        self._log = CommandLog(log)
         self._keeping: list[asyncio.Task[None]] = []
         self._plant = Follower(Bucket(names.PLANT, self._path))
 

@@ -17,19 +17,25 @@ CLOSING_S = 1.0  # closing waits this long for the record that is being written
 
 
 class CommandLog:
-    """The log in this file, which is only appended to. Raises OSError if it cannot be opened.
+    """The log in this file, which is only appended to.
 
     Each record is written in its own daemon thread, so a disk that hangs blocks neither the loop nor the
     exit.
     """
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._log = AuditLog(path)
+        self._log: AuditLog | None = None
         self._turn = asyncio.Lock()  # keeps records in the order of the calls
         self._writing = threading.Lock()
         self._is_closed = False
+
+    def open(self) -> AuditLog:
+        """Open the file unless it is open. Raises OSError. `note` opens it too."""
+        if self._log is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._log = AuditLog(self.path)
+        return self._log
 
     async def note(self, record: Mapping[str, Any]) -> None:
         """Append a record with the time of day (UTC), and return once it is synced to the disk.
@@ -49,35 +55,14 @@ class CommandLog:
 
     def _add(self, record: Mapping[str, Any], now_ns: int) -> None:
         with self._writing:
-            self._log.add(now_ns, dict(record))
-            self._log.sync()
+            log = self.open()
+            log.add(now_ns, dict(record))
+            log.sync()
 
     def close(self) -> None:
         """Close the file after the record that is being written; later records are refused."""
         self._is_closed = True
         if self._writing.acquire(timeout=CLOSING_S):
-            self._log.close()
+            if self._log:
+                self._log.close()
             self._writing.release()
-
-
-class UnopenedLog:
-    """A log that could not be opened: each `note` raises the reason."""
-
-    def __init__(self, path: Path, failure: OSError) -> None:
-        self.path = path
-        self._failure = failure
-
-    async def note(self, record: Mapping[str, Any]) -> None:
-        """Raise the OSError that kept the file from being opened."""
-        raise self._failure
-
-    def close(self) -> None:
-        """Do nothing, as no file is open."""
-
-
-def open_log(path: Path) -> CommandLog | UnopenedLog:
-    """Open the log in this file. If it cannot be opened, each `note` fails instead."""
-    try:
-        return CommandLog(path)
-    except OSError as failure:
-        return UnopenedLog(path, failure)

@@ -21,12 +21,9 @@ from multidrop.fleet.lines.ownership import NEEDED
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import ask
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.servers.record_shapes import misshapen
 from multidrop.supervisor import end_tasks
 
 SILENT_NS = 2_000_000_000  # without an answer; a follower answers its leader once a second
-_CLUSTER = {"leader": str, "replicas": list}  # missing entries get defaults
-_REPLICA = {"name": str, "current": bool, "offline": bool, "active": int}
 
 
 class Replica(NamedTuple):
@@ -70,56 +67,43 @@ class Cluster(NamedTuple):
         return [follower.name for follower in self.followers if follower.is_ready]
 
 
-def cluster_of(info: Mapping[str, Any]) -> Cluster | None:
-    """Return the cluster in a stream's state; None if a single server keeps the stream.
+def cluster_of(info: Mapping[str, Any], path: ServerPath) -> Cluster:
+    """Return the cluster in a stream's state: the present server alone if the stream is not replicated.
 
     Raises Unsure for an invalid state.
     """
     if "cluster" not in info:
-        return None
-    found = _believed(info["cluster"], _CLUSTER, leader="", replicas=[])
-    usual = {"current": False, "offline": False, "active": 0}
-    followers = (_believed(one, _REPLICA, **usual) for one in found["replicas"])
-    return Cluster(
-        found["leader"],
-        tuple(Replica(one["name"], one["current"], one["offline"], one["active"]) for one in followers),
-    )
-
-
-def _believed(given: Any, shape: Mapping[str, type], **usual: Any) -> dict[str, Any]:
-    """Return a table with defaults for missing and null entries. Raises Unsure for another shape."""
-    found = given
-    if isinstance(given, dict):
-        found = {**usual, **{name: value for name, value in given.items() if value is not None}}
-    if mistake := misshapen(found, shape):
-        raise Unsure(f"the answer of NATS about a bucket's servers is invalid: {mistake}")
-    return dict(found)
+        return Cluster(path.server_name)
+    try:
+        found = info["cluster"]
+        followers = [
+            Replica(
+                str(one["name"]),
+                bool(one.get("current")),
+                bool(one.get("offline")),
+                int(one.get("active", 0)),
+            )
+            for one in found.get("replicas") or ()
+        ]
+        return Cluster(str(found.get("leader") or ""), tuple(followers))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise Unsure("the answer of NATS about a bucket's servers is invalid") from None
 
 
 SOON_S = 0.4  # time limit for leaders' answers, which usually take some milliseconds
 
 
-async def cluster_at(path: ServerPath, bucket: str) -> Cluster | None:
-    """Return the servers of a bucket, None for a single server. Raises FleetError if none answers."""
-    return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"))
-
-
 async def known_cluster(path: ServerPath, bucket: str) -> Cluster:
     """Return the servers of a bucket; a cluster without a leader if none answers."""
     with suppress(FleetError):
-        return await cluster_at(path, bucket) or Cluster(path.server_name)
+        return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"), path)
     return Cluster()
-
-
-async def has_leader(path: ServerPath, bucket: str) -> bool:
-    """Return True if a bucket has a leader that answers: otherwise its records cannot be written."""
-    return bool((await known_cluster(path, bucket)).leader)
 
 
 async def have_leaders(path: ServerPath) -> bool:
     """Return True if lines can be claimed: enough buckets of masters have a leader that answers."""
-    led = await asyncio.gather(*(has_leader(path, bucket) for bucket in names.OWNERS))
-    return sum(led) >= NEEDED
+    clusters = await asyncio.gather(*(known_cluster(path, bucket) for bucket in names.OWNERS))
+    return sum(bool(cluster.leader) for cluster in clusters) >= NEEDED
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, LeaseBucket, ServerError, ask, bucket_settings
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.servers.leaders import Cluster, bring_leaders_home, cluster_of, led_clusters
+from multidrop.fleet.servers.leaders import bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
 ROUNDS = 40  # of `_contest`; nats-server 2.9.10 fails in the first few
@@ -22,6 +22,8 @@ CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
 CLOCKS_APART_S = 10.0
+
+T = TypeVar("T")
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -43,8 +45,9 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     replicas = replicas or reached
     await _contest(paths, reached)
     for bucket in names.BUCKETS:
-        await _create(paths[0], bucket_settings(bucket, replicas))
-    await _wait_for_plant(paths[0])
+        await _retried(paths[0], partial(_create, paths[0], bucket_settings(bucket, replicas)))
+    # Right after a bucket's creation no server returns its records.
+    await _retried(paths[0], partial(Bucket(names.PLANT, lambda: paths[0]).changes, 0))
     await bring_leaders_home(paths[0], await led_clusters(paths[0]))
     servers = {path.server_name: ".".join(map(str, path.version)) for path in paths}
     return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
@@ -61,36 +64,12 @@ async def open_all(paths: Sequence[ServerPath]) -> None:
 
 async def check_buckets(path: ServerPath) -> None:
     """Raise FleetError if these servers have no fleet or no quorum. Waits for an election in progress."""
-    ends = asyncio.get_running_loop().time() + WAIT_S
+    info = None
     for bucket in names.BUCKETS:
-        try:
-            info = await _led(path, bucket, ends)
-        except ServerError as failure:
-            if failure.is_missing:
-                raise FleetError(
-                    f"{path.url} has no bucket {bucket}: run `multidrop fleet init` first"
-                ) from None
-            raise
-        except NoRight:
-            raise
-        except FleetError as failure:
-            raise no_quorum(path, failure) from None
-    check_clock(path, info.get("ts"))
-
-
-async def _led(path: ServerPath, bucket: str, ends: float) -> dict[str, Any]:
-    """Return the state of a bucket once it has a leader. It has none during a move or an election."""
-    while True:
-        try:
-            info = await ask(path, f"STREAM.INFO.KV_{bucket}")
-            if (cluster_of(info) or Cluster(path.server_name)).leader:
-                return info
-            lack = Unsure(f"the bucket {bucket} has no leader")
-        except Unsure as failure:
-            lack = failure
-        if asyncio.get_running_loop().time() > ends:
-            raise lack
-        await asyncio.sleep(0.1)
+        info = await _retried(path, partial(_info, path, f"KV_{bucket}"))
+        if info is None:
+            raise FleetError(f"{path.url} has no bucket {bucket}: run `multidrop fleet init` first")
+    check_clock(path, info and info.get("ts"))
 
 
 def check_clock(path: ServerPath, server_time: Any) -> None:
@@ -124,89 +103,58 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
 
 async def _kept_on(path: ServerPath) -> int:
     """Return the least number of servers that store one of the buckets; 0 if a bucket is missing."""
-    kept = []
-    for bucket in names.BUCKETS:
-        info = await _info(path, f"KV_{bucket}")
-        if info is None:
-            return 0
-        cluster = cluster_of(info)
-        kept.append(1 + len(cluster.followers) if cluster else 1)
-    return min(kept)
+    infos = [await _retried(path, partial(_info, path, f"KV_{bucket}")) for bucket in names.BUCKETS]
+    return min(1 + len(cluster_of(info, path).followers) if info else 0 for info in infos)
 
 
 async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
-    """Return the state of a stream, None if there is none. Waits for an election in progress."""
-    ends = asyncio.get_running_loop().time() + WAIT_S
-    while True:
-        try:
-            return await ask(path, f"STREAM.INFO.{stream}")
-        except ServerError as failure:
-            if failure.is_missing:
-                return None
-            raise
-        except NoRight:
-            raise
-        except FleetError as failure:
-            if asyncio.get_running_loop().time() > ends:
-                raise no_quorum(path, failure) from None
-            await asyncio.sleep(0.2)
+    """Return the state of a stream, None if there is none. Raises Unsure if it has no leader."""
+    try:
+        info = await ask(path, f"STREAM.INFO.{stream}")
+    except ServerError as failure:
+        if failure.is_missing:
+            return None
+        raise
+    if not cluster_of(info, path).leader:
+        raise Unsure(f"the bucket {stream.removeprefix('KV_')} has no leader")
+    return info
 
 
 async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
-    ends = asyncio.get_running_loop().time() + WAIT_S
     while await _info(path, settings["name"]) is None:
-        await _try(path, f"STREAM.CREATE.{settings['name']}", ends, settings)
+        await ask(path, f"STREAM.CREATE.{settings['name']}", settings)
 
 
 async def _remove(path: ServerPath, stream: str) -> None:
-    ends = asyncio.get_running_loop().time() + WAIT_S
     while await _info(path, stream) is not None:
-        await _try(path, f"STREAM.DELETE.{stream}", ends)
+        await ask(path, f"STREAM.DELETE.{stream}")
 
 
-async def _try(
-    path: ServerPath, subject: str, ends: float, settings: Mapping[str, Any] | None = None
-) -> None:
-    """Request a change of a stream. Failures other than missing rights are ignored until the time is over."""
-    try:
-        await ask(path, subject, settings)
-    except ServerError:
-        if asyncio.get_running_loop().time() > ends:
-            raise
-        await asyncio.sleep(0.2)  # there is no leader yet, or the change is in progress
-    except NoRight:
-        raise
-    except FleetError as failure:
-        if asyncio.get_running_loop().time() > ends:
-            raise no_quorum(path, failure) from None
+async def _retried(path: ServerPath, attempt: Callable[[], Awaitable[T]]) -> T:
+    """Repeat an attempt for up to WAIT_S: servers elect a leader, or a change is in progress.
 
-
-async def _wait_for_plant(path: ServerPath) -> None:
-    """Wait until the plant can be read: just after a bucket's creation no server answers for it."""
-    ends = asyncio.get_running_loop().time() + WAIT_S
+    Raises NoRight, the last refusal of the servers, or FleetError if they have no quorum.
+    """
+    loop = asyncio.get_running_loop()
+    ends = loop.time() + WAIT_S
     while True:
         try:
-            await Bucket(names.PLANT, partial(_itself, path)).changes(0)
+            return await attempt()
         except NoRight:
             raise
         except FleetError as failure:
-            if asyncio.get_running_loop().time() > ends:
-                raise no_quorum(path, failure) from None
-            await asyncio.sleep(0.2)
-        else:
-            return
+            if loop.time() > ends:
+                raise failure if isinstance(failure, ServerError) else no_quorum(path, failure) from None
+        await asyncio.sleep(0.1)
 
 
 async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
     """Let several claimants request the same revision, repeatedly. Raises FleetError if two get it."""
     settings = bucket_settings(CONTEST, replicas)
-    await _create(paths[0], settings)
+    await _retried(paths[0], partial(_create, paths[0], settings))
     try:
         ways = [path for path in paths if path.is_open]
-        claimants = [
-            LeaseBucket(CONTEST, partial(_itself, ways[at % len(ways)]), f"claimant-{at}")
-            for at in range(CLAIMANTS)
-        ]
+        claimants = [_claimant(ways[at % len(ways)], f"claimant-{at}") for at in range(CLAIMANTS)]
         revision, unsure = NONE_YET, 0
         while revision == NONE_YET or unsure < ROUNDS:
             unsure += 1
@@ -217,24 +165,18 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
                     f"the NATS servers around {paths[0].url} gave one revision of a key to {len(granted)} of "
                     f"{CLAIMANTS} claimants at once: no lease is safe there"
                 )
-            revision = granted[0] if granted else await _revision(claimants[0], paths[0])
+            if granted:
+                revision = granted[0]
+            else:
+                revision = (await _retried(paths[0], partial(claimants[0].get, CONTEST))).revision
             if unsure > 2 * ROUNDS:
                 raise no_quorum(paths[0], Unsure("a key was never granted"))
     finally:
-        await _remove(paths[0], settings["name"])
+        await _retried(paths[0], partial(_remove, paths[0], settings["name"]))
 
 
-def _itself(path: ServerPath) -> ServerPath:
-    return path
-
-
-async def _revision(claimant: LeaseBucket, path: ServerPath) -> int:
-    try:
-        return (await claimant.get(CONTEST)).revision
-    except NoRight:
-        raise
-    except FleetError as failure:
-        raise no_quorum(path, failure) from None
+def _claimant(path: ServerPath, name: str) -> LeaseBucket:
+    return LeaseBucket(CONTEST, lambda: path, name)
 
 
 async def _claim(claimant: LeaseBucket, revision: int) -> int | None:
