@@ -51,6 +51,22 @@ async def look(observer: Observer) -> None:
         await observer.look(path)
 
 
+async def begun() -> tuple[Trial, Lease]:
+    """Return a trial, and a lease whose first session has started."""
+    trial = Trial()
+    lease = trial.lease()
+    assert await lease.try_to_begin()
+    return trial, lease
+
+
+async def watched() -> tuple[Trial, Lease, Observer]:
+    """Return the same, and an observer that has read the session's records."""
+    trial, lease = await begun()
+    observer = trial.observer()
+    await look(observer)
+    return trial, lease, observer
+
+
 async def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> None:
     trial = Trial()
     for bucket in trial.buckets:
@@ -63,9 +79,7 @@ async def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> No
 
 
 async def test_a_renewal_counts_from_its_sending() -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     trial.clock.pass_s(1)
     sent = trial.clock.now
     for bucket in trial.buckets:
@@ -93,9 +107,7 @@ async def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_unti
 
 
 async def test_the_deadline_is_the_second_latest() -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     began = trial.clock.now
     trial.clock.pass_s(1)
     await lease.renew_once(0)
@@ -106,9 +118,7 @@ async def test_the_deadline_is_the_second_latest() -> None:
 
 
 async def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     trial.buckets[1].is_down = True
     for _ in range(20):
         trial.clock.pass_s(0.5)
@@ -150,9 +160,7 @@ def test_a_renewal_that_failed_is_tried_again_soon() -> None:
 
 
 async def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     until = lease.until
     for bucket in trial.buckets:
         bucket.loses_answers = True
@@ -168,9 +176,7 @@ async def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> N
 
 
 async def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     trial.clock.pass_s(1)
 
     async def end_meanwhile() -> None:
@@ -187,9 +193,7 @@ async def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
 
 async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> None:
     """Else the next gateway would wait until the lease has run out, though this one left in order."""
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     for bucket, value in zip(trial.buckets, trial.values(), strict=True):
         bucket.store("a", value)
     await lease.end()
@@ -199,9 +203,7 @@ async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> No
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
 async def test_the_end_of_a_session_is_written_over_its_own_renewals_alone(later: dict[str, Any]) -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
     assert [value["ended"] for value in trial.values()] == [later.get("ended", False), True, True]
@@ -268,9 +270,7 @@ async def test_a_suspension_between_clock_and_timer_is_survived() -> None:
 
 async def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     """CLOCK_BOOTTIME starts again when a machine does."""
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     await lease.end()
     trial.clock.now = 3 * SECOND
     after = trial.lease()
@@ -386,41 +386,25 @@ async def test_the_lock_file_proves_the_predecessors_death(
         assert again.session == 2
 
 
-@pytest.mark.parametrize("machine", ["another machine", ""])
-async def test_a_lock_file_of_another_machine_proves_nothing(
-    machine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("before", "after", "is_copied"),
+    [
+        ("this machine", "another machine", True),
+        ("this machine", "", True),
+        ("", "", True),
+        ("this machine", "this machine", False),  # another file at this path, as in two containers
+    ],
+)
+async def test_a_lock_of_another_machine_or_file_proves_nothing(
+    before: str, after: str, is_copied: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
-    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
-    lock = LifeLock(tmp_path / "a.lock")
-    assert await trial.lease(lock=lock).try_to_begin()
-    lock.close()
-    monkeypatch.setattr(life_lock, "machine_id", lambda: machine)
-    with closing(LifeLock(tmp_path / "a.lock")) as lock:
-        assert not await trial.lease(lock=lock).try_to_begin()
-
-
-async def test_another_file_at_the_same_path_proves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two containers of one machine may both have /var/lib/multidrop/a.lock."""
-    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
-    trial = Trial()
+    monkeypatch.setattr(life_lock, "machine_id", lambda: before)
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         assert await trial.lease(lock=lock).try_to_begin()
+    monkeypatch.setattr(life_lock, "machine_id", lambda: after)
+    if not is_copied:
         (tmp_path / "a.lock").unlink()
-        with closing(LifeLock(tmp_path / "a.lock")) as other:
-            assert not await trial.lease(lock=other).try_to_begin()
-
-
-async def test_two_machines_without_an_id_prove_nothing_to_each_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trial = Trial()
-    monkeypatch.setattr(life_lock, "machine_id", lambda: "")
-    lock = LifeLock(tmp_path / "a.lock")
-    assert await trial.lease(lock=lock).try_to_begin()
-    lock.close()
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         assert not await trial.lease(lock=lock).try_to_begin()
 
@@ -442,14 +426,6 @@ async def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_w
         assert not await trial.lease(lock=lock).try_to_begin()
         boot.write_text("first\n", "utf-8")
         assert await trial.lease(lock=lock).try_to_begin()
-
-
-def test_a_machines_id_has_the_kernels_boot_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = tmp_path / "machine-id"
-    own.write_text("of a trial", "utf-8")
-    monkeypatch.setattr(life_lock, "IDS", (own, *life_lock.IDS[1:]))
-    boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    assert life_lock.machine_id() == f"of a trial.{boot}"
 
 
 @pytest.mark.parametrize("empty", [0, 1])
@@ -488,10 +464,7 @@ async def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> 
 @pytest.mark.parametrize("has_rival", [False, True])
 async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bool) -> None:
     """Its server may have died with the gateway. Another observer may have ended one of the others."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, _lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
     asked: list[str] = []
@@ -512,10 +485,7 @@ async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bo
 
 async def test_only_the_judged_revision_is_ended() -> None:
     """A record that is renewed between the judgement and its end stays, even if it was read again."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
     judged = observer.dead()["a"]
@@ -532,10 +502,7 @@ async def test_only_the_judged_revision_is_ended() -> None:
 
 async def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
     """Some records are read while others are asked for; a gateway may be judged in between."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
     assert [*observer.dead()] == ["a"]
@@ -560,10 +527,7 @@ async def test_no_gateway_ends_itself() -> None:
 
 async def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
     """Else all gateways would end each other when servers that were away come back."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
     observer.begin_anew()
     await look(observer)
@@ -577,10 +541,7 @@ async def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
 
 async def test_an_ended_session_stays_ended_after_a_cut() -> None:
     """Else it counts a dead gateway among the living for a while, and gives lines away to it."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, _lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
     assert await observer.end_the_dead()
@@ -601,10 +562,7 @@ async def test_an_ended_session_stays_ended_after_a_cut() -> None:
 
 async def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
     """Its last renewal may have been a moment ago."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, _lease, observer = await watched()
     await observer.end_the_dead()
     trial.clock.pass_s(60)
     for bucket in trial.buckets:
@@ -651,10 +609,7 @@ def test_a_possibly_dead_gateway_is_read_at_once(since_s: float, rests_s: float)
 
 async def test_without_answers_no_gateway_is_judged() -> None:
     """The server that it reads from may be suspended while others renew the leases."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, _lease, observer = await watched()
     for bucket in trial.buckets:
         bucket.is_down = True
     for _ in range(60):
@@ -694,10 +649,7 @@ async def test_an_end_by_another_counts_when_the_lease_must_have_run_out() -> No
 
 
 async def test_an_end_of_ones_own_session_counts_at_once() -> None:
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, lease, observer = await watched()
     await lease.end()
     await look(observer)
     assert observer.is_over("a", 1)
@@ -731,9 +683,7 @@ async def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
 
 
 async def test_an_ended_path_stays_ended_for_this_session() -> None:
-    trial = Trial()
-    lease = trial.lease()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
     value = trial.values()[1]
     trial.buckets[1].store("a", {**value, "ended": True})
     for _ in range(3):
@@ -744,10 +694,7 @@ async def test_an_ended_path_stays_ended_for_this_session() -> None:
 
 
 async def test_a_session_that_lost_a_path_is_weak_until_a_whole_one_follows() -> None:
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
-    await look(observer)
+    trial, lease, observer = await watched()
     assert (lease.is_weak, observer.weak()) == (False, [])
     trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
     await renew(lease)

@@ -85,6 +85,18 @@ class Trial:
             if name != self.buckets[0].name:
                 await self.lease.renew_once(path)
 
+    async def until_polled(self) -> None:
+        await until(lambda: "hall" in self.keeper.polled and not self.keeper._at_work)
+
+    async def reconcile(self) -> None:
+        """Reconcile, and wait until no line is open or being opened."""
+        self.keeper.reconcile()
+        await until(lambda: self.keeper.is_silent)
+
+    def are_down(self, *, is_so: bool = True) -> None:
+        for bucket in self.buckets:
+            bucket.is_down = is_so
+
     def claim_now(self) -> None:
         claim = self.keeper.claim_of("hall")
         assert claim
@@ -104,6 +116,13 @@ class Trial:
             self.records.owners[bucket].take(Record("hall", revision, owner_value(("b", 1), 9, 0)))
 
 
+async def claimed() -> Trial:
+    """Return a trial whose gateway polls the line."""
+    trial = Trial()
+    await trial.claim()
+    return trial
+
+
 class DeadTrial(Trial):
     """The same with a line whose last master is over."""
 
@@ -121,8 +140,7 @@ class DeadTrial(Trial):
 
 
 async def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     assert trial.lines.taken == {"hall"}
 
     def may() -> tuple[bool, bool]:
@@ -139,8 +157,7 @@ async def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is
 
 async def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands() -> None:
     """It is about to be let go, and its new master answers."""
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     trial.clock.pass_s(1)
     assert trial.keeper.may_command("hall")
     trial.is_taken_by_another(0)
@@ -150,16 +167,14 @@ async def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_com
 
 
 async def test_lines_are_released_while_there_is_time_to_close_them() -> None:
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
     trial.keeper.reconcile()
     assert trial.keeper.polled
     assert not trial.keeper._at_work
     trial.clock.pass_s(0.001)
     assert trial.lease.is_valid
-    trial.keeper.reconcile()
-    await until(lambda: trial.keeper.is_silent)
+    await trial.reconcile()
     assert trial.lines.taken == set()
 
 
@@ -198,50 +213,41 @@ async def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> No
 
 
 async def test_a_closed_line_takes_no_stops() -> None:
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     trial.keeper.releasing = {"hall"}
-    trial.keeper.reconcile()
-    await until(lambda: trial.keeper.is_silent)
+    await trial.reconcile()
     assert trial.keeper.is_mine("hall")
     assert not trial.keeper.may_stop("hall")
 
 
 async def test_a_line_is_closed_before_it_is_released() -> None:
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     trial.keeper.releasing = {"hall"}
     trial.keeper.reconcile()
     assert trial.owner() == ("a", 1)
     await until(lambda: trial.keeper.is_silent)
     assert trial.lines.taken == set()
     assert trial.owner() == ("a", 1)
-    trial.keeper.reconcile()
-    await until(lambda: trial.keeper.is_silent)
+    await trial.reconcile()
     assert trial.owner() == ("", 0)
 
 
 async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
     """An unanswered write may still be stored later, until a newer record rules that out."""
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     bucket = trial.buckets[0]
     trial.keeper.releasing = {"hall"}
-    trial.keeper.reconcile()
-    await until(lambda: trial.keeper.is_silent)
-    for one in trial.buckets:
-        one.is_down = True
+    await trial.reconcile()
+    trial.are_down()
     trial.keeper.reconcile()  # released, without an answer
     await until(lambda: trial.keeper.is_silent)
     trial.keeper.releasing = set()  # it is to stay after all
     for _ in range(3):
-        trial.keeper.reconcile()
-        await until(lambda: trial.keeper.is_silent)
+        await trial.reconcile()
         assert trial.lines.taken == set()
-    for one in trial.buckets:
-        one.is_down = False
+    trial.are_down(is_so=False)
     trial.keeper.reconcile()
-    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    await trial.until_polled()
     assert owner_of(bucket.records["hall"]) == ("a", 1)
     assert bucket.revision("hall") == 2  # the release at revision 1 can no longer be stored
 
@@ -255,8 +261,7 @@ ME, NOBODY = ("a", 1), ("", 0)
 
 
 async def test_a_new_line_is_claimed_by_one_record() -> None:
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     assert owners(trial) == [ME, NOBODY, NOBODY]
     assert trial.keeper.moves == 1
 
@@ -274,7 +279,7 @@ async def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
     await trial.read_and_begin()
     trial.buckets[place].is_down = True
     trial.claim_now()
-    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    await trial.until_polled()
     assert owners(trial)[place] == NOBODY
     assert owners(trial).count(ME) == 2
 
@@ -313,7 +318,7 @@ async def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
     await trial.read_and_begin()
     await trial.let_the_first_lag()
     trial.claim_now()
-    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    await trial.until_polled()
     assert owners(trial) == [NOBODY, ME, ME]
 
 
@@ -324,7 +329,7 @@ async def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
     trial.clock.pass_s(1.5)
     await trial.lease.renew_once(names.OWNERS.index(trial.buckets[2].name))
     trial.claim_now()
-    await until(lambda: "hall" in trial.keeper.polled and not trial.keeper._at_work)
+    await trial.until_polled()
     assert owners(trial) == [ME, ME, NOBODY]
 
 
@@ -398,17 +403,14 @@ async def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
 
 
 async def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
-    trial = Trial()
-    await trial.claim()
-    for bucket in trial.buckets:
-        bucket.is_down = True
+    trial = await claimed()
+    trial.are_down()
     trial.keeper.releasing = {"hall"}
     for _ in range(2):  # it is closed first
         trial.keeper.reconcile()
         await until(lambda: not trial.keeper._tasks)
     assert not trial.keeper.is_mine("hall")
-    for bucket in trial.buckets:
-        bucket.is_down = False
+    trial.are_down(is_so=False)
     trial.keeper.releasing, trial.keeper.may_claim = set(), False
     trial.keeper.reconcile()
     await until(lambda: not trial.keeper._tasks)
@@ -420,8 +422,7 @@ async def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
 
 async def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
     """Its session is not ended: the others wait for as long as if it had died."""
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
 
     async def fail(line: str) -> None:
         raise RuntimeError("the port is stuck")
@@ -539,8 +540,7 @@ async def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: py
 async def test_a_lost_port_is_reported_before_a_long_reopening_fails(
     loss: PortLoss, reported: str | None
 ) -> None:
-    trial = Trial()
-    await trial.claim()
+    trial = await claimed()
     await until(lambda: "hall" in trial.keeper.polled)
     await until(lambda: not trial.keeper._at_work)
     trial.keeper._port_loss = lambda line: loss
