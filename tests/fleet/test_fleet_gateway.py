@@ -19,7 +19,6 @@ from serial_hall import SerialHall
 
 from multidrop.fleet import gateway as fleet_gateway
 from multidrop.fleet.gateway import FleetGateway
-from multidrop.fleet.samples.forwarder import ForwarderState
 from multidrop.fleet.servers import names
 
 PATIENCE_S = 60.0
@@ -77,7 +76,9 @@ async def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
     monkeypatch.setattr(fleet_gateway, "IN_TROUBLE_S", 0.0)
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     taken = iter([0, 0, 1])  # messages of the spool's two that the stream has at each look
-    forwarder: Any = SimpleNamespace(state=lambda: ForwarderState(0, next(taken, 2), trouble))
+    forwarder: Any = type(
+        "Forwarding", (), {"trouble": trouble, "last": property(lambda _: next(taken, 2))}
+    )()
     spool, gateway.forwarder = gateway.spool, forwarder
     monkeypatch.setattr(gateway, "spool", SimpleNamespace(state=lambda: SimpleNamespace(newest=2)))
     forwarding = asyncio.create_task(asyncio.sleep(PATIENCE_S))

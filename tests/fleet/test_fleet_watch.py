@@ -25,10 +25,7 @@ from multidrop.cli.fleet import look
 from multidrop.cli.fleet import watch as fleet_watch
 from multidrop.cli.fleet.screen import picture
 from multidrop.cli.fleet.tables import moment, move_table, size
-from multidrop.fleet.overview import (
-    FleetWatch,
-    is_shown,
-)
+from multidrop.fleet.overview import FleetWatch
 from multidrop.supervisor import Ended, supervisor
 
 SPOOL = {"bytes": 81234, "lost": 0, "behind": 2, "lag_s": 1.5, "trouble": None}
@@ -276,20 +273,6 @@ def test_on_a_terminal_it_draws_until_it_is_interrupted(fleet: Cluster) -> None:
         terminal.written = os.read(terminal.fd, 65536)
         assert b"\x1b[?25h" in terminal.written  # the cursor
         assert b"Traceback" not in terminal.written
-
-
-@table(
-    ("state", "is_one"),
-    [
-        (SAYS, True),
-        (SAYS | {"spool": SPOOL | {"behind": None, "lag_s": None}}, True),
-        (SAYS | {"spool": SPOOL | {"lag_s": "2 s"}}, False),
-        (SAYS | {"spool": {}}, False),
-        (SAYS | {"trouble": 5}, False),
-    ],
-)
-def test_an_answer_that_lacks_something_is_none(state: dict[str, Any], is_one: bool) -> None:
-    assert is_shown(state) is is_one
 
 
 def test_a_time_that_no_calendar_has() -> None:

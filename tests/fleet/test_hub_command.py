@@ -41,7 +41,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         for number in range(4):
             spool.append(numbered(number * 10, 10))
             assert await asyncio.to_thread(spool.sync, 30.0)
-        while forwarder.state().last != 4:
+        while forwarder.last != 4:
             await asyncio.sleep(0.01)
         task.cancel()
         await asyncio.wait([task])

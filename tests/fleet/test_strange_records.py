@@ -260,7 +260,8 @@ async def _do_nothing() -> None:
     pass
 
 
-STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "spool": {"bytes": 0, "lost": 0}}
+SPOOL = {"bytes": 0, "lost": 0, "behind": None, "lag_s": 1.5, "trouble": None}
+STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "trouble": "", "troubles": {}, "spool": SPOOL}
 
 
 @pytest.mark.parametrize(
@@ -271,7 +272,12 @@ STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "troubles": {}, "spool
         (b"[" * 500_000, "it has no 'state'"),
         (json.dumps({**STATE, "lines": "1"}).encode(), "its 'lines' is not a whole number"),
         (json.dumps({**STATE, "margin_s": None}).encode(), "its 'margin_s' is not a number"),
+        (json.dumps({**STATE, "trouble": 5}).encode(), "its 'trouble' is not a text"),
         (json.dumps({**STATE, "spool": {"bytes": 0}}).encode(), "it has no 'lost'"),
+        (
+            json.dumps({**STATE, "spool": {**SPOOL, "lag_s": "2 s"}}).encode(),
+            "its 'lag_s' is not a number or",
+        ),
     ],
 )
 def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes, mistake: str) -> None:

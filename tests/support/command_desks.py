@@ -15,11 +15,10 @@ from fleets import HandClock
 
 from multidrop import YD1000, Bus
 from multidrop.control import commands, read_audit, written_before
-from multidrop.fleet.commands.desk import CommandDesk
+from multidrop.fleet.commands.desk import CommandDesk, StopDesk
+from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, Offered
-from multidrop.fleet.commands.stop_desk import StopDesk
-from multidrop.fleet.lines.held_lines import HeldLines
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.supervisor import supervisor
 

@@ -14,6 +14,7 @@ from nats.aio.msg import Msg
 
 from multidrop import PollingFailed
 from multidrop.core import Mastership
+from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight
@@ -21,7 +22,6 @@ from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines.fleet_lines import FleetLines
-from multidrop.fleet.lines.held_lines import HeldLines
 from multidrop.fleet.lines.line_keeper import SILENT_S
 from multidrop.fleet.lines.moves import TOLD
 from multidrop.fleet.samples.forwarder import Forwarder
@@ -35,8 +35,8 @@ from multidrop.fleet.servers.setup import check_buckets, open_all
 from multidrop.supervisor import Ended, end_tasks, supervisor
 
 SPOOL_BYTES = 10_000_000_000
-STATE = {"state": str, "lines": int, "margin_s": float, "troubles": dict, "spool": dict}
-SPOOL = {"bytes": int, "lost": int}
+STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
+SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
 FORWARD_S = 10.0  # time limit for forwarding the rest at shutdown; the next start continues
 IN_TROUBLE_S = 3.0  # the same limit if the stream has a problem
 SYNC_S = 3.0  # time limit for writing the last rows to the disk, before forwarding
@@ -157,9 +157,8 @@ class FleetGateway:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         while not forwarding.done():
-            state = self.forwarder.state()
-            is_late = loop.time() - begun > (IN_TROUBLE_S if state.trouble else FORWARD_S)
-            if is_late or (state.last or 0) >= self.spool.state().newest:
+            is_late = loop.time() - begun > (IN_TROUBLE_S if self.forwarder.trouble else FORWARD_S)
+            if is_late or (self.forwarder.last or 0) >= self.spool.state().newest:
                 return
             await asyncio.sleep(ENDING_S)
 
@@ -189,7 +188,7 @@ class FleetGateway:
         member, spool = self.member, self.spool.state()
         lost = {line: f"port lost: {why}" for line, why in member.keeper.lost.items()}
         failing = {line: f"polling fails: {why}" for line, why in self.lines.poller.line_failures.items()}
-        forwarder = self.forwarder.state() if self.forwarder else None
+        forwarder = self.forwarder
         last = forwarder.last if forwarder else None
         return {
             "gateway": self.name,
@@ -211,7 +210,7 @@ class FleetGateway:
                 "waiting": spool.waiting,
                 "lost": spool.lost,
                 "sent": forwarder.sent if forwarder else 0,
-                "lag_s": self.forwarder.lag_s() if self.forwarder else None,
+                "lag_s": forwarder.lag_s() if forwarder else None,
                 "behind": None if last is None else max(0, spool.newest - last),
                 "trouble": spool.trouble or (forwarder.trouble if forwarder else None),
             },

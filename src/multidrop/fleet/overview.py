@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container
 from contextlib import suppress
-from types import NoneType
 from typing import Any
 
 from multidrop.fleet.errors import FleetError
@@ -22,11 +21,6 @@ from multidrop.printable import masked
 
 MOVES_SHOWN = 20
 MISSED_MS = 30 * 24 * 3600 * 1000  # how long a gateway that did not come back is reported
-_MAY_BE_NONE: Mapping[str, tuple[type, ...]] = {  # types of entries in the spool part of a gateway's answer
-    "behind": (int, NoneType),
-    "lag_s": (int, float, NoneType),
-    "trouble": (str, NoneType),
-}
 
 
 class FleetView:
@@ -54,15 +48,13 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # the gateway has another version
+            with suppress(KeyError, TypeError, ValueError):  # invalid moves
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
-        try:
-            state = await ask_gateway(self._path, gateway, "state")
-        except FleetError:
-            return None
-        return state if is_shown(state) else None
+        with suppress(FleetError):
+            return await ask_gateway(self._path, gateway, "state")
+        return None
 
     def fleet(self) -> dict[str, Any]:
         """Return living and missing gateways, lines with their masters, and the last moves.
@@ -117,14 +109,6 @@ class FleetView:
 
 def _ms(found: object) -> int | None:
     return found if type(found) is int else None
-
-
-def is_shown(state: Mapping[str, Any]) -> bool:
-    """Return True if a gateway's answer has all displayed fields; that of another version may lack some."""
-    spool = state["spool"]
-    return isinstance(state.get("trouble"), str) and all(
-        name in spool and isinstance(spool[name], kinds) for name, kinds in _MAY_BE_NONE.items()
-    )
 
 
 EVERY_S = 1.0  # between reads

@@ -88,11 +88,11 @@ def filled(folder: Path, messages: int) -> Spool:
 async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
     spool = filled(tmp_path / "spool", 7)
     async with client_of(running) as client, forwarding(spool, client) as forwarder:
-        await until(lambda: forwarder.state().last == 7)
+        await until(lambda: forwarder.last == 7)
         spool.append(numbered(35, 5))
         assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-        await until(lambda: forwarder.state().last == 8)
-        assert forwarder.state() == (8, 8, None)
+        await until(lambda: forwarder.last == 8)
+        assert (forwarder.sent, forwarder.last, forwarder.trouble) == (8, 8, None)
         assert spool.state().acknowledged == 8
         found = await stored(client)
     assert [(one.gateway, one.log, one.sequence, one.lost) for one in found] == [
@@ -112,8 +112,8 @@ async def test_a_restarted_gateway_goes_on_behind_what_the_stream_has(
             spool.append(numbered(run * 10, 10))
             assert await asyncio.to_thread(spool.sync, PATIENCE_S)
             async with forwarding(spool, client) as forwarder:
-                await until(lambda forwarder=forwarder, run=run: forwarder.state().last == run + 1)
-                assert forwarder.state().sent == 1
+                await until(lambda forwarder=forwarder, run=run: forwarder.last == run + 1)
+                assert forwarder.sent == 1
             spool.close()
         assert [one.sequence for one in await stored(client)] == [1, 2, 3]
 
@@ -149,7 +149,7 @@ async def test_after_any_doubt_each_message_is_there_once(
 ) -> None:
     spool = filled(tmp_path / "spool", 6)
     async with client_of(running) as client, forwarding(spool, Lossy(client, fates)) as forwarder:
-        await until(lambda: forwarder.state().last == 6)
+        await until(lambda: forwarder.last == 6)
         await asyncio.sleep(0.1)  # for late ones to be refused
         assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4, 5, 6]
     spool.close()
@@ -164,13 +164,13 @@ async def test_answers_of_servers_among_a_logs_messages_are_passed_over(
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
     async with client_of(running) as client, forwarding(spool, client) as forwarder:
-        await until(lambda: forwarder.state().last == 2)
+        await until(lambda: forwarder.last == 2)
         for number, headers in enumerate(answers, 3):
             assert await publish(client, subject, b"{}", headers)
             spool.append(numbered(number * 5, 5))
             assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-            await until(lambda number=number: forwarder.state().last == number)
-        assert (forwarder.state().sent, spool.state().acknowledged) == (4, 4)
+            await until(lambda number=number: forwarder.last == number)
+        assert (forwarder.sent, spool.state().acknowledged) == (4, 4)
         sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
         assert sequences == [1, 2, 3, 4]
     spool.close()
@@ -197,8 +197,8 @@ async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
     async with client_of(running) as client, forwarding(spool, Refusing(client, 5)) as forwarder:
-        await until(lambda: forwarder.state().last == 2)
-        await until(lambda: forwarder.state().trouble is None)
+        await until(lambda: forwarder.last == 2)
+        await until(lambda: forwarder.trouble is None)
     spool.close()
     assert [record.getMessage() for record in caplog.records] == [
         "samples are not forwarded: the stream 'samples' refuses a message: no room",
@@ -213,7 +213,7 @@ async def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster,
     assert await asyncio.to_thread(spool.sync, PATIENCE_S)
     await until(lambda: spool.state().oldest == 6)
     async with client_of(running) as client, forwarding(spool, client) as forwarder:
-        await until(lambda: forwarder.state().last == 6)
+        await until(lambda: forwarder.last == 6)
         (found,) = await stored(client)
     assert (found.sequence, found.lost) == (6, 250)
     spool.close()
@@ -225,17 +225,17 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
     spool = filled(tmp_path / "spool", 2)
     async with client_of(running) as client:
         async with forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().last == 2)
+            await until(lambda: forwarder.last == 2)
         spool.close()
         (tmp_path / "spool" / "000000000002-50.arrows").unlink()
         spool = Spool(tmp_path / "spool", "gateway-1")
         for number in (100, 200):  # first as long as the stream, and then longer
             async with forwarding(spool, client) as forwarder:
-                await until(lambda forwarder=forwarder: forwarder.state().trouble)
+                await until(lambda forwarder=forwarder: forwarder.trouble)
             spool.append(numbered(number, 5))
             assert await asyncio.to_thread(spool.sync, PATIENCE_S)
         async with forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().trouble)
+            await until(lambda: forwarder.trouble)
         assert [one.sequence for one in await stored(client)] == [1, 2]
         spool.close()
     told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
@@ -251,12 +251,12 @@ async def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.
     spool = filled(tmp_path / "spool", 3)
     with cluster(tmp_path / "nats", 1) as servers:
         async with client_of(servers) as client, forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().last == 3)
+            await until(lambda: forwarder.last == 3)
             servers.nodes[0].kill()
             spool.append(numbered(15, 5))
-            await until(lambda: forwarder.state().trouble)
+            await until(lambda: forwarder.trouble)
             servers.nodes[0].start()
-            await until(lambda: forwarder.state().last == 4)
+            await until(lambda: forwarder.last == 4)
             assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4]
     spool.close()
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
@@ -313,9 +313,9 @@ async def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
             await publish(client, subject_of("a", "b"), b"", {})
         spool = filled(tmp_path / "spool", 1)
         async with forwarding(spool, client) as forwarder:
-            await until(lambda: forwarder.state().trouble)
+            await until(lambda: forwarder.trouble)
             await create_stream(client, replicas=1)
-            await until(lambda: forwarder.state().last == 1)
+            await until(lambda: forwarder.last == 1)
         spool.close()
 
 

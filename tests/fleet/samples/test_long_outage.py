@@ -26,7 +26,7 @@ async def forwarded(spool: Spool, servers: Cluster) -> None:
     forwarder = Forwarder(spool, client)
     task = asyncio.create_task(forwarder.run())
     async with asyncio.timeout(PATIENCE_S):
-        while forwarder.state().last != spool.state().newest:
+        while forwarder.last != spool.state().newest:
             await asyncio.sleep(0.01)
     task.cancel()
     await asyncio.wait([task])

@@ -16,9 +16,9 @@ from multidrop import Drive, WriteForbidden
 from multidrop.control import CommandResult
 from multidrop.control.commands import carry_out_verb, stop_drive_by, typed_value, write_register
 from multidrop.drive import verb_arguments, verbs_of
+from multidrop.fleet.commands.held_lines import HeldLine
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, CommandRequest
 from multidrop.fleet.leases.rules import SECOND
-from multidrop.fleet.lines.held_lines import HeldLine
 
 LIMIT_NS = 1 * SECOND  # from the offer until the command's first frame
 REMEMBERED = 10_000  # limit of offers in memory; the oldest are removed

@@ -18,12 +18,11 @@ from typing import Any
 
 from nats.aio.msg import Msg
 
-from multidrop.fleet.commands.desk import CommandDesk
+from multidrop.fleet.commands.desk import CommandDesk, StopDesk
+from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer, Offered, encode
-from multidrop.fleet.commands.stop_desk import StopDesk
 from multidrop.fleet.lines.fleet_lines import FleetLines
-from multidrop.fleet.lines.held_lines import HeldLines
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.supervisor import supervisor

@@ -13,7 +13,6 @@ import logging
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 from nats.aio.client import Client
 
@@ -41,14 +40,6 @@ SET_BACK = (
 _log = logging.getLogger("multidrop.fleet.samples.forwarder")
 
 
-class ForwarderState(NamedTuple):
-    """Messages sent since the start, the last sequence in the stream, and the present problem."""
-
-    sent: int
-    last: int | None  # None: unknown so far
-    trouble: str | None
-
-
 class NotOurLog(Exception):
     """The stream has a different message under a number of this log: the folder was copied, or set back."""
 
@@ -60,21 +51,18 @@ class Forwarder:
         self._spool, self._client = spool, client
         self._subject = subject_of(spool.gateway, spool.log)
         self._news = asyncio.Event()
-        self._sent = 0
-        self._last: int | None = None
-        self._trouble: str | None = None
-
-    def state(self) -> ForwarderState:
-        return ForwarderState(self._sent, self._last, self._trouble)
+        self.sent = 0  # messages since the start
+        self.last: int | None = None  # the last sequence in the stream; None: unknown so far
+        self.trouble: str | None = None
 
     def lag_s(self) -> float | None:
         """Return the age (s, by the system's clock) of the oldest message that the stream lacks.
 
         Return 0 if the stream lacks none; None if that is still unknown, or the message was removed.
         """
-        if self._last is None:
+        if self.last is None:
             return None
-        stored = self._spool.following(self._last)
+        stored = self._spool.following(self.last)
         if stored is None:
             return 0.0
         with suppress(OSError):  # the spool may have just removed the file
@@ -119,7 +107,7 @@ class Forwarder:
             if found is None:  # refused because an earlier attempt of ours succeeded
                 return
             place, sequence = found, stored.sequence
-            self._sent += 1
+            self.sent += 1
             self._have(sequence)
             self._note(None)
 
@@ -128,7 +116,7 @@ class Forwarder:
         last = await last_of(self._client, self._subject)
         end_if_cancelled()
         if last is None or last.sequence == 0:  # none is stored any longer, or the last one is forged
-            sequence = self._last or 0
+            sequence = self.last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence
         if last.sequence > self._spool.state().newest:
@@ -149,15 +137,15 @@ class Forwarder:
         }
 
     def _have(self, sequence: int) -> None:
-        self._last = sequence
+        self.last = sequence
         self._spool.acknowledge(sequence)
 
     def _note(self, trouble: str | None, cause: Exception | None = None) -> None:
-        if trouble and trouble != self._trouble:
+        if trouble and trouble != self.trouble:
             _log.error("samples are not forwarded: %s", trouble, exc_info=cause)
-        if self._trouble and not trouble:
-            _log.warning("samples are forwarded again, behind message %s", self._last)
-        self._trouble = trouble
+        if self.trouble and not trouble:
+            _log.warning("samples are forwarded again, behind message %s", self.last)
+        self.trouble = trouble
 
 
 def _read(path: Path) -> bytes | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, get_args
 
 from multidrop.fleet.servers import names
 
@@ -18,14 +18,16 @@ LEASE = {
 }
 OWNER = {"gateway": str, "session": int, "votes": int, "turn": int, "since": int}
 LINE = {"line": dict, "files": dict}
-SHAPES: Mapping[str, Mapping[str, type]] = {
+SHAPES: Mapping[str, Mapping[str, Any]] = {
     **dict.fromkeys(names.LEASES, LEASE),
     **dict.fromkeys(names.OWNERS, OWNER),
     names.PLANT: LINE,
 }
 SMALL, LARGE = 1 << 14, 1 << 20  # bytes of a record; a line's record has its family files
-_KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
-_KINDS |= {dict: "a table", list: "a list"}
+_KINDS: Mapping[Any, str] = {
+    **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
+    **{int | None: "a whole number or null", float | None: "a number or null", str | None: "a text or null"},
+}
 
 
 def largest(bucket: str) -> int:
@@ -49,14 +51,14 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
     return (None if mistake else value), mistake
 
 
-def misshapen(value: Any, shape: Mapping[str, type]) -> str:
+def misshapen(value: Any, shape: Mapping[str, Any]) -> str:
     """Return how a value differs from a shape; "" if it fits. It may have further entries."""
     if not isinstance(value, dict):
         return "not a table"
     for name, kind in shape.items():
         if name not in value:
             return f"it has no {name!r}"
-        if type(value[name]) is not kind:
+        if type(value[name]) not in (get_args(kind) or (kind,)):
             return f"its {name!r} is not {_KINDS[kind]}"
     return ""
 

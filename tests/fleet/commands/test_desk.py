@@ -7,26 +7,31 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
 from examples import every_third
-from lines import patient
+from lines import PATIENCE, patient
 from tables import table
 
-from multidrop import Stopped
+from multidrop import InvtCHE, Stopped
 from multidrop.control import Seen, audit_log, read_audit
-from multidrop.fleet.commands import stop_desk
+from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
+from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandOutcome,
+    CommandRequest,
     Offered,
     read_answer,
     read_offer,
 )
+from multidrop.fleet.commands.offers import prepare
 
 DONE, REFUSED, NOT_SENT, UNKNOWN = (
     CommandOutcome.DONE,
@@ -463,7 +468,7 @@ def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
 ) -> None:
     """It is noted in words that can be printed, and one that names no drives stops all of the line."""
     # Who asks again for a stop without an id asks for another one.
-    monkeypatch.setattr(stop_desk, "HOLD_S", PATIENCE_S)
+    monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
     assert answer is not None
     assert answer.drives["pump"].outcome is DONE
@@ -519,3 +524,56 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 def test_an_asker_rejects_invalid_answers(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)
+
+
+@pytest.mark.slow
+def test_of_many_stops_of_a_silent_drive_one_is_repeated(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each is sent after its call, and all have the answer of the one that is repeated."""
+    repeated: list[float | None] = []
+
+    def noted(*details: Any, stop: Callable[..., Results]) -> Results:
+        repeated.append(details[-1])
+        return stop(*details)
+
+    monkeypatch.setattr(desk_module, "stop_line", partial(noted, stop=stop_line))
+    monkeypatch.setattr(
+        RepeatedStops.__init__, "__defaults__", (partial(noted, stop=stop_drive), begin_stops)
+    )
+
+    async def stopped(desk: Desks) -> list[CommandAnswer | None]:
+        desk.sim.deaf_until = inf
+        called = [asyncio.create_task(desk.stop())]
+        async with asyncio.timeout(PATIENCE):
+            while not desk.lines.for_stop(LINE).bus.stops_under_way():  # type: ignore[union-attr]
+                await asyncio.sleep(0.002)
+            called += [asyncio.create_task(desk.stop()) for _ in range(8)]
+            while len(repeated) < 3 or desk.stops._repeated._sent:
+                await asyncio.sleep(0.002)
+        desk.sim.deaf_until = 0.0
+        return await asyncio.gather(*called)
+
+    with desks(tmp_path) as desk:
+        answers = asyncio.run(stopped(desk))
+    assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
+    assert repeated == [None, 0.0, 0.0]  # the second of these for seven that waited for the first one's reply
+
+
+def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:
+    drive = InvtCHE(1, name="mill", maximum_frequency=50)
+    for request in (
+        CommandRequest("1", "anna", "mill", register="setpoint", value=10.0),
+        CommandRequest("2", "anna", "mill", verb="start"),
+    ):
+        answer = prepare(drive, request).work()
+        assert answer.outcome is CommandOutcome.NOT_SENT
+        assert answer.text.startswith("mill is ")
+
+
+def test_an_offer_forgets_nothing_of_the_setpoint_in_force() -> None:
+    """It is not sent yet, and perhaps never: a start would be refused, or not see a power cycle."""
+    drive = InvtCHE(1, name="mill", maximum_frequency=50)
+    drive.commanded = 40.0
+    prepare(drive, CommandRequest("1", "anna", "mill", verb="set_frequency", options={"hz": 10.0}))
+    assert drive.commanded == 40.0
