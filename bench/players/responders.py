@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from socket import socket, socketpair
 
-from bench.support.programs import CHECKSUM, compiled, talking
+from bench.support.programs import FRAMES, compiled, talking
 
 
 @contextmanager
 def responders(kind: str, count: int, *options: object) -> Iterator[tuple[list[str], list[int]]]:
     """Play that many lines; yield their ports, and the descriptors for child processes."""
-    program = compiled("players/responders.c", *CHECKSUM)
+    program = compiled("players/responders.c", *FRAMES)
     if kind == "pty":
         with talking([program, "--ptys", count, *options]) as talker:
             yield talker.said.split(), []

@@ -27,7 +27,7 @@ from typing import Any
 from bench.masters import jobs
 from bench.players.responders import responders
 from bench.support import tables
-from bench.support.programs import CHECKSUM, compiled, module, on_processor
+from bench.support.programs import FRAMES, compiled, module, on_processor
 
 BAUDRATE = 115200
 DELAY_US = 2000
@@ -112,7 +112,7 @@ def measured(master: str, kind: str, count: int, seconds: float, paced: bool) ->
             lines = responders(kind, count, "--baudrate", baudrate, "--delay-us", delay_us)
             ports, fds = stack.enter_context(lines)
         if master == "bare C":
-            command = [compiled("masters/bare_lines.c", *CHECKSUM), seconds, *ports]
+            command = [compiled("masters/bare_lines.c", *FRAMES), seconds, *ports]
         else:
             job = json.dumps(asdict(Lines(ports, baudrate, seconds)))
             command = [*module("bench.questions.many_lines", job)]

@@ -17,8 +17,7 @@ from typing import Any
 HERE = Path(__file__).parents[1]
 PROCESSORS = sorted(os.sched_getaffinity(0))
 CORE = HERE.parent / "csrc"
-CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that use the core's own checksums
-FRAMES = (*CHECKSUM, str(CORE / "body.c"), str(CORE / "frame.c"))
+FRAMES = (f"-I{CORE}", str(CORE / "body.c"), str(CORE / "frame.c"))  # the core's frames and checksums
 
 
 @cache
