@@ -1,5 +1,6 @@
 """Rules for all tests: no test writes into the EEPROM ledger of the user who runs it."""
 
+import asyncio
 import gc
 import os
 import signal
@@ -7,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
+from inspect import iscoroutinefunction
 from itertools import count, islice
 from pathlib import Path
 from typing import IO, Any
@@ -103,6 +105,16 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     finally:
         counting.start()
         os.environ.update(kept)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run an `async def` test on an event loop of its own."""
+    if not iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    asyncio.run(pyfuncitem.obj(**arguments))
+    return True
 
 
 def _is_counted(item: pytest.Item) -> bool:

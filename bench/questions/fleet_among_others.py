@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--every", default="500 ms", help="between two exchanges of a line")
     parser.add_argument("--seconds", type=float, default=30.0, help="of each run")
     arguments = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
     from fleet_scale import cpu_s_of, groups, large_fleet, plant_of_fake_lines, until
     from nats_clusters import cluster
     from serial_hall import SerialHall

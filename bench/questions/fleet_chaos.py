@@ -22,7 +22,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 import duckdb
 from nats_clusters import Cluster, cluster

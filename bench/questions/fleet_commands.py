@@ -29,7 +29,7 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
     from command_drills import command_drill
 
     tables.heading("Is a command carried out twice, or its asker told wrongly, whatever is killed?")

@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=12)
     parser.add_argument("--deed", action="append", help="only this one; may be given again")
     arguments = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
     from fleet_drills import (
         CUTS,
         DEEDS,

@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, cast
 
-sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from postgres_clusters import Postgres, postgres
 

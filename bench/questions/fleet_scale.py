@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--gateways", type=int, default=20)
     parser.add_argument("--kills", type=int, default=3)
     arguments = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
     from fleet_scale import groups, large_fleet, plant_of_fake_lines
     from nats_clusters import cluster
 

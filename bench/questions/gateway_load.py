@@ -27,7 +27,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from gateway_users import GatewayUsers, Place, gateway_users, place_of, serve_tables
 from simulated_pumps import POLLED, SimulatedPumps, free_ports, simulated_pumps, write_plant

@@ -25,7 +25,7 @@ from multidrop.sim.wire import Wire
 
 pytestmark = pytest.mark.usefixtures("_turns_awaited")
 
-FAN = f"{Path(__file__).parents[1]}/support/own_drives.py:Fan"
+FAN = f"{Path(__file__).parents[1]}/support/drives/own_drives.py:Fan"
 find_model(FAN)  # says that the file is run, once in a process: not in the midst of a test
 LINE = '[[line]]\nname = "{}"\nport = "{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'

@@ -10,7 +10,7 @@ from inspect import isawaitable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[1] / "support").iterdir()))
 
 from controlled_loop import ControlledLoop
 from modbus_gateway import FakeCommands, FakeHub, FakeLine, plant_of

@@ -68,7 +68,7 @@ NOT_RUN = {
     "pip install 'multidrop[fleet]'": "installs",
     "multidrop fleet demo": "takes half a minute: tests/fleet/test_fleet_demo.py runs it",
     "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
-    "export MULTIDROP_NATS": "names servers: tests/support/fleet_drills.py does it",
+    "export MULTIDROP_NATS": "names servers: tests/support/fleet/fleet_drills.py does it",
     "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
     "multidrop hub tls://": "needs servers: tests/fleet/servers/test_secured_fleet.py runs it",
     "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",

@@ -20,7 +20,7 @@ from multidrop.errors import DriveException, NoReply
 from multidrop.families.registry import find_model
 
 SERVERS = Path(__file__).parents[1] / "support" / "servers"
-DEVICE = f"{Path(__file__).parents[1] / 'support' / 'own_drives.py'}:Device"
+DEVICE = f"{Path(__file__).parents[1] / 'support' / 'drives' / 'own_drives.py'}:Device"
 Device = find_model(DEVICE)
 ADDRESS = 7
 

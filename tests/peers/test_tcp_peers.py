@@ -23,7 +23,7 @@ from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
 
 SERVERS = Path(__file__).parents[1] / "support" / "servers"
-DEVICE = f"{Path(__file__).parents[1] / 'support' / 'own_drives.py'}:Device"
+DEVICE = f"{Path(__file__).parents[1] / 'support' / 'drives' / 'own_drives.py'}:Device"
 Device = find_model(DEVICE)
 ADDRESS = 7
 HELD = {

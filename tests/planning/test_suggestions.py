@@ -16,7 +16,7 @@ from multidrop.families.files.loader import load_family
 from multidrop.families.registry import SHIPPED
 from multidrop.planning.suggestions import reading_gain
 
-SUPPORT = Path(__file__).parents[1] / "support"
+SUPPORT = Path(__file__).parents[1] / "support" / "drives"
 PLANT = f"""
 [[line]]
 name = "hall"

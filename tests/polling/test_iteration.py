@@ -97,7 +97,7 @@ def test_a_poller_takes_a_plant_file(tmp_path: Path) -> None:
 
             [[line.drive]]
             name = "pump-1"
-            model = "{Path(__file__).parents[1] / "support" / "toy.py"}:Toy"
+            model = "{Path(__file__).parents[1] / "support" / "drives" / "toy.py"}:Toy"
             address = 1
             """,
             encoding="utf-8",

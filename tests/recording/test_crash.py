@@ -59,7 +59,7 @@ class Nursery:
         self._port = port
         self._directory = directory
         self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).parents[1] / "support" / "killable_client.py")],
+            [sys.executable, str(Path(__file__).parents[1] / "support" / "processes" / "killable_client.py")],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -229,7 +229,7 @@ def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
             "-c",
             RECORD_FOR_EVER,
             str(path),
-            str(Path(__file__).parents[1] / "support"),
+            *map(str, (Path(__file__).parents[1] / "support").iterdir()),
         ]
         with BoundProcess(command, stdout=subprocess.PIPE, text=True) as writing:
             assert writing.stdout is not None
@@ -286,7 +286,7 @@ def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
         "-c",
         FILL_THE_DISK,
         str(path),
-        str(Path(__file__).parents[1] / "support"),
+        *map(str, (Path(__file__).parents[1] / "support").iterdir()),
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stderr == ""

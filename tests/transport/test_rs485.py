@@ -78,7 +78,7 @@ def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list
     log.unlink(missing_ok=True)
     log.touch()
     settings = {"LD_PRELOAD": driver, "RS485_LOG": log, "RS485_CHARACTER_NS": CHARACTER_NS} | variables
-    paths = os.pathsep.join(map(str, [ROOT / "tests/support", os.environ.get("PYTHONPATH", "")]))
+    paths = os.pathsep.join(map(str, [ROOT / "tests/support/drives", os.environ.get("PYTHONPATH", "")]))
     ran = subprocess.run(
         [sys.executable, "-c", CLIENT, mode, str(reads)],
         env=os.environ | {name: str(value) for name, value in settings.items()} | {"PYTHONPATH": paths},

@@ -196,11 +196,11 @@ def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch
 def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:
     """Each run has its own numbers; all reported rows are there once, in order, without a gap."""
     dice = random.Random(kills)
-    support = Path(spooled.__file__).parents[1]
+    support = os.pathsep.join(map(str, Path(spooled.__file__).parents[1].iterdir()))
     told = []
     for run in range(kills):
         words = [sys.executable, spooled.__file__, str(folder), str(run * 1_000_000)]
-        here = {**os.environ, "PYTHONPATH": str(support)}
+        here = {**os.environ, "PYTHONPATH": support}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             assert child.stdout is not None
             least = [int(child.stdout.readline()) for _ in range(2)][1]  # none yet, and the first that are

@@ -18,7 +18,10 @@ import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
+from pathlib import Path
 from typing import Any, NamedTuple
+
+sys.path.extend(map(str, Path(__file__).parents[1].iterdir()))
 
 from kills import BoundProcess
 from simulated_pumps import FIRST_READING, POLLED, UNPOLLED

@@ -16,7 +16,7 @@ from multidrop.core import Framing, Message
 
 Verdict = Message | str  # a string is the reason for rejection
 
-JUDGE = Path(__file__).parents[1] / "c" / "libmodbus_judge.c"
+JUDGE = Path(__file__).parents[2] / "c" / "libmodbus_judge.c"
 EXCEPTIONS = range(12)  # errno of libmodbus for exceptions 00 to 0B; its own errors follow
 EMBBADEXC = 14
 UNKNOWN_CODE = "an exception without a code"

@@ -18,6 +18,8 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+sys.path.extend(map(str, Path(__file__).parents[1].iterdir()))
+
 from kills import BoundProcess
 
 from multidrop import Plant

@@ -161,7 +161,7 @@ def _printed() -> list[Printed]:
         for reply, says in replies.items()
     }
     found = []
-    with (Path(__file__).parents[1] / "data" / "frames.csv").open(newline="") as file:
+    with (Path(__file__).parents[2] / "data" / "frames.csv").open(newline="") as file:
         for row in csv.DictReader(file):
             text, framing = row["bytes"], FRAMINGS[row["framing"]]
             common = (framing, row["direction"], _bytes(text), text, row["verdict"])

@@ -14,7 +14,7 @@ from kills import BoundProcess
 from multidrop.families.registry import find_model
 
 MULTIDROP = [sys.executable, "-m", "multidrop"]
-TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
+TOY = f"{Path(__file__).parents[1]}/drives/toy.py:Toy"
 find_model(TOY)  # imports the file now, because its notice would otherwise appear in the middle of a test
 Run = Callable[..., tuple[int, str, str]]
 TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a user's model is a program\n"

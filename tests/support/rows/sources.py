@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "src" / "multidrop"
 ROOMS = ("src", "csrc", "tests", "bench", "docs")
 BUILT = {"_build", "__pycache__", "corpus"}

@@ -1,6 +1,6 @@
 """A pytest plugin that hides pandas, polars and DuckDB.
 
-`PYTHONPATH=tests/support pytest -p without`
+`PYTHONPATH=tests/support/processes pytest -p without`
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Print coverage of Python and C, and the lines that the tests did not reach.
 
-`python tests/support/covered.py PATH...`: coverage.py's JSON report, the directory of a core built with
---coverage, or both. tests/README.md explains the lines that are not reached.
+`python tests/support/processes/covered.py PATH...`: coverage.py's JSON report, the directory of a core built
+with --coverage, or both. tests/README.md explains the lines that are not reached.
 """
 
 from __future__ import annotations
