@@ -34,12 +34,11 @@ from multidrop.errors import (
     NotMaster,
     NotVerified,
     Unconfirmed,
-    Unsupported,
     WriteForbidden,
 )
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.invt_che import CHEControl, parameter
-from multidrop.sim import MotorDrive, simulated
+from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
 from multidrop.transport.exchange import READ_ATTEMPTS
 
@@ -180,24 +179,6 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     assert looks == ["look"]
 
 
-@pytest.mark.parametrize("actual", MAKE)
-@every_family
-def test_a_drive_of_another_family_is_not_written_to(
-    monkeypatch: pytest.MonkeyPatch, model: str, actual: str
-) -> None:
-    if model == actual:
-        return
-    sim = simulated(MAKE[actual](1))
-    assert isinstance(sim, MotorDrive)
-    line = SimulatedBus(monkeypatch, sim)
-    drive = line.attach(MAKE[model](1))
-    for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):
-        with pytest.raises((WriteForbidden, NoReply, Unsupported)):
-            call()
-    assert line.written == []
-    assert not sim.counters.writes
-
-
 def test_a_goodrive_is_not_taken_for_a_che(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     sim["device"] = 0x010A
@@ -205,23 +186,6 @@ def test_a_goodrive_is_not_taken_for_a_che(monkeypatch: pytest.MonkeyPatch) -> N
         with pytest.raises(WriteForbidden, match="010AH"):
             call()
     assert line.written == []
-
-
-def test_a_stop_is_sent_to_a_drive_that_cannot_be_heard_and_nothing_else_is(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    line.loses = lambda request: True
-    for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
-        with pytest.raises(NoReply):
-            call()
-    assert line.written == []
-    begun = line.seconds
-    with pytest.raises(Unconfirmed, match=r"never confirmed: .*control = STOP took effect"):
-        drive.stop()
-    assert set(line.written) == {"01 06 10 00 00 05 4D 09", "01 06 10 00 00 08 8C CC"}  # a run's and a jog's
-    assert len(line.written) > 35  # for 30 s, of which more than half is left to polling
-    assert 30 <= line.seconds - begun < 32
 
 
 def test_an_ambiguous_ibd_needs_its_owners_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -395,71 +359,6 @@ def test_an_unsent_write_is_not_unconfirmed(monkeypatch: pytest.MonkeyPatch, res
 
 
 # ---- faults on the way ----
-
-
-@every_family
-def test_a_start_whose_reply_is_lost_is_sent_once(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
-    drive.set_frequency(20)
-    line.loses = lambda request: request.function in (2, 5, 6) and STARTS[model](request)
-    with pytest.raises(Unconfirmed, match="no reply"):
-        drive.start()
-    assert len(starts(line, model)) == 1
-    assert sim.motor.energised  # it did happen, and the caller was told that it may have
-
-
-@every_family
-def test_a_stop_whose_reply_is_lost_is_sent_until_it_is_answered(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
-    drive.set_frequency(20)
-    drive.start()
-    begun = len(line.written)
-    line.loses = lambda request: request.function in (2, 5, 6) and len(line.written) - begun < 3
-    drive.stop()
-    stops = line.written[begun:]
-    assert stops[0] == stops[1] == stops[2]
-    assert not sim.motor.energised
-
-
-@every_family
-def test_a_stop_whose_reply_is_always_lost_is_unconfirmed(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
-    drive.set_frequency(20)
-    drive.start()
-    begun = len(line.written)
-    line.loses = lambda request: request.function in (2, 5, 6)
-    with pytest.raises(Unconfirmed, match=r"sent \d+ times, it was never confirmed"):
-        drive.stop(seconds=3.9)
-    assert len(line.written) > begun + 8
-    line.sleep(60)
-    sim.pass_time(line.seconds)
-    assert not sim.motor.energised  # it had heard the first one
-
-
-@every_family
-@pytest.mark.parametrize("verb", ["start", "stop"])
-def test_a_drive_that_is_heard_no_more_after_its_command(
-    monkeypatch: pytest.MonkeyPatch, model: str, verb: str
-) -> None:
-    """An unseen effect is unconfirmed; NoReply would mean that no write was sent."""
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
-    drive.set_frequency(20)
-    if verb == "stop":
-        drive.start()
-    begun = len(line.written)
-    line.loses = lambda request: len(line.written) > begun and not is_write(request)
-    with pytest.raises(
-        Unconfirmed, match=r"it was confirmed, but its effect could not be seen: .*not answer"
-    ):
-        getattr(drive, verb)()
-    assert len(starts(line, model)) == 1
-    line.sleep(60)
-    sim.pass_time(line.seconds)
-    assert sim.motor.energised == (verb == "start")
 
 
 def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.MonkeyPatch) -> None:

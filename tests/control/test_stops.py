@@ -179,21 +179,7 @@ def test_no_moving_call_is_sent_after_closing(monkeypatch: pytest.MonkeyPatch) -
     assert writes(line, begun) == []
 
 
-# ---- looks ----
-
-
 # ---- until it stands ----
-
-
-@every_family
-def test_a_stop_is_repeated_as_long_as_the_line_is_deaf(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
-    drive.set_frequency(20)
-    drive.start()
-    hears_at = line.seconds + 20
-    line.deafens = lambda request: line.seconds < hears_at
-    drive.stop()
-    assert not sim.motor.energised
 
 
 @every_family
@@ -579,13 +565,7 @@ def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: 
     assert len(writes(line)) > 3
 
 
-# ---- expiry ----
-
-
 # ---- what is said of what was sent ----
-
-
-# ---- interruptions ----
 
 
 # ---- one drive, one bus ----

@@ -131,6 +131,35 @@ def test_a_stop_of_another_thread_ends_a_start_that_is_waiting_in_its_looks(mode
         until(lambda: not received.sim.motor.energised)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("model", usually(*MAKE))
+def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
+    with line(model) as (_, drive, received, _):
+        drive.set_frequency(20)
+        received.loses = lambda request: request in received.starts
+        with pytest.raises(Unconfirmed, match="no reply"):
+            drive.start()
+        assert len(received.starts) == 1
+        assert received.sim.motor.energised  # the caller was told that it may be
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "lost"), in_turn(MAKE, [3, 2, 7]))
+def test_a_stop_whose_replies_are_lost_is_repeated_unchanged(model: str, lost: int) -> None:
+    with line(model) as (_, drive, received, _):
+        drive.set_frequency(20)
+        drive.start()
+        begun = len(received.writes)
+        received.loses = lambda request: request in received.writes and len(received.writes) <= begun + lost
+        drive.stop()
+        stops = received.writes[begun:]
+        assert len(stops) > lost
+        assert all(stop in stops[lost:] for stop in stops[:lost])
+        assert len(received.starts) == 1
+        assert not received.sim.motor.energised
+
+
 def test_closing_waits_for_a_stop_that_is_under_way() -> None:
     with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)

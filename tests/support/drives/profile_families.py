@@ -155,6 +155,7 @@ SHIPPED_AS = {
     "delta-vfd-el": "delta-vfd-el",
     "optidrive-e3": "optidrive-e3",
 }
+KIND = {**{name: name for name in MAKE}, **{f"shipped {name}": kind for name, kind in SHIPPED_AS.items()}}
 
 
 def shipped(name: str, address: int) -> Drive:

@@ -1,0 +1,238 @@
+"""Each verb of every family, in each situation, with each fault on the line: its outcome and its frames.
+
+The table below is the whole specification; `check` holds what is true in every cell of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from motors import MAKE, STARTS
+from profile_families import ALL, KIND
+from profile_families import MAKE as PROFILES
+from profile_families import STARTS as PROFILE_STARTS
+from simulated_bus import SimulatedBus, is_write, one
+from tables import table
+
+from multidrop.control import records
+from multidrop.control.outcome import Seen
+from multidrop.core import Message, build_reply, build_request
+from multidrop.drive import ANOTHER_FAMILY, Drive
+from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, Unsupported, WriteForbidden
+from multidrop.sim import simulated
+
+FAMILIES: dict[str, Callable[[int], Drive]] = {**MAKE, **ALL}
+STARTED_BY = {**STARTS, **PROFILE_STARTS}
+NO_EXCEPTIONS = "delixi-native"  # its error replies have codes of their own: tests/families
+
+SITUATIONS = ("fresh", "set", "running", "tripped")
+VERBS: dict[str, Callable[[Any], Any]] = {
+    "set_frequency": lambda drive: drive.set_frequency(25),
+    "start": lambda drive: drive.start(),
+    "jog": lambda drive: drive.jog(),
+    "stop": lambda drive: drive.stop(seconds=5),
+    "coast": lambda drive: drive.coast(seconds=5),
+    "stop_all": lambda drive: drive.bus.stop_all(seconds=5)[drive.name],
+    "reset_fault": lambda drive: drive.reset_fault(),
+}
+TURNING, STOPPING = ("start", "jog"), ("stop", "coast", "stop_all")
+OUTCOMES: dict[str, type[BusError]] = {
+    "?": Unconfirmed,
+    "x": DriveException,
+    "-": NoReply,
+    "!": WriteForbidden,
+    "n": Unsupported,
+}
+# ok: done; ?: unconfirmed; x: refused by the drive; -: no reply, and no write was sent; !: forbidden.
+# A second outcome is that of families that cannot read the setpoint back, or that start with several words.
+TABLE = """
+situation verb          none lost-once lost never damaged exception late silent unreadable deaf echo
+fresh     set_frequency ok   ok/?      ok/? ?     ?       x         ok/? ?      ?          -    -
+fresh     start         !    !         !    !     !       !         !    !      !          -    -
+fresh     stop          ok   ok        ?    ?     ok      ok/x      ok/? ?      ?          ?    ?
+set       set_frequency ok   ok/?      ok/? ?     ?       x         ok/? ?      ?          ?/-  ?/-
+set       start         ok   ?/ok      ?    ?     ?/ok    x         ?/ok ?      ?/-        -    -
+set       jog           ok   ?         ?    ?     ?       x         ?    ?      ?          -    -
+running   set_frequency ok   ok/?      ok/? ?     ?       x         ok/? ?      ?          ?/-  ?/-
+running   stop          ok   ok        ?    ?     ok      x         ok/? ?      ?          ?    ?
+running   coast         ok   ok        ?    ?     ok      x         ok/? ?      ?          ?    ?
+running   stop_all      ok   ok        ?    ?     ok      x         ok/? ?      ?          ?    ?
+running   reset_fault   !    !         !    !     !       !         !    !      !          -    -
+tripped   start         !/?  !/?       !/?  !/?   !/?     !/x       !/?  !/?    !/?        -    -
+tripped   stop          ok   ok        ?    ?     ok      ok/x      ok/? ?      ?          ?    ?
+tripped   reset_fault   ok   ok/?      ?    ?     ok/?    x         ok/? ?      ?          -    -
+"""
+HEAD, *ROWS = [line.split() for line in TABLE.strip().splitlines()]
+CELLS = [(row[0], row[1], fault, told) for row in ROWS for fault, told in zip(HEAD[2:], row[2:], strict=True)]
+NOT_ARRIVING = ("never", "silent", "exception", "deaf", "echo")  # the drive does not act
+
+
+class Cell:
+    """One drive in its situation, whose line is at fault from the first write of the verb on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, family: str, situation: str) -> None:
+        self.line, self.drive, self.sim = one(monkeypatch, FAMILIES[family](1))
+        self.sim.motor.acceleration_time = self.sim.motor.deceleration_time = 1.0
+        self._is_start = STARTED_BY[KIND.get(family, family)]
+        if situation != "fresh":
+            self.drive.set_frequency(20)
+        if situation == "running":
+            self.drive.start()
+            self.line.sleep(3)
+        if situation == "tripped":
+            self.sim.trip(4)
+        self._begun = len(self.line.frames)
+        self._late: list[bytes] = []
+
+    @property
+    def writes(self) -> list[Message]:
+        return [request for request, _ in self.line.frames[self._begun :] if is_write(request)]
+
+    @property
+    def starts(self) -> list[Message]:
+        return [write for write in self.writes if self._is_start(write)]
+
+    def strike(self, fault: str) -> None:
+        """Give the line this fault."""
+        line = self.line
+        losing: dict[str, Callable[[Message], bool]] = {
+            "lost-once": lambda request: is_write(request) and len(self.writes) == 1,
+            "lost": is_write,
+            "unreadable": lambda request: bool(self.writes) and not is_write(request),
+        }
+        answering: dict[str, Callable[[Message], bytes | None]] = {
+            "damaged": lambda request: b"\x01\x06\0" if is_write(request) and len(self.writes) < 3 else None,
+            "exception": lambda request: self._refusal(request) if is_write(request) else None,
+            "late": self._answer_of_the_request_before,
+            "echo": lambda request: build_request(self.drive.framing, request) if is_write(request) else None,
+        }
+        line.loses = losing.get(fault, line.loses)
+        line.answers = answering.get(fault, line.answers)
+        deafening: dict[str, Callable[[Message], bool]] = {
+            "never": is_write,
+            "silent": lambda request: bool(self.writes),
+            "deaf": lambda request: True,
+            "echo": lambda request: True,
+        }
+        line.deafens = deafening.get(fault, line.deafens)
+
+    def _refusal(self, request: Message) -> bytes:
+        return build_reply(
+            self.drive.framing, Message(request.address, request.function, request.start, exception=4)
+        )
+
+    def _answer_of_the_request_before(self, request: Message) -> bytes | None:
+        """From the first write on, for three requests."""
+        if not self.writes or len(self._late) == 3:
+            return None
+        reply = self.sim.answer(request, self.line.seconds)
+        self._late.append(build_reply(self.drive.framing, reply) if reply else b"")
+        return self._late[-2] if len(self._late) > 1 else b""
+
+    def outcome(self, verb: str) -> str:
+        try:
+            result = VERBS[verb](self.drive)
+        except tuple(OUTCOMES.values()) as failure:
+            return next(sign for sign, kind in OUTCOMES.items() if type(failure) is kind)
+        if verb == "stop_all":
+            return {Seen.STOPPED: "ok", Seen.SENT: "?", Seen.REFUSED: "x"}.get(result.seen, str(result))
+        return "ok"
+
+    def runs(self) -> bool:
+        self.sim.pass_time(self.line.seconds + 60)
+        return bool(self.sim.motor.energised)
+
+
+def check(cell: Cell, situation: str, verb: str, fault: str, outcome: str) -> None:
+    """Assert what holds in every cell."""
+    assert len(cell.starts) <= (verb in TURNING), "a start is sent once, and only by a start"
+    if outcome in ("-", "!", "n") and fault != "unreadable":
+        assert cell.writes == [], "nothing was sent"
+    runs = cell.runs()
+    if situation == "running" and (verb not in STOPPING or outcome == "n"):
+        assert runs
+    elif verb not in TURNING and situation != "running":
+        assert not runs, "only a start turns a motor"
+    if verb in TURNING and outcome == "ok":
+        assert runs
+    if (
+        situation == "set"
+        and outcome == "?"
+        and verb in TURNING
+        and fault in ("lost-once", "lost", "unreadable")
+    ):
+        assert runs is bool(cell.starts), "the caller was told that it may run"
+    if verb in STOPPING and outcome != "n":
+        assert not runs or fault in NOT_ARRIVING
+        assert len(cell.writes) > (0 if outcome == "ok" else 3), "a stop is sent until it is confirmed"
+        if fault == "lost-once":
+            assert cell.writes[0] == cell.writes[1]
+    if verb == "set_frequency":
+        assert len(cell.writes) <= 1, "a setpoint is sent once"
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=["-".join(cell[:3]) for cell in CELLS])
+@table("family", FAMILIES)
+def test_outcome_of_a_verb_during_a_fault(family: str, cell: tuple[str, str, str, str]) -> None:
+    situation, verb, fault, expected = cell
+    if fault == "exception" and family == NO_EXCEPTIONS:
+        return
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
+        tried = Cell(monkeypatch, family, situation)
+        tried.strike(fault)
+        outcome = tried.outcome(verb)
+        assert outcome in (*expected.split("/"), "n")
+        assert outcome != "n" or verb in ("jog", "coast", "reset_fault"), "only these may be missing"
+        check(tried, situation, verb, fault, outcome)
+
+
+# ---- another make at the drive's address ----
+
+
+BUILT_IN = {name: make for name, make in MAKE.items() if name != NO_EXCEPTIONS}
+PAIRS = [
+    (declared, there)
+    for declared in {**BUILT_IN, **ALL}
+    for there in {**BUILT_IN, **PROFILES}
+    if KIND.get(declared, declared) != there
+]
+# Makes that are recognised by their registers, so that no frame of another family is sent to them.
+RECOGNISED = {"invt-che", "yd1000"}
+# The other make's status is invalid in the profile, and its `signature` is another one.
+RECOGNISED_BY_STATUS = {("invt-goodrive", "delta-vfd-el")}
+# Families whose stop, 0001H at 2000H, runs an INVT Goodrive, which shows no proof of its make.
+STOP_RUNS_A_GOODRIVE = {"innovert-ibd", "delixi-modbus", "delta-vfd-el"}
+
+
+@table("declared, there", PAIRS)
+def test_commands_never_reach_another_make(declared: str, there: str) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sim: Any = simulated(FAMILIES[there](1))
+        bus = SimulatedBus(monkeypatch, sim)
+        drive = bus.attach(FAMILIES[declared](1))
+        for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):
+            with pytest.raises(BusError):
+                call()
+        assert bus.written == []
+        assert not sim.motor.energised
+
+
+@table("declared, there", PAIRS)
+def test_stop_is_withheld_only_from_a_recognised_make(declared: str, there: str) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sim: Any = simulated(FAMILIES[there](1))
+        bus = SimulatedBus(monkeypatch, sim)
+        drive = bus.attach(FAMILIES[declared](1))
+        failure: BusError | None = None
+        try:
+            drive.stop(seconds=1)
+        except BusError as raised:
+            failure = raised
+        is_withheld = isinstance(failure, WriteForbidden) and failure.rule == ANOTHER_FAMILY
+        assert is_withheld == (bus.written == [])
+        kind = KIND.get(declared, declared)
+        assert not is_withheld or there in RECOGNISED or (kind, there) in RECOGNISED_BY_STATUS
+        assert sim.motor.energised == (kind in STOP_RUNS_A_GOODRIVE and there == "invt-goodrive")
