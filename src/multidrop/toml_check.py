@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -82,6 +83,55 @@ class Key:
         return isinstance(value, self.kind) and value not in ("", [])
 
 
+Steps = tuple[tuple[str, int], ...]  # from the document to a table: the array's name and the table's number
+
+
+class ConfigError(str):
+    """An error with its place at the start; `sentence` is the rest, `line` the file's line or 0."""
+
+    sentence: str
+    line: int
+
+
+def line_numbers(path: Path) -> dict[tuple[Steps, str], int]:
+    """Return the line of each table's header, under the key "", and of each of its keys."""
+    if not path.is_file():  # reading a serial port would block
+        return {}
+    found: dict[tuple[Steps, str], int] = {}
+    counts: Counter[tuple[Steps, str]] = Counter()
+    steps: Steps = ()
+    for number, line in enumerate(path.read_text("utf-8-sig", "replace").splitlines(), 1):
+        if header := _HEADER.match(line):
+            *above, last = header[1].split(".")
+            outer = tuple(step for name, step in zip(above, steps, strict=False) if name == step[0])
+            counts[outer, last] += 1
+            steps = (*outer, (last, counts[outer, last]))
+            found[steps, ""] = number
+        elif entry := _ENTRY.match(line):
+            found.setdefault((steps, entry[1]), number)
+    return found
+
+
+_HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]")
+_ENTRY = re.compile(r"\s*([\w-]+)\s*=")
+
+
+def grouped(errors: Sequence[str]) -> tuple[str, ...]:
+    """Return the errors; a sentence with more than SHOWN_ALIKE places is there once, with their number."""
+    alike = Counter(getattr(error, "sentence", error) for error in errors)
+    found: dict[str, str] = {}
+    for error in errors:
+        sentence = getattr(error, "sentence", error)
+        if alike[sentence] <= SHOWN_ALIKE:
+            found[error] = error
+        elif sentence not in found:
+            found[sentence] = f"{error}; the same in {alike[sentence] - 1} more places"
+    return tuple(found.values())
+
+
+SHOWN_ALIKE = 3  # equal sentences that are each shown
+
+
 @dataclass(frozen=True)
 class TomlPlace:
     """A place in the file. All places share the errors found so far, and the names seen so far."""
@@ -90,26 +140,43 @@ class TomlPlace:
     labels: tuple[str, ...] = ()
     config_errors: list[str] = field(default_factory=list)
     seen: dict[tuple[object, ...], str] = field(default_factory=dict)
+    lines: Callable[[], Mapping[tuple[Steps, str], int]] = dict  # see `line_numbers`
+    steps: Steps = ()
 
     def inside(self, kind: str, tables: list[Any]) -> Iterator[tuple[Any, TomlPlace]]:
         """Yield each table with its place, which is labelled with the table's name or else its number."""
         for number, table in enumerate(tables, 1):
             name = table.get("name") if isinstance(table, dict) else None
             label = f'{kind} "{name}"' if name and isinstance(name, str) else f"{kind} number {number}"
-            yield table, TomlPlace(self.path, (*self.labels, label), self.config_errors, self.seen)
+            yield table, replace(self, labels=(*self.labels, label), steps=(*self.steps, (kind, number)))
 
     def within(self, *labels: str) -> TomlPlace:
         """Return a place inside this one."""
-        return TomlPlace(self.path, (*self.labels, *labels), self.config_errors, self.seen)
+        return replace(self, labels=(*self.labels, *labels))
 
     def of_file(self, path: Path, *labels: str) -> TomlPlace:
         """Return a place in another file that belongs to this one."""
         return TomlPlace(path, labels, self.config_errors, self.seen)
 
-    def wrong(self, sentence: object) -> None:
-        """Add an error at this place. Unprintable characters are escaped, and passwords in URLs removed."""
+    def wrong(self, sentence: object, key: str = "") -> None:
+        """Add an error at this place, or at one of its keys.
+
+        Unprintable characters are escaped, and passwords in URLs removed.
+        """
+        line = self._line(key)
         text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
-        self.config_errors.append(f"{self.path}: {printable(masked(text))}")
+        error = ConfigError(f"{self.path}{f':{line}' if line else ''}: {printable(masked(text))}")
+        error.sentence, error.line = str(sentence), line
+        self.config_errors.append(error)
+
+    def _line(self, key: str) -> int:
+        """Return the line of a key or its table, or of the key that holds this place; 0 if it is unknown."""
+        places = [(self.steps, key), (self.steps, "")]
+        if self.steps:
+            *outer, (name, _) = self.steps
+            places += [(tuple(outer), name), (tuple(outer), "")]
+        lines = self.lines()
+        return next((lines[place] for place in places if place in lines), 0)
 
     def once(self, *what: object, sentence: str) -> None:
         """Add an error if `what` was seen before; `{first}` in the sentence becomes the first place."""
@@ -117,15 +184,15 @@ class TomlPlace:
             self.wrong(sentence.format(first=self.seen[what]))
         self.seen.setdefault(what, ", ".join(self.labels))
 
-    def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "") -> T | None:
+    def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "", key: str = "") -> T | None:
         """Return make(*arguments). If that raises ValueError or TypeError, add the error and return None.
 
-        `hint` is appended to the error.
+        `hint` is appended to the error, `key` is the key that it is about.
         """
         try:
             return make(*arguments)
         except (ValueError, TypeError) as mistake:
-            self.wrong(f"{mistake}{hint}")
+            self.wrong(f"{mistake}{hint}", key)
             return None
 
     def check(self, table: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
@@ -141,9 +208,9 @@ class TomlPlace:
                 if key.needed and name not in meant:
                     self.wrong(f"{name!r} is missing; add {key.example}")
             elif not key.takes(value):
-                self.wrong(f"{name} = {value!r} is not right; write {key.example}")
+                self.wrong(f"{name} = {value!r} is not right; write {key.example}", name)
             elif isinstance(value, str) and not value.isprintable():
-                self.wrong(f"{name} = {value!r} has characters that do not print; leave them out")
+                self.wrong(f"{name} = {value!r} has characters that do not print; leave them out", name)
             else:
                 good[name] = value
         return good
@@ -155,7 +222,7 @@ class TomlPlace:
             near = difflib.get_close_matches(name, keys, n=1)
             meant.update(near)
             hint = f"did you mean {near[0]!r}?" if near else f"the keys here are {', '.join(keys)}"
-            self.wrong(f"unknown key {name!r}; {hint}")
+            self.wrong(f"unknown key {name!r}; {hint}", name)
         return meant
 
 
@@ -178,7 +245,7 @@ def check_period(seconds: float) -> None:
 
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
     """Return the duration under this key in s; None if it is missing, or invalid, which adds an error."""
-    return place.attempt(_duration_under, key, given[key]) if key in given else None
+    return place.attempt(_duration_under, key, given[key], key=key) if key in given else None
 
 
 def _duration_under(key: str, text: str) -> float:

@@ -175,9 +175,9 @@ def test_all_mistakes_in_the_file_are_printed_with_status_2(run: Run, fitting: P
     fitting.write_text(text)
     status, out, err = run("plan", fitting)
     assert (status, out) == (2, "")
-    assert [line.removeprefix(f'multidrop: {fitting}: line "hall-1"') for line in err.splitlines()] == [
-        ": unknown key 'prot'; did you mean 'port'?",
-        ", drive \"pump-1\": every = 'soon' is not a duration from 100 us to 24 h, "
+    assert [line.removeprefix(f"multidrop: {fitting}:") for line in err.splitlines()] == [
+        "3: line \"hall-1\": unknown key 'prot'; did you mean 'port'?",
+        '8: line "hall-1", drive "pump-1": every = \'soon\' is not a duration from 100 us to 24 h, '
         'such as "50 ms", "2 s" or "1 min"',
     ]
 

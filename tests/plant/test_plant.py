@@ -106,15 +106,15 @@ def load(tmp_path: Path) -> Load:
 
 @pytest.fixture
 def mistakes(load: Load, tmp_path: Path) -> Mistakes:
-    """A function that returns the mistakes of a plant file, without the file's path at their start."""
+    """A function that returns the mistakes of a plant file, without path and line number at their start."""
 
     def mistakes(text: str) -> list[str]:
         with pytest.raises(PlantError) as refusal:
             load(text)
-        start = f"{tmp_path / 'plant.toml'}: "
-        assert all(sentence.startswith(start) for sentence in refusal.value.mistakes)
+        start = re.compile(re.escape(str(tmp_path / "plant.toml")) + r"(:\d+)?: ")
+        assert all(start.match(sentence) for sentence in refusal.value.mistakes)
         assert str(refusal.value) == "\n".join(refusal.value.mistakes)
-        return [sentence.removeprefix(start) for sentence in refusal.value.mistakes]
+        return [start.sub("", sentence, count=1) for sentence in refusal.value.mistakes]
 
     return mistakes
 
@@ -210,6 +210,33 @@ def test_framing_and_options_reach_the_drive(load: Load) -> None:
     assert pump.drive.framing is Framing.ASCII
     assert pump.drive.settings == Settings(9600, "7E1")
     assert pump.drive.option == {"rated_frequency": 60}
+
+
+def test_a_mistake_names_the_line_of_its_key_or_table(load: Load) -> None:
+    text = (
+        GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
+        .replace('"output_current",', '"output_curent",')
+        .replace("address = 2", "address = 1")
+    )
+    with pytest.raises(PlantError) as refusal:
+        load(text)
+    numbers = [int(sentence.split(":")[1]) for sentence in refusal.value.mistakes]
+    rows = text.splitlines()
+    starts = ("prot =", "poll =", "[[line.drive]]")
+    assert all(rows[number - 1].startswith(start) for number, start in zip(numbers, starts, strict=True))
+
+
+def test_the_same_mistake_in_many_drives_is_one_sentence(load: Load) -> None:
+    drives = (
+        TOY.replace('"D"', f'"D{address}"').replace("address = 1", f"address = {address}")
+        + 'poll = ["output_curent"]\n'
+        for address in range(1, 32)
+    )
+    with pytest.raises(PlantError) as refusal:
+        load(HEAD + "".join(drives))
+    (sentence,) = refusal.value.mistakes
+    assert '"D1"' in sentence
+    assert sentence.endswith("; the same in 30 more places")
 
 
 def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) -> None:

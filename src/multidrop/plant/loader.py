@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from multidrop.families.files import FamilyError
 from multidrop.families.registry import find_model
 from multidrop.plant.drive_names import check_drive_name
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
-from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
+from multidrop.toml_check import Key, TomlPlace, duration_of, grouped, line_numbers, read_document
 
 
 class PlantError(ValueError):
@@ -37,13 +37,13 @@ def load_plant(path: Path | str) -> Plant:
     if why := port_or_address(path):
         raise PlantError((why,))
     path = Path(path)
-    place = TomlPlace(path)
+    place = TomlPlace(path, lines=cache(partial(line_numbers, path)))
     document = place.attempt(read_document, path, "plant file")
     given = {} if document is None else place.check(document, _PLANT)
     lines = tuple(_line(table, at) for table, at in place.inside("line", given.get("line", [])))
     plant = Plant(lines, path, given.get("serve", {}))
     if place.config_errors:
-        raise PlantError(tuple(place.config_errors), None if document is None else replace(plant, lines=()))
+        raise PlantError(grouped(place.config_errors), None if document is None else replace(plant, lines=()))
     return plant
 
 
@@ -214,7 +214,7 @@ def _try_each(
             least |= framing  # the allowed formats depend on the framing
     for key, value in arguments.items():
         if key != "framing":
-            place.attempt(partial(model, **(least | {key: value})))
+            place.attempt(partial(model, **(least | {key: value})), key=key)
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
