@@ -171,15 +171,27 @@ def test_a_line_with_too_many_drives_is_warned_of(run: Run, tmp_path: Path) -> N
     assert [name for name, _ in remarks] == ["line L"]
 
 
-def test_a_plant_file_tells_its_family_s_mistakes_once(run: Run, tmp_path: Path) -> None:
+def test_mistakes_of_a_family_file_are_reported_once(run: Run, tmp_path: Path) -> None:
     (tmp_path / "fan.toml").write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
     drives = "".join(f'[[line.drive]]\nname = "f{at}"\nmodel = "fan.toml"\naddress = {at}\n' for at in (1, 2))
     (tmp_path / "plant.toml").write_text(f'[[line]]\nname = "L"\nport = "/dev/null"\n{drives}')
     status, _, err = run("plan", tmp_path / "plant.toml")
     assert status == 2
-    told = [line for line in err.splitlines() if "fan.toml" in line]
-    assert len(told) == 2
-    assert all('plant.toml: line "L", drive "f1": ' in line for line in told)
+    reported = [line for line in err.splitlines() if "fan.toml" in line]
+    assert len(reported) == 2
+    assert all('plant.toml:4: line "L", drive "f1": ' in line for line in reported)
+
+
+def test_a_coil_needs_no_span(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "io.toml"
+    path.write_text(
+        '[family]\ntitle = "IO"\nmanual = "v1"\n[setting]\nlamp = { at = "00001", place = "1" }\n'
+    )
+    status, out, _ = run("check", path)
+    assert status == 0
+    assert "lamp  setting  0 or 1" in out
+    assert "its span" not in out
+    assert "together = { coil = 20 }" in " ".join(out.split())
 
 
 def test_two_files_of_one_name_are_not_scanned_for_at_once(run: Run, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from multidrop.drive.verbs import MOVING
 from multidrop.families import MODELS
 from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import load_family
+from multidrop.families.files.notation import TABLES
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import PlantError, load_plant, port_or_address
 from multidrop.plant.model import Plant
@@ -147,7 +148,10 @@ def unknown(family: type[Drive]) -> Iterator[Remark]:
     if family.identify is Drive.identify:
         yield "identify", "how to recognise this device; read its name plate"
     if not family.most_registers:
-        yield "together", "how many neighbouring registers one request may read; together = { holding = 20 }"
+        tables = dict.fromkeys(one.table for one in registers if one.table.read is not None)
+        names = (name for name, table in TABLES.items() if table in tables)
+        counts = ", ".join(f"{name} = 20" for name in names)
+        yield "together", f"how many neighbouring addresses one request may read; together = {{ {counts} }}"
     if "confirmed" in family.options:
         for key in ("remote", "watchdog"):
             if getattr(family, key) == getattr(Drive, key):
@@ -159,7 +163,8 @@ def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
         yield 'whether it is stored in EEPROM: each write counts as wear; kept = "ram" or "eeprom"'
     if register.step is None:
         yield "its scale: raw counts are shown"
-    if register.access is Access.SETTING and register.values is None and register.span is None:
+    has_span = register.is_bit or register.values is not None or register.span is not None
+    if register.access is Access.SETTING and not has_span:
         yield "its span: every value that fits is written; span = [0, 50]"
     if register.access is not Access.READING and not register.place:
         yield 'its place in the manual, for comparison; place = "table 3"'

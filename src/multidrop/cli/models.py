@@ -296,6 +296,8 @@ def _registers(family: type[Drive], table: Table) -> Iterator[str]:
 def _row(register: Register[Any]) -> tuple[str, ...]:
     if register.values is not None:
         what = "names"
+    elif register.is_bit:
+        what = "0 or 1"
     elif register.step is None:
         what = f"{register.unit} scale not stated"
     else:
