@@ -4,6 +4,7 @@ import math
 
 import pytest
 from tables import table
+from toy import Fault, Toy
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
@@ -250,3 +251,12 @@ def test_neighbouring_drives_and_registers_have_different_codes() -> None:
     tables = (HOLDING, INPUT, Table("another", 7, None))
     codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
     assert len(codes) == 8 * 3 * 8
+
+
+def test_a_simulated_value_may_be_a_name_or_text() -> None:
+    sim = simulated(Toy(1))
+    sim["fault"] = "overcurrent"
+    sim["output_current"] = "2.5"
+    assert (sim["fault"], sim["output_current"]) == (Fault.OVERCURRENT, 2.5)
+    with pytest.raises(ValueError, match="fault has no 'three'; it takes none, overcurrent"):
+        sim["fault"] = "three"

@@ -13,6 +13,7 @@ from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
 from multidrop.sim.faulty_wire import HELP, Faults
+from multidrop.sim.port import is_dead_link
 
 ANY_TCP = "tcp://127.0.0.1:0"  # any free port of this computer, to simulate a line that is elsewhere
 LOOPBACK = ("127.0.0.1", "localhost")
@@ -86,7 +87,7 @@ def _port(line: PlantLine, directory: Path | None) -> str:
     link = directory / line.name
     if link.parent != directory:
         raise ValueError(f"line {line.name!r} has a / in its name: rename it to link its port")
-    if link.is_symlink() or link.exists():
+    if (link.is_symlink() or link.exists()) and not is_dead_link(link):
         raise ValueError(f"{link} exists already: remove it, or choose another directory with --ports")
     return str(link)
 

@@ -99,6 +99,8 @@ class SimulatedDrive:
             self.memory.set_text(self.drive.texts[name], value)
             return
         register = self.drive.register(name)
+        if isinstance(value, str):  # a name, such as of a wiring; raises ValueError with the known names
+            value = register.parse(value)
         self.memory.set(register, value)
         for cell in self.memory.of(register):
             self.changed(cell)

@@ -12,9 +12,17 @@ from multidrop.control.eeprom_ledger import default_path
 from multidrop.core import get_settings, set_settings
 from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import of_address
-from multidrop.transport.simulated_ports import SimulatedPort
+from multidrop.transport.simulated_ports import SimulatedPort, is_simulated
 
 MOST_READ = 4096
+
+
+def is_dead_link(link: Path) -> bool:
+    """Return True for the link of a killed simulator: its terminal is gone or belongs to another program."""
+    if not link.is_symlink():
+        return False
+    target = str(link.readlink())
+    return target.startswith("/dev/pts/") and not (link.exists() and is_simulated(target))
 
 
 class PtyPort:
@@ -36,6 +44,8 @@ class PtyPort:
             self.path = os.ttyname(self._slave)
             self._simulated = SimulatedPort(self.path, default_path().parent)
             if link is not None:
+                if is_dead_link(link):
+                    link.unlink()
                 link.symlink_to(self.path)
                 self.path = str(link)
         except OSError:
