@@ -198,7 +198,8 @@ def test_a_missing_extra(run: Run, monkeypatch: pytest.MonkeyPatch, library: str
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == library else found(name))
     said = one_sentence(run("fleet", "status"))
     assert said.endswith(
-        f"`multidrop fleet` needs {library}, which is not installed: pip install 'multidrop[fleet]'"
+        f"`multidrop fleet` needs {library}, which is not installed: "
+        "pip install 'nats-py[nkeys]>=2.10' 'pyarrow>=16'"
     )
 
 

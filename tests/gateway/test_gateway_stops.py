@@ -541,7 +541,7 @@ def test_part_that_cannot_start_is_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
         (
             "library",
-            r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'multidrop\[mqtt\]'",
+            r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'paho-mqtt",
         ),
         ("port", r"\[serve.mqtt\]: 127.0.0.1:1502 cannot be had"),
     ):

@@ -320,7 +320,7 @@ def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     with History(tmp_path) as history:
         assert history.metadata() == METADATA
         for ask in (lambda: rows_in(history), lambda: history.buckets("pump-0.speed", NOON, NOON + DAY)):
-            with pytest.raises(ImportError, match=r"needs duckdb.*pip install 'multidrop\[history\]'"):
+            with pytest.raises(ImportError, match=r"needs duckdb.*pip install 'duckdb>"):
                 ask()
 
 

@@ -65,7 +65,7 @@ NOT_RUN = {
     "multidrop serve --new-token": "prints a secret: tests/gateway/test_serve.py",
     "multidrop serve --demo": "runs until it is stopped: tests/gateway/test_serve.py",
     "multidrop serve plant.toml": "runs until it is stopped: tests/gateway/test_serve.py",
-    "pip install 'multidrop[fleet]'": "installs",
+    "pip install '.[fleet]'": "installs",
     "multidrop fleet demo": "takes half a minute: tests/fleet/test_fleet_demo.py runs it",
     "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
     "export MULTIDROP_NATS": "names servers: tests/support/fleet/fleet_drills.py does it",

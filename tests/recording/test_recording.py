@@ -450,7 +450,7 @@ def test_parquet_without_pyarrow_names_the_extra(
     assert callable(act)
     path = record(tmp_path / "a.parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(RecordingError, match=r"Parquet needs pyarrow: pip install 'multidrop\[parquet\]'"):
+    with pytest.raises(RecordingError, match=r"Parquet needs pyarrow: pip install 'pyarrow>"):
         act(path)
 
 

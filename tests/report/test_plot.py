@@ -854,10 +854,10 @@ def test_no_recording_or_no_rows_is_one_sentence(run: Run, tmp_path: Path, comma
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
-def test_without_the_extra_it_is_named(
+def test_a_missing_library_is_named_with_the_command_that_installs_it(
     run: Run, ramp: Path, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(multidrop.cli.support.files.importlib.util, "find_spec", lambda name: None)
     status, _, err = run(command, ramp)
     assert status == 2
-    assert "pip install 'multidrop[plot]'" in err
+    assert "pip install 'matplotlib>" in err

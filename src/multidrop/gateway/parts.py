@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from multidrop import Batch, Plant
+from multidrop.extras import install_command
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
@@ -83,9 +84,7 @@ def build(name: str, settings: object, context: PartContext) -> Part:
         part: Part = import_module(PARTS[name]).build(settings, context)
     except ImportError as missing:
         library = missing.name or str(missing)
-        raise ValueError(
-            f"it needs {library}, which is not installed: pip install 'multidrop[{name}]'"
-        ) from missing
+        raise ValueError(f"it needs {library}, which is not installed: {install_command(name)}") from missing
     return part
 
 

@@ -10,6 +10,7 @@ from shutil import rmtree
 from tempfile import mkdtemp
 from typing import Any
 
+from multidrop.extras import install_command
 from multidrop.history.series import Series
 from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
@@ -33,7 +34,7 @@ def connect(memory: str, spill: Path | None = None) -> Any:
         import duckdb
     except ImportError as failure:
         raise MissingDuckDB(
-            "compacted history needs duckdb, which is not installed: pip install 'multidrop[history]'"
+            f"compacted history needs duckdb, which is not installed: {install_command('history')}"
         ) from failure
     settings: dict[str, Any] = {"memory_limit": memory, "threads": 1, "autoinstall_known_extensions": False}
     if spill:

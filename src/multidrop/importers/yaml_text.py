@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from multidrop.extras import install_command
+
 MOST_CHARACTERS = 1_000_000
 MOST_NODES = 50_000  # an alias counts as all nodes of its expansion
 
@@ -22,7 +24,7 @@ def parse_yaml(text: str) -> Any:
     try:
         yaml: Any = import_module("yaml")
     except ImportError as failure:
-        raise ImportError("YAML is read with PyYAML: pip install 'multidrop[yaml]'") from failure
+        raise ImportError(f"YAML is read with PyYAML: {install_command('yaml')}") from failure
     if len(text) > MOST_CHARACTERS:
         raise ValueError(f"has more than {MOST_CHARACTERS} characters of YAML")
 

@@ -9,6 +9,8 @@ from array import array
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from multidrop.extras import install_command
+
 
 class ArrowTable(ABC):
     """A table with the Arrow PyCapsule interface, through which other libraries can read it."""
@@ -49,7 +51,7 @@ def _library(name: str, extra: str, method: str) -> Any:
         return importlib.import_module(name)
     except ImportError as failure:
         raise ImportError(
-            f"{method}() needs {name}, which is not installed: pip install 'multidrop[{extra}]'"
+            f"{method}() needs {name}, which is not installed: {install_command(extra)}"
         ) from failure
 
 

@@ -12,6 +12,7 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
+from multidrop.extras import install_command
 from multidrop.polling.batch import Rows, schema
 from multidrop.polling.tables import nanoarrow
 from multidrop.recording.format import (
@@ -44,7 +45,7 @@ def _pyarrow(path: Path) -> Any:
         import pyarrow.compute
         import pyarrow.parquet
     except ImportError as failure:
-        raise RecordingError(path, "Parquet needs pyarrow: pip install 'multidrop[parquet]'") from failure
+        raise RecordingError(path, f"Parquet needs pyarrow: {install_command('parquet')}") from failure
     return arrow
 
 

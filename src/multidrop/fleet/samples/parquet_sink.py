@@ -30,6 +30,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from multidrop.extras import install_command
 from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
 from multidrop.fleet.samples.message import ROWS
 from multidrop.recording import FileLock
@@ -169,7 +170,7 @@ async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
     The work is done by a child process of low priority, which may be killed at any time.
     """
     if importlib.util.find_spec("duckdb") is None:
-        _log.warning("files are not merged: install duckdb with pip install 'multidrop[history]'")
+        _log.warning("files are not merged: that needs duckdb: %s", install_command("history"))
         await asyncio.Event().wait()
     words = ["-m", "multidrop.history.compact", str(folder), "--below", "0", "--merge-rows"]
     while True:

@@ -1,0 +1,19 @@
+"""Optional libraries: the command that installs those of an extra."""
+
+from __future__ import annotations
+
+import shlex
+from importlib.metadata import PackageNotFoundError, requires
+
+
+def install_command(extra: str) -> str:
+    """Return the pip command for an extra's libraries.
+
+    It names the libraries, because `multidrop[extra]` is found only beside the sources.
+    """
+    try:
+        found = [one.partition(";") for one in requires("multidrop") or ()]
+    except PackageNotFoundError:
+        found = []
+    wanted = [name.strip() for name, _, marker in found if f'extra == "{extra}"' in marker.replace("'", '"')]
+    return "pip install " + (shlex.join(wanted) if wanted else f"'multidrop[{extra}]'")
