@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -193,6 +195,18 @@ def interrupted_parser(words: list[str]) -> int:
         raise KeyboardInterrupt
     finally:
         raise AttributeError("'_StoreAction' object has no attribute 'save_nargs'")
+
+
+def test_ctrl_c_during_the_first_imports_is_one_sentence() -> None:
+    code = (
+        "import sys, types; from multidrop.__main__ import main\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'multidrop.cli': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupting()); sys.exit(main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "multidrop: interrupted\n")
 
 
 @pytest.mark.parametrize("run", [interrupted_class, interrupted_parser])
