@@ -129,7 +129,7 @@ def test_the_demo() -> None:
         said = demo.stdout.read()
         assert demo.wait() == 0, said
     for word in (
-        "gw-2 is KILLED; it was master of line-",
+        "gw-2 is KILLED, the master of ",
         "the others are masters of its lines now",
         "again",
     ):

@@ -80,6 +80,19 @@ def test_lines_that_do_not_fit_are_counted_and_the_masterless_come_first() -> No
     assert text.count("from gw-1") >= 6
 
 
+def test_at_80_columns_and_24_rows_each_of_twelve_lines_has_its_master() -> None:
+    text = drawn(told(lines=12), 80, 24)
+    assert re.search(r"^line-0 +none +\| line-3", text, re.MULTILINE)
+    assert len(re.findall(r"line-\d+ +(?:gw-1|none)", text)) == 12
+    assert "last moves:" in text
+
+
+def test_notes_are_shown_whole_or_not() -> None:
+    notes = {"notes": [f"{at} " + "words " * 20 for at in range(3)]}
+    shown = drawn(told() | notes, 80).splitlines()
+    assert [row[0] for row in shown if re.match(r"\d words", row)] == ["1", "2"]
+
+
 def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
     head = [drawn(told(), width).splitlines()[2] for width in (200, 80, 72, 64, 56, 48, 40)]
     assert [re.sub(" +", " ", one) for one in head] == [
@@ -109,7 +122,7 @@ def test_what_does_not_fit_is_wrapped_or_seen_to_be_cut() -> None:
     assert shown[1] == "this is 12 s old: no server is reached~"
     assert shown[-3:] == [
         "a note of some words a note of some",
-        "words a note of some words",
+        "         words a note of some words",
         "Ctrl-C ends it",
     ]
 

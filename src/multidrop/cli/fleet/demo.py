@@ -24,6 +24,7 @@ from multidrop.cli.fleet.tables import natural
 from multidrop.cli.fleet.watch import drawing, follow
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import end_signals_cancel
+from multidrop.cli.support.values import counted
 
 GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
@@ -217,7 +218,7 @@ class Demo:
         lines = sorted((line for line, name in stage.masters().items() if name == KILLED), key=natural)
         killed_ns = time.time_ns()
         self._children.kill(KILLED)
-        stage.note(f"{KILLED} is KILLED; it was master of {', '.join(lines)}")
+        stage.note(f"{KILLED} is KILLED, the master of {counted(len(lines), 'line')}")
         survivors = [name for name in GATEWAYS if name != KILLED]
         await stage.until(lambda: stage.are_masters(survivors), f"the lines of {KILLED} were taken over")
         stage.note(f"the others are masters of its lines now: {stage.shares()}")

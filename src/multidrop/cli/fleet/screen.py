@@ -15,6 +15,7 @@ from multidrop.cli.fleet.tables import (
     FleetState,
     count_sentence,
     gateway_table,
+    line_columns,
     line_table,
     move_table,
     natural,
@@ -52,14 +53,22 @@ def _body(fleet: FleetState, width: int, room: int) -> list[str]:
     silent = silent_gateways(fleet)
     names = sorted(fleet["lines"], key=lambda name: _urgency(name, fleet["lines"][name]["master"], silent))
     lines = line_table(fleet, names, width - 1)
+    if len(lines) > room // 2:
+        columns = line_columns(fleet, sorted(names, key=natural), width - 1)
+        lines = columns if len(columns) <= room // 2 else lines
     moves = _moves(fleet, width, max(min(MOVES, room // 2), room - len(lines)))
     return [*begin, *_fitting(lines, room - len(moves)), *moves]
 
 
 def _notes(fleet: FleetState, width: int) -> list[str]:
-    """Return the last notes, wrapped, as many as fit."""
-    wrapped = [line for note in fleet.get("notes", ()) for line in textwrap.wrap(note, width - 1)]
-    return wrapped[-NOTES:]
+    """Return the last notes, wrapped, as many whole ones as fit."""
+    notes: list[str] = []
+    for note in reversed(fleet.get("notes", ())):
+        wrapped = textwrap.wrap(note, width - 1, subsequent_indent=" " * 9)
+        if len(wrapped) + len(notes) > NOTES:
+            break
+        notes = [*wrapped, *notes]
+    return notes
 
 
 def _moves(fleet: FleetState, width: int, room: int) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from math import inf
 from typing import Any
 
-from multidrop.cli.support.values import Row, aligned, counted
+from multidrop.cli.support.values import Row, aligned, columns_of, counted
 
 FleetState = Mapping[str, Any]  # a fleet, as `--json` prints it
 GATEWAYS = (
@@ -100,6 +100,18 @@ def _line_row(name: str, line: FleetState, silent: set[str]) -> Row:
     master, since = line["master"], line["since_ms"]
     answer = ", no answer" if master in silent else ""
     return name, line["port"], f"{master}{answer}" if master else "none", moment(since) if master else ""
+
+
+def line_columns(fleet: FleetState, names: Iterable[str], width: int) -> list[str]:
+    """Return the lines with their masters in several columns: for a screen without room for the table."""
+    silent = silent_gateways(fleet)
+    rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
+    cells = aligned([(name, master) for name, _, master, _ in rows], "<<")
+    across = max(1, (width + 3) // (max(map(columns_of, cells), default=0) + 3))
+    down = -(-len(cells) // across)
+    table = [tuple(cells[at::down]) for at in range(down)]
+    padded = [(*row, *[""] * (len(table[0]) - len(row))) for row in table]
+    return [*aligned(padded, "<" * len(table[0]), " | ")] if table else []
 
 
 def silent_gateways(fleet: FleetState) -> set[str]:

@@ -20,11 +20,11 @@ LONGEST_NAME = 24  # columns; keeps tables within a terminal
 _PRECISIONS = {NumberFormat.F16: "half", NumberFormat.F32: "single", NumberFormat.F64: "double"}
 
 
-def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
+def aligned(rows: Iterable[Row], alignment: str, between: str = "  ") -> list[str]:
     """Return one line per row with aligned columns; `alignment` has < or > for each column."""
     rows = list(rows)
     widths = [max(map(columns_of, column), default=0) for column in zip(*rows, strict=True)]
-    return ["  ".join(map(_padded, row, alignment, widths)).rstrip() for row in rows]
+    return [between.join(map(_padded, row, alignment, widths)).rstrip() for row in rows]
 
 
 def columns_of(text: str) -> int:
