@@ -1,0 +1,91 @@
+"""`multidrop ports`: lists this computer's serial ports with their adapters; says who may open each."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from multidrop.cli.doctor_findings import SYSFS, find_adapter
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import wrapped
+from multidrop.transport.port_identity import of_device
+
+NO_PORTS = "no serial port found; plug the adapter in" + (
+    ", then see `sudo dmesg | tail`" if sys.platform == "linux" else ""
+)
+
+
+@dataclass(frozen=True)
+class SerialPort:
+    """A serial port; `name` contains the adapter's serial number if it has one."""
+
+    name: str
+    device: str
+    adapter: str
+    may_open: bool
+    advice: str = ""  # how to get the permission
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    found = sorted(_linux_ports() if sys.platform == "linux" else _other_ports(), key=lambda port: port.name)
+    if arguments.json:
+        print_text(json.dumps([asdict(port) for port in found], indent=2))
+    else:
+        print_text("\n".join(line for port in found for line in _text(port)) or NO_PORTS)
+    return 0 if found else 1
+
+
+def _text(port: SerialPort) -> Iterator[str]:
+    yield port.name
+    now = f"{port.device}: " if port.device != port.name else ""
+    yield from wrapped(f"{now}{port.adapter}", "  ", "    ")
+    opening = "you may open it" if port.may_open else f"you may not open it: {port.advice}"
+    yield from wrapped(opening, "  ", "    ", breaks_words=False)
+
+
+def _linux_ports(sysfs: Path = SYSFS, devices: Path = Path("/dev")) -> Iterator[SerialPort]:
+    """Yield the terminals with hardware behind them. The kernel marks an absent UART by type 0."""
+    for tty in sorted((sysfs / "class/tty").glob("*")):
+        device, uart = devices / tty.name, tty / "type"
+        if not (tty / "device").exists() or (uart.exists() and uart.read_text("ascii").strip() == "0"):
+            continue
+        adapter = find_adapter(str(device), sysfs)
+        if not adapter.driver or not device.exists():
+            continue
+        what = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
+        advice = "" if os.access(device, os.R_OK | os.W_OK) else _permission_advice(device)
+        yield SerialPort(
+            of_device(str(device)), str(device), f"{what}, driver {adapter.driver}", not advice, advice
+        )
+
+
+def _permission_advice(device: Path) -> str:
+    """Return how this user gets the permission to open a device."""
+    import grp
+    import pwd
+
+    about, user = device.stat(), pwd.getpwuid(os.getuid())
+    group = grp.getgrgid(about.st_gid)
+    if about.st_mode & 0o060 != 0o060 or not about.st_gid:
+        return f"only {pwd.getpwuid(about.st_uid).pw_name} may; a udev rule can give it to a group"
+    if user.pw_name in group.gr_mem:
+        return f"you were added to its group {group.gr_name} after this login: log out and in again"
+    return f"sudo usermod -aG {group.gr_name} {user.pw_name}, then log out and in again"
+
+
+def _other_ports() -> Iterator[SerialPort]:
+    """Yield the ports that pyserial finds on Windows and macOS, where every user may open them."""
+    from serial.tools.list_ports import comports
+
+    for port in comports():
+        yield SerialPort(port.device, port.device, port.description or "unknown adapter", may_open=True)
