@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from multidrop.cli.support.arguments import whole
-from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.files import refuse_overwriting, write_new
 from multidrop.cli.support.output import print_text, warn
 from multidrop.importers import ImportedDevice, family_text, plant_text, read_devices
 from multidrop.printable import printable
@@ -38,12 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
     text = family_text(device, arguments.file.name)
     plant = plant_text(device, arguments.out.name) if arguments.plant else ""
     if arguments.out:
-        arguments.out.write_text(text, "utf-8")
+        write_new(arguments.out, text)
         print_text(f"wrote {arguments.out}: fill its gaps, then run multidrop check {arguments.out}")
     else:
         print_text(text)
     if plant:
-        arguments.plant.write_text(plant, "utf-8")
+        write_new(arguments.plant, plant)
         print_text(f"wrote {arguments.plant}: enter its port")
     for sentence in device.lost:
         warn(f"not imported: {sentence}")

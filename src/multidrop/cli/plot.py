@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.files import beside, load_recording
+from multidrop.cli.support.files import beside, load_recording, write_new
 from multidrop.cli.support.output import print_text
 
 SUFFIXES = (".png", ".html")
@@ -28,10 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     from multidrop.report import plot, plot_page, png
 
     figure, left_out = plot(recording, arguments.drive, arguments.register)
-    if out.suffix.lower() == ".png":
-        out.write_bytes(png(figure))
-    else:
-        out.write_text(plot_page(recording, figure), "utf-8")
+    write_new(out, png(figure) if out.suffix.lower() == ".png" else plot_page(recording, figure))
     print_text(out)
     if left_out:
         print_text(f"not shown: {'; '.join(left_out)} (choose with --drive and --register)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.files import beside, load_recording
+from multidrop.cli.support.files import beside, load_recording, write_new
 from multidrop.cli.support.output import print_text
 
 
@@ -23,6 +23,6 @@ def run(arguments: argparse.Namespace) -> int:
     recording = load_recording(arguments.recording, out, "report")
     from multidrop.report import report_page
 
-    out.write_text(report_page(recording), "utf-8")
+    write_new(out, report_page(recording))
     print_text(out)
     return 0

@@ -20,7 +20,7 @@ from multidrop.cli.support.arguments import (
     rs485_at,
     settle_at,
 )
-from multidrop.cli.support.files import check_writable
+from multidrop.cli.support.files import check_writable, write_new
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485
@@ -87,9 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     drives = [finding for finding in found if isinstance(finding, Found)]
     written = None
     if arguments.out and any(drive.models for drive in drives):
-        arguments.out.write_text(
-            plant_text(lasting_name(arguments.port), drives, families, rs485, settle), "utf-8"
-        )
+        write_new(arguments.out, plant_text(lasting_name(arguments.port), drives, families, rs485, settle))
         written = str(arguments.out)
     if arguments.json:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}

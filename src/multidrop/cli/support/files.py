@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.support.output import warn
 from multidrop.cli.support.values import counted
-from multidrop.recording.format import already_there, new_file
+from multidrop.extras import install_command
+from multidrop.recording.format import AppendFile, already_there, new_file, writing
 from multidrop.recording.segments import segments_of
 
 if TYPE_CHECKING:
@@ -28,6 +29,20 @@ def check_writable(path: Path) -> None:
         return
     new_file(path).close()
     path.unlink()
+
+
+def write_new(path: Path, content: str | bytes) -> None:
+    """Write a whole new file, or leave none. Raises ValueError if it exists, OSError if it does not fit."""
+    with writing(path):
+        file = AppendFile(path)
+        try:
+            file.append(content.encode() if isinstance(content, str) else content)
+        except BaseException:
+            if path.is_file():  # never remove a device
+                path.unlink()
+            raise
+        finally:
+            file.close()
 
 
 def check_capture(path: Path) -> None:
@@ -84,8 +99,8 @@ def load_recording(path: Path, out: Path, command: str) -> Recording:
 
 
 def require_extra(library: str, extra: str, command: str) -> None:
-    """Raise ValueError if the library is missing; the error names the package to install."""
+    """Raise ValueError if the library is missing; the error has the command that installs it."""
     if importlib.util.find_spec(library) is None:
         raise ValueError(
-            f"`multidrop {command}` needs {library}, which is not installed: pip install 'multidrop[{extra}]'"
+            f"`multidrop {command}` needs {library}, which is not installed: {install_command(extra)}"
         )
