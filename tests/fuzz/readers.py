@@ -28,7 +28,7 @@ from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import Metadata, open_recording, open_writer, repair
-from multidrop.sim.faulty_wire import load_faults
+from multidrop.sim.faults import load_faults
 
 PLANT = """
 [[line]]

@@ -14,10 +14,13 @@ from toy import Toy
 
 from multidrop.cli import main
 from multidrop.core import STATUSES, Message, Peer
+from multidrop.drive.family import Drive
 from multidrop.errors import LineError, PortLost
-from multidrop.families import YD1000
-from multidrop.sim import Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
-from multidrop.sim.faulty_wire import RATES
+from multidrop.families import MODELS, YD1000
+from multidrop.sim import DriveFaults, Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
+from multidrop.sim.faults import rates_of
+from multidrop.sim.faulty_wire import overload_code
+from multidrop.sim.motor_drive import MotorDrive
 from multidrop.toml_check import parse_duration
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import make_exchange
@@ -133,6 +136,69 @@ def test_noise_comes_with_a_motor_s_start() -> None:
     assert line.wire.struck["start_noise"] == 1
 
 
+# ---- one drive ----
+
+
+def two_drives(**faults: Any) -> LineClient:
+    """A line whose second drive has these faults."""
+    drives = [SimulatedDrive(Toy(1, name="sound")), SimulatedDrive(Toy(2, name="flaky"))]
+    return LineClient(*drives, drives={"flaky": DriveFaults(**faults)})
+
+
+FLAKY_READ, FLAKY_REPLY = checksums.rtu("02 03 00 02 00 01"), checksums.rtu("02 03 02 00 00")
+
+
+@pytest.mark.parametrize("fault", ["loss", "damage", "delay"])
+def test_a_fault_of_one_drive_affects_only_its_replies(fault: str) -> None:
+    line = two_drives(**{fault: 1}, late=3.0)
+    usual = LineClient().after()[0][0]
+    assert line.bytes_after() == REPLY
+    received = line.after(FLAKY_READ)
+    data = b"".join(piece for _, piece in received)
+    if fault == "loss":
+        assert data == b""
+    elif fault == "damage":
+        assert bits(data, FLAKY_REPLY) == 1
+    else:
+        assert data == FLAKY_REPLY
+        assert received[0][0] > usual + 0.1
+    assert line.wire.struck == {fault: 1}
+
+
+def test_a_drive_falls_silent_and_comes_back() -> None:
+    line = two_drives(silence=30.0, silent_for=9.0, first=10.0)
+    replies = [line.bytes_after(FLAKY_READ) == FLAKY_REPLY for _ in range(10)]  # every 5 s
+    assert replies == [True, True, False, False, True, True, True, True, False, False]
+    assert line.bytes_after() == REPLY
+
+
+def test_a_running_motor_trips_and_its_load_drifts() -> None:
+    sim = simulated(YD1000(1, name="flaky"))
+    assert isinstance(sim, MotorDrive)
+    line = LineClient(sim, drives={"flaky": DriveFaults(trip=20.0, first=10.0, drift=0.2)})
+    loads = set()
+    for _ in range(3):
+        line.after()  # not running: it does not trip
+        loads.add(sim.motor.load)
+    assert sim.motor.fault == 0
+    assert len(loads) == 3
+    assert all(0.2 <= load <= 0.6 for load in loads)
+    for request in (START, READ, READ, READ, READ):
+        line.after(request)
+    assert sim.motor.fault == overload_code(sim.drive)
+
+
+@pytest.mark.parametrize("model", MODELS.values())
+def test_a_trip_has_a_code_of_its_family(model: type[Drive]) -> None:
+    drive = model(1)
+    assert 0 < overload_code(drive) < 0x10000
+
+
+def test_a_drive_without_a_motor_cannot_trip() -> None:
+    with pytest.raises(ValueError, match="flaky has no simulated motor: remove its trip and drift"):
+        two_drives(trip=1.0)
+
+
 # ---- the port ----
 
 
@@ -193,8 +259,8 @@ def test_a_bare_pty_cannot_hang_up() -> None:
 
 def test_all_that_a_file_says(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
-    path.write_text("\n".join([*(f"{name} = 0.25" for name in RATES), 'late = "2 s"', "seed = 3"]))
-    assert load_faults(path) == Faults(**dict.fromkeys(RATES, 0.25), late=2.0, seed=3)
+    path.write_text("\n".join([*(f"{name} = 0.25" for name in rates_of(Faults)), 'late = "2 s"', "seed = 3"]))
+    assert load_faults(path) == Faults(**dict.fromkeys(rates_of(Faults), 0.25), late=2.0, seed=3)
 
 
 def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
@@ -218,9 +284,27 @@ def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
     ]
 
 
+def test_faults_of_drives_are_in_their_tables(tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    path.write_text('drop = 0.1\n[drive.pump-1]\nloss = 0.2\nsilence = "1 min"\n')
+    pump = DriveFaults(loss=0.2, silence=60.0)
+    assert load_faults(path, {"pump-1"}) == load_faults(path) == Faults(drop=0.1, drives={"pump-1": pump})
+    path.write_text("[drive.pump-2]\n[drive.pump-1]\nloss = 3\n")
+    with pytest.raises(ValueError, match="unknown key") as mistake:
+        load_faults(path, {"pump-1"})
+    assert str(mistake.value).splitlines() == [
+        f"{path}: unknown key 'pump-2'; did you mean 'pump-1'?",
+        f'{path}: drive "pump-1": loss = 3 is not a rate; write one from 0 to 1, such as 0.01',
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
-    [(None, r"the faults' file cannot be read: No such file"), ("drop =", "is not TOML: ")],
+    [
+        ("drive = 1", "drive is not a table"),
+        (None, r"the faults' file cannot be read: No such file"),
+        ("drop =", "is not TOML: "),
+    ],
 )
 def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
@@ -233,7 +317,8 @@ def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_
 def test_the_help_lists_the_keys_of_a_faults_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--help"]) == 0
     told = capsys.readouterr().out
-    assert all(re.search(rf"^  {name} = ", told, re.MULTILINE) for name in (*RATES, "seed", "late"))
+    keys = {*rates_of(Faults), *rates_of(DriveFaults), "seed", "late", "silence", "trip"}
+    assert {name for name in keys if not re.search(rf"^  {name} = ", told, re.MULTILINE)} == set()
 
 
 def test_the_command_reports_a_mistake_in_the_file(

@@ -12,7 +12,7 @@ import pytest
 from lines import Own, until
 from toy import Toy
 
-from multidrop import Bus, NoReply
+from multidrop import YD1000, Bus, NoReply
 from multidrop.sim import EncodedDrive, Simulator, Wire, serve, simulated
 
 PATIENCE = 60.0
@@ -87,3 +87,21 @@ def test_a_thread_that_ends_says_so(
     with pytest.raises(Ill, match="of select"):
         simulator.__exit__()
     assert "no drive answers any more" in caplog.text
+
+
+@pytest.mark.slow
+def test_simulated_time_passes_faster() -> None:
+    """A motor's ramp of 10 s takes less than one."""
+    sim = simulated(YD1000(1))
+    with Simulator([Wire([sim])], speed=20) as simulator, Bus(simulator.wires[0].path) as bus:
+        fan = bus.attach(YD1000, 1)
+        fan.set_frequency(50.0)
+        fan.start()
+        until(lambda: fan.read(fan.output_frequency) == 50.0)
+        assert sim.now > 10 * time.monotonic()  # by the simulator's clock
+
+
+@pytest.mark.parametrize("speed", [0, -1, float("inf"), float("nan")])
+def test_speed_is_a_positive_number(speed: float) -> None:
+    with pytest.raises(ValueError, match="is not a positive number"):
+        Simulator([], speed=speed)

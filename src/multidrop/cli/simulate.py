@@ -12,7 +12,7 @@ from multidrop.drive.line_settings import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
-from multidrop.sim.faulty_wire import HELP, Faults
+from multidrop.sim.faults import HELP, Faults
 from multidrop.sim.port import is_dead_link
 
 ANY_TCP = "tcp://127.0.0.1:0"  # any free port of this computer, to simulate a line that is elsewhere
@@ -37,14 +37,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="directory for a link to each line's port; needed if a line has neither of these ports",
     )
     parser.add_argument("--unpaced", action="store_true", help="answer at once, not at the pace of a wire")
-    parser.add_argument("--faults", metavar="FILE", help="faults of the line, as described below")
+    parser.add_argument("--faults", metavar="FILE", help="faults of lines and drives, as described below")
+    parser.add_argument(
+        "--speed",
+        metavar="N",
+        type=_speed,
+        default=1.0,
+        help="let simulated time pass N times as fast: wires, drives, motors and faults; default: 1",
+    )
     parser.epilog = HELP
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
 def run(arguments: argparse.Namespace) -> int:
     plant = load_plant(arguments.plant)
-    faults = load_faults(arguments.faults) if arguments.faults else Faults()
+    names = [polled.drive.name for line in plant.lines for polled in line.drives]
+    faults = load_faults(arguments.faults, names) if arguments.faults else Faults()
     directory: Path | None = arguments.ports
     if directory is not None and not hasattr(os, "openpty"):
         raise ValueError(NO_TERMINALS)
@@ -59,8 +67,16 @@ def run(arguments: argparse.Namespace) -> int:
         FaultyWire(_drives(line), faults, name=line.name, port=port, unpaced=arguments.unpaced)
         for line, port in zip(plant.lines, ports, strict=True)
     ]
-    serve(wires, _announce)
+    serve(wires, _announce, speed=arguments.speed)
     return 0
+
+
+def _speed(text: str) -> float:
+    """Return how fast simulated time passes. Raises ValueError if it is not from 0.1 to 100."""
+    speed = float(text)
+    if not 0.1 <= speed <= 100:
+        raise ValueError(text)
+    return speed
 
 
 def _has_place(port: str) -> bool:

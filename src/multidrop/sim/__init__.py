@@ -7,9 +7,10 @@ from multidrop.sim.drive import Written as Written
 from multidrop.sim.drive import encoded as encoded
 from multidrop.sim.drive import proof as proof
 from multidrop.sim.families import simulated as simulated
-from multidrop.sim.faulty_wire import Faults as Faults
+from multidrop.sim.faults import DriveFaults as DriveFaults
+from multidrop.sim.faults import Faults as Faults
+from multidrop.sim.faults import load_faults as load_faults
 from multidrop.sim.faulty_wire import FaultyWire as FaultyWire
-from multidrop.sim.faulty_wire import load_faults as load_faults
 from multidrop.sim.motor import Motor as Motor
 from multidrop.sim.motor import Phase as Phase
 from multidrop.sim.motor import Rating as Rating

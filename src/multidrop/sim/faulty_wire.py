@@ -1,30 +1,30 @@
-"""FaultyWire: a wire that damages, delays and loses bytes between its client and its drives.
+"""FaultyWire: a wire with faults between its client and its drives, and with flaky drives.
 
 Input and output are bytes with times. All random decisions come from one seed.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import random
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from functools import partial
 from pathlib import Path
-from typing import Any
 
+from multidrop.drive.family import Drive
 from multidrop.sim.drive import SimulatedDrive
+from multidrop.sim.faults import DriveFaults, Faults
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.receiver import Frame
 from multidrop.sim.wire import ReceiverGroup, Transmission, Wire
-from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
     "drop": lambda frame, at, bit: frame[:at] + frame[at + 1 :],
     "flip": lambda frame, at, bit: frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :],
     "repeat": lambda frame, at, bit: frame[: at + 1] + frame[at:],
 }
+DRIFT_S = 20.0  # period of a drifting load
 
 
 class FaultyWire(Wire):
@@ -45,15 +45,22 @@ class FaultyWire(Wire):
         super().__init__(drives, name=name, port=port, unpaced=unpaced)
         if faults.hang_up and port == "pty":
             raise ValueError(f"{name}: a port that hangs up must be a link or a TCP port, to come back there")
+        self._by_name = {sim.drive.name: sim for sim in drives}
+        for drive, own in faults.drives.items():
+            sim = self._by_name.get(drive)
+            if sim and (own.trip or own.drift) and not isinstance(sim, MotorDrive):
+                raise ValueError(f"{name}: {drive} has no simulated motor: remove its trip and drift")
         self.faults = faults
         self.struck: Counter[str] = Counter()
         self._random = random.Random(f"{faults.seed} {name}")
         self._stray: list[Transmission] = []  # noise and echo on their way to the client
         self._held: Transmission | None = None  # a reply that waits for the next one
         self._back_at: float | None = None  # when a removed port comes back
+        self._due: dict[tuple[str, str], float] = {}  # next silence or trip, by drive and event
+        self._loads: dict[str, float] = {}  # of drives whose load drifts: the mean
 
-    def _strikes(self, fault: str) -> bool:
-        rate: float = getattr(self.faults, fault)
+    def _strikes(self, fault: str, of: Faults | DriveFaults | None = None) -> bool:
+        rate: float = getattr(of or self.faults, fault)
         if rate <= 0 or self._random.random() >= rate:
             return False
         self.struck[fault] += 1
@@ -70,6 +77,9 @@ class FaultyWire(Wire):
         if self._strikes("hang_up"):
             self._hang_up(now)
             return
+        for name, faults in self.faults.drives.items():
+            if name in self._by_name:
+                self._pass_time(self._by_name[name], faults, now)
         character = next(
             (group.receiver.character for group in self._groups if group.settings.baudrate == baudrate),
             self._groups[0].receiver.character,
@@ -79,6 +89,44 @@ class FaultyWire(Wire):
         if self._strikes("echo"):
             self._stray.append(Transmission(chunk, now, character))
         super().receive(self._damaged(chunk), now, baudrate)
+
+    def _pass_time(self, sim: SimulatedDrive, faults: DriveFaults, now: float) -> None:
+        """Silence the drive, trip its motor and move its load, as its faults say."""
+        name = sim.drive.name
+        if self._is_due(name, "silence", faults, now):
+            sim.deaf_until = max(sim.deaf_until, now + faults.silent_for)
+        if not isinstance(sim, MotorDrive):
+            return
+        if self._is_due(name, "trip", faults, now) and sim.motor.energised:
+            sim.trip(overload_code(sim.drive))
+        if faults.drift:
+            mean = self._loads.setdefault(name, sim.motor.load)
+            sim.motor.load = mean + faults.drift * math.sin(now * math.tau / DRIFT_S + sim.drive.address)
+
+    def _is_due(self, drive: str, event: str, faults: DriveFaults, now: float) -> bool:
+        """Return True once each period of this event."""
+        period: float | None = getattr(faults, event)
+        if not period:
+            return False
+        key = drive, event
+        if key not in self._due:
+            self._due[key] = now + (self._up_to(period) if faults.first is None else faults.first)
+        if now < self._due[key]:
+            return False
+        self._due[key] = now + period
+        self.struck[event] += 1
+        return True
+
+    def _reply(self, sim: SimulatedDrive, data: bytes, begin: float, character: float) -> None:
+        faults = self.faults.drives.get(sim.drive.name)
+        if faults:
+            if self._strikes("loss", faults):
+                return
+            if self._strikes("damage", faults):
+                data = DAMAGES["flip"](data, self._random.randrange(len(data)), self._random.randrange(8))
+            if self._strikes("delay", faults):
+                begin += self._up_to(faults.late)
+        super()._reply(sim, data, begin, character)
 
     def _deliver(self, group: ReceiverGroup, frames: Sequence[Frame]) -> None:
         if not frames:
@@ -174,76 +222,11 @@ def _ptys_up_to(name: str) -> list[int]:
     return taken
 
 
-def _rate(means: str) -> Any:
-    """Return a dataclass field for a rate from 0 (never) to 1 (always)."""
-    return field(default=0.0, metadata={"means": means, "example": "0.01"})
-
-
-def _most(default: float, example: str, means: str) -> Any:
-    return field(default=default, metadata={"means": means, "example": f'"{example}"'})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Faults:
-    """Rates of faults. At most one of `drop`, `flip` and `repeat` happens to a frame.
-
-    Therefore each of the three checksums detects the damage. If a reply is later than its family's response
-    timeout, it cannot be distinguished from the reply to the next equal request.
-    """
-
-    seed: int = field(default=0, metadata={"means": "the same one brings the same faults", "example": "7"})
-    drop: float = _rate("of the frames lose a character")
-    flip: float = _rate("of the frames have one bit turned")
-    repeat: float = _rate("of the frames have one character twice")
-    twice: float = _rate("of the replies come twice")
-    delay: float = _rate("of the replies come late")
-    late: float = _most(0.1, "100 ms", "the longest delay")
-    merge: float = _rate("of the replies wait, up to `late`, and come with the next")
-    split: float = _rate("of the replies have a pause inside")
-    pause: float = _most(0.02, "20 ms", "the longest pause")
-    echo: float = _rate("of the requests come back to the client")
-    noise: float = _rate("of the requests have noise before them")
-    start_noise: float = _rate("of the motors' starts bring noise")
-    burst: int = field(default=32, metadata={"means": "characters of noise at most", "example": "32"})
-    hang_up: float = _rate("of the requests find the port gone")
-    away: float = _most(1.0, "1 s", "the longest time until it is back")
-    rename: float = _rate("of the returns are under another name; the link follows")
-
-    def __post_init__(self) -> None:
-        for name in RATES:
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} = {value!r} is not a rate; write one from 0 to 1, such as 0.01")
-        if not 1 <= self.burst <= MOST_BURST:
-            raise ValueError(f"burst = {self.burst!r} is not from 1 to {MOST_BURST} characters")
-
-
-MOST_BURST = 4096
-_DURATIONS = ("late", "pause", "away")
-RATES = tuple(one.name for one in fields(Faults) if one.name not in ("seed", "burst", *_DURATIONS))
-
-
-def _kind(name: str) -> Any:
-    return str if name in _DURATIONS else (int, float) if name in RATES else int
-
-
-_EXAMPLES = {one.name: f"{one.name} = {one.metadata['example']}" for one in fields(Faults)}
-_KEYS = {name: Key(_kind(name), example) for name, example in _EXAMPLES.items()}
-HELP = (
-    "The faults' file has these lines, all of which may be left out: then a share\n"
-    "and the seed are 0, and the longest times and bursts are as here.\n"
-) + "".join(f"  {_EXAMPLES[one.name]:<20}{one.metadata['means']}\n" for one in fields(Faults))
-
-
-def load_faults(path: Path | str) -> Faults:
-    """Read the rates of faults from a file. Raises ValueError with all mistakes in it."""
-    path = Path(path)
-    place = TomlPlace(path)
-    document = place.attempt(read_document, path, "faults' file")
-    given = place.check({} if document is None else document, _KEYS)
-    for name in [name for name in given if name in _DURATIONS]:
-        given[name] = duration_of(given, name, place)
-    faults = {name: place.attempt(partial(Faults, **{name: value})) for name, value in given.items()}
-    if place.config_errors:
-        raise ValueError("\n".join(place.config_errors))
-    return Faults(**{name: getattr(one, name) for name, one in faults.items()})
+def overload_code(drive: Drive) -> int:
+    """Return the family's code of an overload, or of the first fault that it names, or 1."""
+    for name in ("fault", "last_fault", "fault_record_1"):
+        register = drive.registers.get(name)
+        if register is not None and register.values is not None:
+            faults = [one for one in register.values if one]
+            return int(next((one for one in faults if "OVERLOAD" in one.name), faults[0]))
+    return 1

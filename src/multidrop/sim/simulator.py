@@ -23,10 +23,16 @@ _log = logging.getLogger("multidrop.sim")
 
 
 class Simulator:
-    """Runs wires during a `with` block: `with Simulator([wire]) as sim: sim.wires[0].path`."""
+    """Runs wires during a `with` block: `with Simulator([wire]) as sim: sim.wires[0].path`.
 
-    def __init__(self, wires: Sequence[Wire]) -> None:
+    With `speed` 10, all simulated times pass ten times as fast: of the wire, the drives and their motors.
+    """
+
+    def __init__(self, wires: Sequence[Wire], *, speed: float = 1.0) -> None:
+        if not 0 < speed < math.inf:
+            raise ValueError(f"speed {speed!r} is not a positive number")
         self.wires = tuple(wires)
+        self._speed = speed
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
         self.failure: BaseException | None = None
         """The first exception of a simulated drive, or of the thread itself; None: there was none."""
@@ -124,12 +130,15 @@ class Simulator:
                 if key.data is None:
                     return
                 self._receive(key.data)
-            now = monotonic()
+            now = self._now()
             while self._wakes and self._wakes[0][0] <= now:
                 at, number = heapq.heappop(self._wakes)
                 if self._planned.get(number) == at:
                     del self._planned[number]
                     self._advance(number)
+
+    def _now(self) -> float:
+        return monotonic() * self._speed
 
     def _sleep(self) -> None:
         """Wait for bytes or the next wake-up.
@@ -137,7 +146,7 @@ class Simulator:
         Uses select() on the selector's own descriptor, because select() is exact to the microsecond and
         epoll_wait() only to the millisecond.
         """
-        limit = max(0.0, self._wakes[0][0] - monotonic()) if self._wakes else None
+        limit = max(0.0, self._wakes[0][0] - self._now()) / self._speed if self._wakes else None
         if isinstance(self._selector, selectors.SelectSelector):
             self._selector.select(limit)
         else:
@@ -152,7 +161,7 @@ class Simulator:
 
     def _receive(self, number: int) -> None:
         wire = self.wires[number]
-        now = monotonic()
+        now = self._now()
         chunk = wire.port.read() if wire.port else b""
         self._attend(number)
         if chunk and wire.port:
@@ -166,7 +175,7 @@ class Simulator:
         """Send the bytes that have reached the client by now, and plan the wire's next wake-up."""
         wire = self.wires[number]
         try:
-            data = wire.advance(monotonic())
+            data = wire.advance(self._now())
         except Exception as failure:
             self._note(number, failure)
             data = b""
@@ -192,12 +201,17 @@ class Simulator:
             self._attended[number] = now
 
 
-def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda simulator: None) -> None:
+def serve(
+    wires: Sequence[Wire],
+    announce: Callable[[Simulator], None] = lambda simulator: None,
+    *,
+    speed: float = 1.0,
+) -> None:
     """Run wires in this process's main thread until it is interrupted or terminated.
 
     `announce` is called once, when the wires' paths are known.
     """
-    simulator = Simulator(wires)
+    simulator = Simulator(wires, speed=speed)
     simulator.open()
     before = signal.signal(signal.SIGTERM, lambda *_: None)
     # Python runs no handler of a signal that comes just before the sleep: the signal's byte ends the sleep.

@@ -159,8 +159,11 @@ class Wire:
                 if self._keeps_silence(sim, frame) and (reply := sim.receive(frame)) is not None:
                     if frame.transaction:  # only Modbus TCP has a transaction
                         reply = replace(reply, transaction=frame.transaction)
-                    data = self.distort(build_reply(sim.drive.framing, reply))
-                    self._send(data, frame.end + sim.delay * self._pace, group.receiver.character)
+                    begin = frame.end + sim.delay * self._pace
+                    self._reply(sim, build_reply(sim.drive.framing, reply), begin, group.receiver.character)
+
+    def _reply(self, sim: SimulatedDrive, data: bytes, begin: float, character: float) -> None:
+        self._send(self.distort(data), begin, character)
 
     def _send(self, data: bytes, begin: float, character: float) -> None:
         bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda reply: reply.begin)
