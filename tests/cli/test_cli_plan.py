@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
-from rich.cells import cell_len
+
+from multidrop.cli.support.values import columns_of
 
 LINE = '[[line]]\nname = "{}"\nport = "/dev/there-is-no-such-port-{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
@@ -71,7 +72,7 @@ def test_long_names_fit_in_line_and_keep_both_ends(run: Run, tmp_path: Path) -> 
         "conveyor-of-...ng-hall-2",
     ]
     assert chinese.split()[0] == "主泵电机三号...却水循环"
-    assert {cell_len(row) for row in (first, second, chinese)} == {cell_len(head)}
+    assert {columns_of(row) for row in (first, second, chinese)} == {columns_of(head)}
 
 
 def test_json_has_the_figures(run: Run, fitting: Path) -> None:

@@ -154,7 +154,6 @@ def test_nothing_is_left_however_it_ends(number: signal.Signals, status: int) ->
 @pytest.mark.slow
 @pytest.mark.long
 def test_on_a_terminal_it_draws_and_prints_its_notes_at_the_end() -> None:
-    require_module("rich")
     with on_terminal("fleet", "demo", size=(110, 30)) as terminal:
         terminal.wait_for_match(r"in (/\S+)\r")
         folder = re.search(r"in (/\S+)\r", terminal.text)[1]  # type: ignore[index]

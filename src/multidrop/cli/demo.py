@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -65,7 +64,7 @@ def _make_room(out: Path) -> None:
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
-    """Return whether the monitor can show the demo: no captures are wanted, and a terminal and rich exist."""
+    """Return whether the monitor can show the demo: no captures are wanted, and it has a terminal."""
     if arguments.capture or arguments.flight_recorder:
         return False
-    return not arguments.json and is_possible() and find_spec("rich") is not None
+    return not arguments.json and is_possible()

@@ -10,20 +10,29 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from errno import EIO
 from functools import partial
 from logging import WARNING
-from os import get_terminal_size
 from pathlib import Path
 from typing import Any
 
+from multidrop.cli.monitor_screen import (
+    BLOCKS,
+    LEAST_HEIGHT,
+    LEAST_WIDTH,
+    PLAIN_BLOCKS,
+    Position,
+    overview,
+    page,
+)
 from multidrop.cli.support.arguments import add_plant_argument, add_port_option, plant_of
-from multidrop.cli.support.files import refuse_overwriting, require_extra
+from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.polling import LiveDrive, LivePlant, PollingSession, SideReader, polling_session
+from multidrop.cli.support.screen import Screen, TextLine
 from multidrop.cli.support.values import counted
 from multidrop.plant.model import Plant
 
@@ -41,9 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    require_extra("rich", "monitor", "monitor")
     if not is_possible():
-        raise ValueError("`multidrop monitor` needs a terminal; `multidrop poll` works without one")
+        raise ValueError(
+            "`multidrop monitor` needs a terminal on Linux or macOS; `multidrop poll` works without one"
+        )
     if arguments.out:
         refuse_overwriting(arguments.out)
     summary = watch(plant_of(arguments.plant, arguments), out=arguments.out)
@@ -51,8 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def is_possible() -> bool:
-    """Return whether stdin and stdout are a terminal."""
-    return sys.stdin.isatty() and sys.stdout.isatty()
+    """Return whether stdin and stdout are a terminal whose keys can be read."""
+    return sys.platform != "win32" and sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
@@ -60,10 +70,11 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
 
     Closing the terminal ends the monitor too. Stops in progress are always finished first.
     """
-    console = open_console()
+    screen = Screen()
+    _check_size(screen)
     live = LivePlant(plant, plant.metadata()["planned"])
     with polling_session(plant, out, live.add) as session:
-        monitor = Monitor(live, session, console)
+        monitor = Monitor(live, session, screen)
         with session.poller:
             try:
                 monitor.show(seconds)
@@ -77,10 +88,8 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
 class Monitor:
     """The screen of a polled plant: draws the newest values and obeys keys."""
 
-    def __init__(self, plant: LivePlant, session: PollingSession, console: Any) -> None:
-        from multidrop.cli.monitor_screen import BLOCKS, PLAIN_BLOCKS, Position
-
-        self._console = console
+    def __init__(self, plant: LivePlant, session: PollingSession, screen: Screen) -> None:
+        self._screen = screen
         self._session = session
         self._plant = plant
         self._at = Position()
@@ -89,14 +98,15 @@ class Monitor:
         self._stop_results: dict[str, tuple[int, int]] = {}  # by line: drives that stopped, drives in all
         self._has_left = False
         self._side_reader = SideReader(session.poller)
-        self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
+        self._blocks = BLOCKS if screen.has_blocks else PLAIN_BLOCKS
 
     def show(self, seconds: float | None) -> None:
         """Draw and obey keys until the user quits, a signal comes, or `seconds` have passed."""
         begun = next_draw = next_tick = time.monotonic()
         # Warnings on stderr would overwrite the screen.
+        every = SCROLL_S if self._screen.scrolls else DRAW_S
         with (
-            self._drawing() as (draw, every),
+            self._screen,
             terminal_keys() as wait_for_key,
             logging_to(self._show_message, "multidrop", WARNING),
         ):
@@ -111,7 +121,7 @@ class Monitor:
                 if now >= next_draw:
                     next_draw = max(next_draw + every, now)
                     self._session.hand_out()
-                    draw(self._picture())
+                    self._screen.draw(self._picture())
                 key = wait_for_key(max(0.0, min(next_draw, next_tick) - time.monotonic()))
                 if key:
                     self._obey(key)
@@ -133,37 +143,12 @@ class Monitor:
     def _is_stopping(self) -> bool:
         return any(thread.is_alive() for thread in self._stops)
 
-    @contextmanager
-    def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:
-        """Yield a function that draws a picture, and the seconds between two pictures.
-
-        Without cursor control, each picture is printed below the previous one.
-        """
-        if self._console.is_dumb_terminal:
-            yield self._console.print, SCROLL_S
-            return
-        from rich.control import Control
-
-        with self._console.screen(hide_cursor=True) as screen:
-
-            def draw(picture: Any) -> None:
-                self._console.control(Control.home())  # otherwise rich draws below the last picture
-                screen.update(picture)
-
-            yield draw, DRAW_S
-
-    def _picture(self) -> Any:
-        from multidrop.cli.monitor_screen import overview, page
-        from multidrop.cli.support.screen_text import joined
-
-        size = self._console.width, self._console.height
-        now_ns = time.time_ns()
+    def _picture(self) -> Sequence[TextLine]:
+        size, now_ns = self._screen.size, time.time_ns()
         if self._at.page:
             others = self._side_reader.read(self._chosen)
-            lines = page(self._chosen, others, self._at, size, now_ns)
-        else:
-            lines = overview(self._plant, self._at, size, now_ns, self._blocks)
-        return joined(lines, self._console.encoding)
+            return page(self._chosen, others, self._at, size, now_ns)
+        return overview(self._plant, self._at, size, now_ns, self._blocks)
 
     @property
     def _chosen(self) -> LiveDrive:
@@ -324,10 +309,9 @@ LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 def terminal_keys() -> Iterator[Callable[[float], str]]:
     """Yield a function that waits up to n seconds for a key and returns its name or letter, or "".
 
-    The function raises OSError if the terminal is closed. Raises ValueError on Windows.
+    The function raises OSError if the terminal is closed.
     """
-    if sys.platform == "win32":
-        raise ValueError("the live screen needs Linux or macOS; use `multidrop poll` on Windows")
+    assert sys.platform != "win32", "is_possible excludes it"
     import termios
     import tty
 
@@ -384,19 +368,11 @@ def _first_letter(pressed: bytes) -> tuple[str, bytes]:
     return "\ufffd", pressed[1:]
 
 
-def open_console() -> Any:
-    """Return the terminal. Raises ValueError if it is too small."""
-    from rich.console import Console
-
-    from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH
-
-    console = Console()
-    if console.is_dumb_terminal:
-        width, height = get_terminal_size()
-        console = Console(width=width, height=height - 1)  # the last line stays empty when it scrolls
-    if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
+def _check_size(screen: Screen) -> None:
+    """Raise ValueError if the terminal is too small."""
+    width, height = screen.size
+    if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         raise ValueError(
-            f"the terminal has {console.width} x {console.height} characters; "
+            f"the terminal has {width} x {height} characters; "
             f"the monitor needs at least {LEAST_WIDTH} x {LEAST_HEIGHT}"
         )
-    return console

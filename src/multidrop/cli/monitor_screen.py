@@ -10,12 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from rich.cells import cell_len, set_cell_size
-from rich.text import Text
-
 from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant, SideRead
-from multidrop.cli.support.screen_text import cut
-from multidrop.cli.support.values import counted
+from multidrop.cli.support.screen import TextLine, cut, filled
+from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
@@ -44,12 +41,14 @@ class Position:
     failures_shown: int = 0  # how many had room on the screen
 
 
-def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str) -> list[Text]:
+def overview(
+    plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str
+) -> list[TextLine]:
     """Draw one line per drive; if not all fit, draw the drives around the chosen one."""
     width, height = size
     top = [_title(plant, width, now_ns), *_line_states(plant, width)]
     columns = _columns(plant, width)
-    top.append(Text(_row(columns, {name: name for name in columns}, "")[:width], style="bold underline"))
+    top.append(TextLine(_row(columns, {name: name for name in columns}, "")[:width], style="bold underline"))
     alarms = _alarms(at, size)
     room = height - len(top) - len(alarms) - 2
     first = _first_seen(at.chosen, len(plant.drives), room)
@@ -60,12 +59,12 @@ def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int,
     hidden = len(plant.drives) - len(rows)
     notes = [f"{OLD} old value"] if any(OLD in row.plain for row in rows) else []
     note = "   ".join([*notes, *([f"{hidden} more drives: scroll"] if hidden else [])])
-    return [*top, *rows, *[Text()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
+    return [*top, *rows, *[TextLine()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
 
 
 def page(
     shown: LiveDrive, others: Mapping[str, SideRead], at: Position, size: tuple[int, int], now_ns: int
-) -> list[Text]:
+) -> list[TextLine]:
     """Draw every register of one drive; `others` has the side reads of unpolled registers."""
     width, height = size
     drive = shown.polled.drive
@@ -73,9 +72,9 @@ def page(
     head += f"{drive.settings} {drive.framing}"
     state = f" {shown.state or 'state not polled'}   {shown.fault}   {_misses(shown.so_far.misses)}"
     top = [
-        Text(set_cell_size(head, width), style="reverse"),
-        Text(cut(state, width)),
-        Text(cut(f" {_pace(shown)}", width)),
+        TextLine(filled(head, width), style="reverse"),
+        TextLine(cut(state, width)),
+        TextLine(cut(f" {_pace(shown)}", width)),
     ]
     names = [name for name, register in drive.registers.items() if register.readable]
     polled = [poll.register.name for poll in shown.polled.polls]
@@ -84,7 +83,7 @@ def page(
     cells = [_register(shown, name, others, now_ns) for name in names]
     notes = max((len(note) for *_, note in cells), default=0)
     room = max(LEAST_VALUE, width - longest - notes - AROUND)  # for values; notes are not cut
-    values = max(LEAST_VALUE, min(room, max((cell_len(value) for value, *_ in cells), default=0)))
+    values = max(LEAST_VALUE, min(room, max((columns_of(value) for value, *_ in cells), default=0)))
     rows = [
         _register_row(f"{name:<{longest}}", *cell, values, width)
         for name, cell in zip(names, cells, strict=True)
@@ -94,25 +93,31 @@ def page(
     at.scrolled = max(0, min(at.scrolled, len(rows) - room))
     visible = rows[at.scrolled : at.scrolled + room]
     note = f"registers {at.scrolled + 1} to {at.scrolled + len(visible)} of {len(rows)}"
-    return [*top, *visible, *[Text()] * (room - len(visible)), *alarms, *_foot(at, width, PAGE_HELP, note)]
+    return [
+        *top,
+        *visible,
+        *[TextLine()] * (room - len(visible)),
+        *alarms,
+        *_foot(at, width, PAGE_HELP, note),
+    ]
 
 
 # ---- parts of both ----
 
 
-def _title(plant: LivePlant, width: int, now_ns: int) -> Text:
+def _title(plant: LivePlant, width: int, now_ns: int) -> TextLine:
     clock = f"{datetime.fromtimestamp(now_ns / 1e9, UTC):%H:%M:%S} UTC "
     text = f" multidrop monitor  {printable(plant.plant.path.name)}"
-    return Text(set_cell_size(text, width - len(clock)) + clock, style="reverse")
+    return TextLine(filled(text, width - len(clock)) + clock, style="reverse")
 
 
-def _line_states(plant: LivePlant, width: int) -> list[Text]:
+def _line_states(plant: LivePlant, width: int) -> list[TextLine]:
     lines = []
     for line in plant.plant.lines:
         recent = plant.recent[line.name]
         text = f" {line.name}  {recent.utilisation:4.0%} of the wire used  "
         text += f"{recent.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
-        lines.append(Text(cut(text, width)))
+        lines.append(TextLine(cut(text, width)))
     return lines
 
 
@@ -144,7 +149,7 @@ def _ms(seconds: float) -> str:
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     """Return column widths by heading; fault and history share the rest of the line."""
     columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 10, "CURRENT": 10, "FAULT": 8, "AGE": 7}
-    longest = max(cell_len(drive.name) for drive in plant.drives)
+    longest = max(columns_of(drive.name) for drive in plant.drives)
     most = 11 + max(0, width - WIDE) // 3
     columns["DRIVE"] += max(0, min(longest - 5, most, width - len(columns) - sum(columns.values())))
     if width > len(columns) + sum(columns.values()) + 6:
@@ -165,15 +170,13 @@ _RIGHT = {"FREQUENCY", "CURRENT", "AGE", "MISSED", "DELAY"}
 def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str:
     parts = []
     for head, width in columns.items():
-        text = cut(cells.get(head, ""), width)
-        blank = " " * (width - cell_len(text))
-        parts.append(blank + text if head in _RIGHT else text + blank)
+        parts.append(padded(cut(cells.get(head, ""), width), ">" if head in _RIGHT else "<", width))
     return f"{mark:1}" + " ".join(parts)
 
 
 def _drive(
     drive: LiveDrive, chosen: bool, columns: Mapping[str, int], width: int, now_ns: int, blocks: str
-) -> Text:
+) -> TextLine:
     old = {name for name in (STATE, FREQUENCY, CURRENT, FAULT) if drive.is_old(name, now_ns)}
 
     def marked(text: str, register: str) -> str:
@@ -192,7 +195,7 @@ def _drive(
     }
     style = "red" if drive.fault else "yellow" if drive.why_silent or old else ""
     text = _row(columns, cells, ">" if chosen else "!" if drive.fault else "")
-    return Text(set_cell_size(text, width), style=f"{style} reverse" if chosen else style)
+    return TextLine(filled(text, width), style=f"{style} reverse" if chosen else style)
 
 
 def _register(
@@ -209,13 +212,13 @@ def _register(
     return (other.text, _age((now_ns - other.time) / 1e9), NOT_POLLED) if other else ("...", "", NOT_POLLED)
 
 
-def _register_row(name: str, value: str, age: str, note: str, value_width: int, width: int) -> Text:
-    text = f" {name}  {cut(value, value_width):>{value_width}}  {age:>6}  {note}"
+def _register_row(name: str, value: str, age: str, note: str, value_width: int, width: int) -> TextLine:
+    text = f" {name}  {padded(cut(value, value_width), '>', value_width)}  {age:>6}  {note}"
     style = "dim" if note == NOT_POLLED else "yellow" if note or age == NEVER else ""
-    return Text(cut(text, width), style=style)
+    return TextLine(cut(text, width), style=style)
 
 
-def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
+def _alarms(at: Position, size: tuple[int, int]) -> list[TextLine]:
     """Draw the unacknowledged failures, the oldest first, as many as fit."""
     width, height = size
     most = max(2, (height - 8) // 2)
@@ -230,16 +233,16 @@ def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
         at.failures_shown += 1
     more = len(failures) - at.failures_shown
     lines += [f"... and {more} more; acknowledge these first"] if more else []
-    return [Text(f" ! {line}".ljust(width), style="bold white on red") for line in lines]
+    return [TextLine(f" ! {line}".ljust(width), style="bold white on-red") for line in lines]
 
 
-def _foot(at: Position, width: int, helps: Sequence[str], note: str) -> list[Text]:
+def _foot(at: Position, width: int, helps: Sequence[str], note: str) -> list[TextLine]:
     if at.question:
-        return [Text(), Text(set_cell_size(cut(f" {at.question}", width), width), style="bold reverse")]
+        return [TextLine(), TextLine(filled(f" {at.question}", width), style="bold reverse")]
     text = f" {at.message}" if at.message else f" {note}"
     helps = ACKNOWLEDGE if at.failures else helps
     help_text = next((help_text for help_text in helps if len(help_text) < width), helps[-1])
-    return [Text(cut(text, width), style="bold"), Text(cut(f" {help_text}", width), style="dim")]
+    return [TextLine(cut(text, width), style="bold"), TextLine(cut(f" {help_text}", width), style="dim")]
 
 
 def _first_seen(chosen: int, count: int, room: int) -> int:

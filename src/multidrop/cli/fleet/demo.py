@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -258,8 +257,8 @@ def sample_times(parquet: Path) -> dict[str, list[int]]:
 
 @contextmanager
 def _drawn(stage: Stage) -> Iterator[None]:
-    """Draw on a terminal if rich is installed; print the notes in any case."""
-    if not (sys.stdout.isatty() and find_spec("rich")):
+    """Draw on a terminal; print the notes in any case."""
+    if not sys.stdout.isatty():
         yield
         return
     try:

@@ -9,8 +9,6 @@ import textwrap
 import time
 from typing import Any
 
-from rich.text import Text
-
 from multidrop.cli.fleet.tables import (
     FleetState,
     count_sentence,
@@ -22,22 +20,22 @@ from multidrop.cli.fleet.tables import (
     silent_gateways,
     trouble_sentences,
 )
-from multidrop.cli.support.screen_text import cut
+from multidrop.cli.support.screen import TextLine, cut
 
 OLD_S = 3.0  # a view older than this is drawn dim
 NOTES = 4  # at most so many lines of notes, and as many of problems
 MOVES = 8  # rows of the table of moves, with its head, if the lines need the remaining room
 
 
-def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[Text]:
+def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLine]:
     """Draw gateways, lines, moves and "notes" of `fleet`, which is as `fleet watch --json` prints it."""
     width, height = size
     is_old = fleet["age_s"] is None or fleet["age_s"] > OLD_S
     top = [_title(fleet, head, width), _warning(fleet, width)]
-    foot = [Text(_cut(note, width)) for note in (*_notes(fleet, width), "Ctrl-C ends it")]
+    foot = [TextLine(_cut(note, width)) for note in (*_notes(fleet, width), "Ctrl-C ends it")]
     room = max(0, height - len(top) - len(foot))
     body = [_row(text, width, is_old) for text in _body(fleet, width, room)[:room]]
-    return [*top, *body, *[Text()] * (room - len(body)), *foot][:height]
+    return [*top, *body, *[TextLine()] * (room - len(body)), *foot][:height]
 
 
 def _body(fleet: FleetState, width: int, room: int) -> list[str]:
@@ -90,26 +88,26 @@ def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list
     return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 
-def _title(fleet: FleetState, head: str, width: int) -> Text:
+def _title(fleet: FleetState, head: str, width: int) -> TextLine:
     clock = time.strftime("%H:%M:%S UTC ", time.gmtime(fleet["at_ms"] / 1000))
     text = f" {head}"[: max(0, width - len(clock))]
-    return Text((text.ljust(width - len(clock)) + clock)[:width], style="reverse")
+    return TextLine((text.ljust(width - len(clock)) + clock)[:width], style="reverse")
 
 
-def _warning(fleet: FleetState, width: int) -> Text:
+def _warning(fleet: FleetState, width: int) -> TextLine:
     if not fleet["trouble"]:
-        return Text()
+        return TextLine()
     age = "not read yet" if fleet["age_s"] is None else f"this is {fleet['age_s']:.0f} s old"
-    return Text(_cut(f"{age}: {fleet['trouble']}", width), style="bold red")
+    return TextLine(_cut(f"{age}: {fleet['trouble']}", width), style="bold red")
 
 
-def _row(text: str, width: int, is_old: bool) -> Text:
+def _row(text: str, width: int, is_old: bool) -> TextLine:
     style: Any = "dim" if is_old else ""
     if "no answer" in text or "  none" in text:
         style = "bold red"
     elif text.startswith(("GATEWAY ", "LINE ", "last moves")):
         style = "bold underline"
-    return Text(_cut(text, width), style=style)
+    return TextLine(_cut(text, width), style=style)
 
 
 def _cut(text: str, width: int) -> str:

@@ -13,8 +13,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
-from multidrop.cli.support.files import require_extra
+from multidrop.cli.fleet.screen import picture
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.screen import Screen
 from multidrop.cli.support.signals import on_end_signals
 from multidrop.supervisor import supervisor
 
@@ -39,10 +40,8 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
     from multidrop.fleet.servers.setup import open_all
     from multidrop.supervisor import end_tasks
 
-    if not is_json:
-        require_extra("rich", "monitor", "fleet watch")
-        if not sys.stdout.isatty():
-            raise ValueError("`multidrop fleet watch` needs a terminal; with --json it works without one")
+    if not is_json and not sys.stdout.isatty():
+        raise ValueError("`multidrop fleet watch` needs a terminal; with --json it works without one")
     await open_all(paths)
     path = next(one for one in paths if one.is_open)
     view = FleetView(path)
@@ -80,29 +79,6 @@ def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
 
 @contextmanager
 def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield a function that draws a fleet on the whole terminal.
-
-    On a terminal without cursor control each picture is printed below the previous one.
-    """
-    from rich.console import Console
-    from rich.control import Control
-
-    from multidrop.cli.fleet.screen import picture
-    from multidrop.cli.support.screen_text import joined
-
-    console = Console()
-
-    def drawn(fleet: dict[str, Any]) -> Any:
-        lines = picture(fleet, (console.width, console.height), head)
-        return joined(lines, console.encoding)
-
-    if console.is_dumb_terminal:
-        yield lambda fleet: console.print(drawn(fleet))
-        return
-    with console.screen(hide_cursor=True) as screen:
-
-        def draw(fleet: dict[str, Any]) -> None:
-            console.control(Control.home())  # otherwise rich draws below the last picture
-            screen.update(drawn(fleet))
-
-        yield draw
+    """Yield a function that draws a fleet on the whole terminal."""
+    with Screen() as screen:
+        yield lambda fleet: screen.draw(picture(fleet, screen.size, head))

@@ -24,7 +24,7 @@ def aligned(rows: Iterable[Row], alignment: str, between: str = "  ") -> list[st
     """Return one line per row with aligned columns; `alignment` has < or > for each column."""
     rows = list(rows)
     widths = [max(map(columns_of, column), default=0) for column in zip(*rows, strict=True)]
-    return [between.join(map(_padded, row, alignment, widths)).rstrip() for row in rows]
+    return [between.join(map(padded, row, alignment, widths)).rstrip() for row in rows]
 
 
 def columns_of(text: str) -> int:
@@ -32,7 +32,8 @@ def columns_of(text: str) -> int:
     return sum((not combining(mark)) + (east_asian_width(mark) in "WF") for mark in text)
 
 
-def _padded(text: str, side: str, width: int) -> str:
+def padded(text: str, side: str, width: int) -> str:
+    """Pad a text to a width in columns; `side` is < for text on the left, > on the right."""
     blank = " " * (width - columns_of(text))
     return text + blank if side == "<" else blank + text
 
@@ -63,7 +64,7 @@ def shortened(name: str) -> str:
 
 def cut_to(text: str, columns: int) -> str:
     """Cut a text to a width in columns; a ~ marks the cut."""
-    return text if columns_of(text) <= columns else f"{_first(text, columns - 1)}~"
+    return text if columns_of(text) <= columns else f"{_first(text, columns - 1)}~"[: max(0, columns)]
 
 
 def _first(text: str, columns: int) -> str:

@@ -1,0 +1,100 @@
+"""Full-screen pictures on a terminal: styled lines of text, drawn over each other."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from types import TracebackType
+from typing import NamedTuple, Self, TextIO
+
+from multidrop.cli.support.values import columns_of, cut_to, padded
+from multidrop.printable import printable
+
+COLOURS = {"red": "31", "yellow": "33", "white": "37", "on-red": "41"}
+ATTRIBUTES = {"bold": "1", "dim": "2", "underline": "4", "reverse": "7"}
+_OPEN, _CLOSE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # alternate screen, cursor hidden
+_HOME = "\x1b[H"
+
+
+class TextLine(NamedTuple):
+    """One line of a picture."""
+
+    plain: str = ""
+    style: str = ""  # names of COLOURS and ATTRIBUTES, separated by spaces
+
+
+def cut(text: str, width: int) -> str:
+    """Cut a text to a width in columns, without control characters; a ~ marks the cut."""
+    return cut_to(printable(text), width)
+
+
+def filled(text: str, width: int) -> str:
+    """Cut a text to a width in columns, or pad it with spaces."""
+    return padded(cut(text, width), "<", width)
+
+
+class Screen:
+    """A terminal that shows one picture at a time. In a `with` block its former content is kept.
+
+    A terminal without cursor control scrolls: each picture is printed below the previous one.
+    """
+
+    def __init__(self, terminal: TextIO | None = None) -> None:
+        self._terminal = terminal or sys.stdout
+        self._encoding = self._terminal.encoding or "ascii"
+        self.has_blocks = "utf" in self._encoding.lower()
+        self.scrolls = os.environ.get("TERM", "").lower() in ("dumb", "unknown")
+        self._codes = ATTRIBUTES | ({} if os.environ.get("NO_COLOR") else COLOURS)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and lines of a picture. If it scrolls, the last line of the terminal stays empty."""
+        width, height = shutil.get_terminal_size()
+        return width, height - self.scrolls
+
+    def __enter__(self) -> Self:
+        self._write("" if self.scrolls else _OPEN)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._write("" if self.scrolls else _CLOSE)
+
+    def draw(self, lines: Sequence[TextLine]) -> None:
+        """Show the lines, of which each fits the width."""
+        if self.scrolls:
+            self._write("".join(f"{self.encodable(line.plain)}\n" for line in lines))
+        else:
+            width, _ = self.size
+            self._write(_HOME + "\r\n".join(self._drawn(line, width) for line in lines))
+
+    def _drawn(self, line: TextLine, width: int) -> str:
+        text = self.encodable(line.plain)
+        codes = ";".join(self._codes[name] for name in line.style.split() if name in self._codes)
+        blank = " " * (width - columns_of(text))
+        return f"\x1b[{codes}m{text}\x1b[m{blank}" if codes else text + blank
+
+    def encodable(self, text: str) -> str:
+        """Return the text with a ? for each column of a character that the terminal's encoding lacks.
+
+        An escape instead would be longer, and would move every column behind it.
+        """
+        try:
+            text.encode(self._encoding)
+        except UnicodeEncodeError:
+            return "".join(self._mark(mark) for mark in text)
+        return text
+
+    def _mark(self, mark: str) -> str:
+        try:
+            mark.encode(self._encoding)
+        except UnicodeEncodeError:
+            return "?" * columns_of(mark)
+        return mark
+
+    def _write(self, text: str) -> None:
+        self._terminal.write(text)
+        self._terminal.flush()
