@@ -1,6 +1,6 @@
 """Simulated lines with all families and faults, in a separate process.
 
-The demo's eight variants have values that encode drive and register (EncodedDrive), so each value proves
+Drives of eight variants have values that encode drive and register (EncodedDrive), so each value proves
 its origin. A ninth drive on each line has a motor, because starts cause noise.
 """
 
@@ -18,12 +18,22 @@ from multiprocessing.sharedctypes import SynchronizedArray
 from pathlib import Path
 from threading import Thread
 
-from multidrop.cli.support.demo_plant import DRIVES, OPTIONS
 from multidrop.families import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.sim import EncodedDrive, Faults, FaultyWire, Simulator, Wire, proof, serve, simulated
 
+VARIANTS = (  # name, model, framing
+    ("erman", "erman-er-g-220", "rtu"),
+    ("che", "invt-che", "rtu"),
+    ("ibd", "innovert-ibd", "rtu"),
+    ("ibd-ascii", "innovert-ibd", "ascii"),
+    ("delixi", "delixi-modbus", "rtu"),
+    ("delixi-ascii", "delixi-modbus", "ascii"),
+    ("delixi-native", "delixi-native", "delixi"),
+    ("yd1000", "yd1000", "rtu"),
+)
+OPTIONS = {"maximum_frequency": 50}
 MOTOR = "fan"
 EVERY = 2.0  # s, period of each drive's first register; the others have no rate
 PATIENCE = 30.0  # s, until the simulator has started
@@ -39,7 +49,7 @@ def write_plant(directory: Path, lines: int) -> Path:
         tcp = number == lines > 1
         port = "socket://127.0.0.1:0" if tcp else directory / f"line-{number}"
         tables.append(f'[[line]]\nname = "line-{number}"\nport = "{port}"\n')
-        for address, (name, model, framing) in enumerate([*DRIVES, (MOTOR, "yd1000", "rtu")], 1):
+        for address, (name, model, framing) in enumerate([*VARIANTS, (MOTOR, "yd1000", "rtu")], 1):
             family = MODELS[model]
             options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
             first, *others = (reading.name for reading in family.readings())

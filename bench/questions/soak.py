@@ -1,4 +1,4 @@
-"""The demo's plant on hostile lines, polled and recorded for hours: its cost, and its errors.
+"""A plant of every family on hostile lines, polled and recorded for hours: its cost, and its errors.
 
 Exits with 1 in these cases:
 
@@ -242,7 +242,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="the last period's recording")
     arguments = parser.parse_args()
     tables.heading(
-        f"The demo's plant and one motor on each of {arguments.lines} hostile lines, polled and recorded; "
+        f"Every family and one motor on each of {arguments.lines} hostile lines, polled and recorded; "
         f"faults of {arguments.faults.name}."
     )
     with TemporaryDirectory(prefix="multidrop-soak-") as name:

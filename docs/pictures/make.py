@@ -2,7 +2,7 @@
 
 The timing diagrams are drawn from the tables in `diagrams.py`. The demo's screen and the plot come from the
 programs themselves, on a simulated line. They take a minute and differ each time. Needs
-`pip install '.[plot,monitor]'`.
+`pip install '.[plot]'`.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ import struct
 import subprocess
 import sys
 import termios
-from io import StringIO
+from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from diagrams import DIAGRAMS, draw
 
 HERE = Path(__file__).parent
-WIDTH, HEIGHT = 104, 16  # characters
+WIDTH, HEIGHT = 110, 24  # characters
+SHOWN_S = 20  # of the demo, whose last full screen is the picture
 COMMAND = [str(Path(sys.executable).with_name("multidrop"))]
 
 PLANT = """
@@ -59,7 +61,7 @@ def _drawn(directory: str) -> str:
     if pid == 0:
         os.environ.update(TERM="xterm-256color", COLORTERM="truecolor", COLUMNS=str(WIDTH), LINES=str(HEIGHT))
         os.chdir(directory)
-        os.execv(COMMAND[0], [*COMMAND, "demo", "--seconds", "20"])
+        os.execv(COMMAND[0], [*COMMAND, "demo", "--seconds", str(SHOWN_S)])
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", HEIGHT, WIDTH, 0, 0))
     drawn = b""
     try:
@@ -78,15 +80,52 @@ def _last_screen(drawn: str) -> str:
     return re.sub(r"\x1b\[\?\d+[hl]", "", last).replace("\r", "")
 
 
-def _svg(screen: str) -> str:
-    from rich.console import Console
-    from rich.text import Text
+CHARACTER, LINE, MARGIN, BAR = 8.4, 18, 12, 34  # px; BAR is the window's title
+DARK, LIGHT = "#1d2126", "#d5dae0"  # background, text
+COLOURS = {"31": "#ff7b72", "33": "#e3b341", "37": "#ffffff"}
+FONT = "ui-monospace,'DejaVu Sans Mono',Menlo,Consolas,monospace"
 
-    console = Console(record=True, width=WIDTH, file=StringIO(), color_system="truecolor")
-    for line in screen.split("\n"):
-        console.print(Text.from_ansi(line), no_wrap=True, overflow="crop")
-    picture = console.export_svg(title="multidrop demo", unique_id="demo")
-    return re.sub(r"\s*@font-face \{.*?\}\n", "\n", picture, flags=re.DOTALL)  # do not load fonts
+
+def _svg(screen: str) -> str:
+    """Return a picture of a terminal whose lines have the escape sequences of `cli/support/screen.py`."""
+    width, height = WIDTH * CHARACTER + 2 * MARGIN, HEIGHT * LINE + BAR + MARGIN
+    parts = [
+        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width:.0f} {height}' "
+        f'font-family="{FONT}" font-size="14">',
+        f"<rect width='{width:.0f}' height='{height}' rx='8' fill='{DARK}'/>",
+        *(
+            f"<circle cx='{20 + 18 * at}' cy='18' r='5.5' fill='{colour}'/>"
+            for at, colour in enumerate(("#ff5f57", "#febc2e", "#28c840"))
+        ),
+        f"<text x='{width / 2:.0f}' y='23' fill='{LIGHT}' text-anchor='middle'>multidrop demo</text>",
+    ]
+    for number, line in enumerate(screen.split("\n")):
+        parts += _runs(line, BAR + number * LINE)
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def _runs(line: str, top: int) -> Iterator[str]:
+    """Yield a line's runs of one style as rectangles and texts."""
+    column, codes = 0, {""}
+    for piece in re.split(r"(\x1b\[[\d;]*m)", line):
+        if piece.startswith("\x1b"):
+            codes = set(piece[2:-1].split(";"))
+            continue
+        x, size = MARGIN + column * CHARACTER, len(piece) * CHARACTER
+        column += len(piece)
+        ink = next((COLOURS[code] for code in sorted(codes) if code in COLOURS), LIGHT)
+        paper = "#a4262c" if "41" in codes else ""
+        if "7" in codes:
+            ink, paper = DARK, ink
+        if paper:
+            yield f"<rect x='{x:.1f}' y='{top}' width='{size:.1f}' height='{LINE}' fill='{paper}'/>"
+        if piece.strip():
+            style = " font-weight='bold'" * ("1" in codes) + " text-decoration='underline'" * ("4" in codes)
+            style += " opacity='0.6'" * ("2" in codes)
+            yield (
+                f"<text x='{x:.1f}' y='{top + 13}' fill='{ink}' textLength='{size:.1f}' "
+                f"lengthAdjust='spacingAndGlyphs' xml:space='preserve'{style}>{escape(piece)}</text>"
+            )
 
 
 def plot(out: Path) -> None:

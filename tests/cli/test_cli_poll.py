@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -10,24 +11,26 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from batches import METADATA, counting
 from commands import TOY_IS_RUN, Run, multidrop, plant_file, running
 from examples import usually
 from kills import BoundProcess
-from lines import Faulty, line, polled, until
+from lines import until
 from recordings import recorded
 from terminals import on_terminal
 from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
-from multidrop.cli.support.demo_plant import DRIVES, start_motors
+from multidrop.cli.support.demo_plant import DRIVES, Operator
 from multidrop.core import Status
 from multidrop.errors import NoReply
+from multidrop.families import MODELS, InvtCHE
 from multidrop.recording import open_recording, open_writer
-from multidrop.sim import Simulator, simulated
+from multidrop.sim import Simulator, Wire, simulated
 
 SIMULATING = """
 import sys, time
@@ -323,35 +326,46 @@ def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:
 def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     """It takes the place of an earlier demo's recording, and is captured."""
     out, capture = tmp_path / "demo.arrows", tmp_path / "demo.pcapng"
-    with open_writer(out, {"drives": dict.fromkeys(name for name, *_ in DRIVES)}):
+    with open_writer(out, {"drives": dict.fromkeys(DRIVES)}):
         pass
-    done = multidrop("demo", "--seconds", 2, "--out", out, "--capture", capture, "--json")
+    done = multidrop("demo", "--seconds", 4, "--out", out, "--capture", capture, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     summary = json.loads(done.stdout)
     drives = open_recording(out).metadata["drives"]
-    assert {(drive["model"], drive["framing"]) for drive in drives.values()} == {
-        ("erman-er-g-220", "rtu"),
-        ("invt-che", "rtu"),
-        ("innovert-ibd", "rtu"),
-        ("innovert-ibd", "ascii"),
-        ("delixi-modbus", "rtu"),
-        ("delixi-modbus", "ascii"),
-        ("delixi-native", "delixi"),
-        ("yd1000", "rtu"),
+    assert {(model, framing) for model in MODELS for framing in framings_of(model)} <= {
+        (drive["model"], drive["framing"]) for drive in drives.values()
     }
+    assert all(
+        register["step"] is not None or register["values"] is not None
+        for drive in drives.values()
+        for register in drive["registers"].values()
+    )
     rows = recorded(out)
     assert {row.drive for row in rows if row.value is not None} == set(drives)
-    assert summary["misses"] == sum(row.value is None for row in rows)  # none, unless the machine is busy
+    assert summary["misses"] == sum(row.value is None for row in rows)
+    assert any(row.value for row in rows if row.register == "output_frequency")  # a motor runs
     with Capture(capture) as found:
         assert sum(map(len, Decoding(found))) > 0
 
 
+def framings_of(model: str) -> list[str]:
+    return [str(framing) for framing in MODELS[model].framings]
+
+
 @pytest.mark.slow
-def test_a_demo_goes_on_without_a_motor_that_does_not_answer(tmp_path: Path) -> None:
-    """A machine may have much else to do."""
-    toy = Toy(1)
-    with Simulator([Faulty([simulated(toy)], lambda reply: b"", unpaced=True)]) as simulator:
-        start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())), tmp_path / "wear.sqlite")
+def test_the_operator_of_a_demo_never_undoes_a_stop() -> None:
+    """It skips a silent drive, and restarts a motor that has tripped."""
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
+    sims[0].deaf_until = math.inf
+    stopped, tripped = sims[1].motor, sims[2].motor
+    with Simulator([Wire(sims, unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+        drives = [bus.attach(sim.drive) for sim in sims]
+        with Operator([bus]):
+            until(lambda: stopped.energised and tripped.energised)
+            drives[1].stop()
+            tripped.trip(1)
+            until(lambda: tripped.energised)
+            assert not stopped.energised
 
 
 def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:
@@ -384,11 +398,13 @@ def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
 def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
-        terminal.wait_for("starting the motors of 8 simulated drives ...")
-        terminal.wait_for(">erman")
-        terminal.wait_for("utilisation")
+        terminal.wait_for(">pump-1")
+        terminal.wait_for_match(r"belts +7 ")
+        terminal.wait_for("multidrop demo --web")
+        terminal.wait_for(f"report {out}")
+        terminal.wait_for("scan /dev/ttyUSB0")
         assert terminal.process.wait(timeout=60) == 0
-    assert "delixi-native" in {row.drive for row in recorded(out)}
+    assert "belt-3" in {row.drive for row in recorded(out)}
 
 
 @pytest.mark.long

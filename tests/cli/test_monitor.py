@@ -109,8 +109,9 @@ def watched(tmp_path: Path) -> LivePlant:
         *(row("drive-3", register, None, "no reply") for register in CHE),
     ]
     live.add(from_rows(rows))
-    live.tick(100.0, told(10, 1000, 0.9))
-    live.tick(101.0, told(11, 1050, 0.9))
+    for second in (0, 1):
+        live.tick(100.0 + second, told(10 + second, 1000 + 50 * second, 0.9))
+        live.remember()
     return live
 
 
@@ -123,7 +124,7 @@ def texts(lines: list[Any]) -> list[str]:
 
 def test_states_come_from_polled_registers(watched: LivePlant) -> None:
     assert [(drive.state, drive.fault, drive.why_silent) for drive in watched.drives] == [
-        ("forward", "", ""),
+        ("running", "", ""),
         ("fault", "oc1_overcurrent_accelerating", ""),
         ("silent", "", "no reply"),
     ]
@@ -176,11 +177,18 @@ def test_history_has_a_gap_for_a_miss(watched: LivePlant) -> None:
     assert sparkline([1, 2], 0) == ""
 
 
+def test_a_long_history_is_drawn_as_means_that_do_not_move() -> None:
+    assert sparkline([0, 7, 0, 7, 7, 7, None, None, 0, 0], 5) == "▅▅█ ▁"
+    steps = [0.0] * 60 + [7.0] * 60 + [0.0] * 120
+    pictures = [sparkline(steps[at : at + 120], 30, points=120 + at) for at in range(100)]
+    assert {picture.strip("▁") for picture in pictures[:60]} == {"█" * 15}
+
+
 def test_history_is_one_register_s(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
-    for second, values in enumerate([{"status": 3.0}, {"output_frequency": 50.0}]):
-        live.add(from_rows([row("drive-1", name, value) for name, value in values.items()]))
-        live.tick(100.0 + second, told(10, 1000, 0.9, 1))
+    for name, value in (("status", 3.0), ("output_frequency", 50.0)):
+        live.add(from_rows([row("drive-1", name, value)]))
+        live.remember()
     assert list(live.drives[0].history) == [None, 50.0]
 
 
@@ -192,9 +200,9 @@ def test_the_overview_says_it_in_words(watched: LivePlant) -> None:
     assert lines[0].startswith(" multidrop monitor  hall.toml")
     assert lines[0].endswith("09:30:00 UTC ")
     assert lines[1].startswith(" hall-1   90% of the wire used  50.0 exchanges/s  12 missed: bad checksum")
-    assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "12", "██"]
+    assert lines[3].split() == [">drive-1", "running", "42.50", "Hz", "2.5", "A", "0.5", "s", "12", "██"]
     assert lines[4].startswith("!drive-2 ?fault")
-    assert lines[4].split()[2:5] == ["?0.00", "Hz", "?oc1_overcu~"]
+    assert lines[4].split()[2:5] == ["?0.00", "Hz", "?oc1_overc~"]
     assert lines[-2] == " ? old value"
     assert lines[5].split()[:5] == ["drive-3", "silent", "no", "reply", "never"]
     assert lines[-1].startswith(" up/down choose")
@@ -208,7 +216,7 @@ def test_one_old_value_among_new_ones_is_marked(watched: LivePlant) -> None:
     at = Position()
     shown = [texts(overview(watched, at, (80, 24), NOW + wait, BLOCKS))[3] for wait in (0, SECOND)]
     assert [" 42.50 Hz " in line for line in shown] == [True, False]  # one miss is none yet
-    assert shown[1].split()[1:8] == ["forward", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
+    assert shown[1].split()[1:8] == ["running", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
 
 
 def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> None:
@@ -340,14 +348,14 @@ def test_ages_have_readable_units(watched: LivePlant, seconds: int, age: str) ->
 
 def test_a_wide_overview_has_the_delays(watched: LivePlant) -> None:
     lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
-    assert lines[2].split()[-2:] == ["DELAY", "HISTORY"]
+    assert lines[2].split()[-3:] == ["DELAY", "LAST", "MINUTE"]
     assert " 8.9 ms " in lines[3]
     assert " ms " not in lines[4]
 
 
 def test_the_page_says_how_the_drive_answers(watched: LivePlant) -> None:
     lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
-    assert lines[1] == " forward      12 missed: bad checksum 9, no reply 3"
+    assert lines[1] == " running      12 missed: bad checksum 9, no reply 3"
     assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
     silent = texts(page(watched.drives[2], {}, Position(2, page=True), (100, 40), NOW))
     assert silent[2] == " 0.0 exchanges/s"

@@ -1,21 +1,28 @@
-"""`multidrop demo`: polls and records a simulated line with every family on it."""
+"""`multidrop demo`: polls and records a simulated plant whose motors run."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from multidrop.cli.monitor import is_possible, watch
-from multidrop.cli.poll import add_polling_arguments, conclude, follow
-from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
+from multidrop.cli.poll import add_polling_arguments, conclude, follow, tap_text
+from multidrop.cli.support.demo_plant import DRIVES, Operator, demo_files, simulator
 from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.output import command_line, print_text
+from multidrop.cli.support.values import aligned, counted
 from multidrop.plant.loader import load_plant
+from multidrop.poller import Poller
 from multidrop.recording import open_recording
 
 OUT, SECONDS = "demo.arrows", 10.0
-POLLED = ("output_frequency", "motor_speed", "output_current", "dc_bus_voltage")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,14 +39,55 @@ def run(arguments: argparse.Namespace) -> int:
         return serve_demo(is_shown=not arguments.no_browser)
     _make_room(arguments.out)
     with TemporaryDirectory(prefix="multidrop-") as directory:
-        path = Path(directory) / "demo.toml"
-        path.write_text(plant_file(demo_port(Path(directory)), POLLED), "utf-8")
-        with simulator(path, Path(directory)):
+        path, faults = demo_files(Path(directory))
+        with simulator(path, Path(directory), faults):
             plant = load_plant(path)
-            start_motors(plant.lines[0], Path(directory) / "wear.sqlite")
             if _can_be_watched(arguments):
-                return conclude(plant, watch(plant, out=arguments.out, seconds=arguments.seconds), arguments)
-            return follow(plant, arguments)
+                summary = watch(plant, out=arguments.out, seconds=arguments.seconds, beside=_operator)
+            else:
+                summary = follow(plant, arguments, beside=_operator)
+            if arguments.json:
+                return conclude(plant, summary, arguments)
+            print_text("\n".join(_text(summary, arguments.out)))
+            return 0 if summary["samples"] else 1
+
+
+def _operator(poller: Poller) -> Operator:
+    return Operator(poller.buses.values())
+
+
+def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
+    """Yield one line for each simulated line, the counts, and the next commands."""
+    rows = [("LINE", "DRIVES", "EXCHANGES/S", "WIRE USED", "MISSES")]
+    for name, line in summary["lines"].items():
+        rate = line["exchanges"] / line["seconds"] if line["seconds"] else 0.0
+        misses = sum(line["misses"].values())
+        rows.append(
+            (name, str(len(line["drives"])), f"{rate:.1f}", f"{line['utilisation']:.0%}", str(misses))
+        )
+    yield from aligned(rows, "<>>>>")
+    samples, misses = counted(summary["samples"], "sample"), counted(summary["misses"], "miss", "misses")
+    yield f"{samples} and {misses} in {out}"
+    yield from tap_text(summary)
+    yield ""
+    yield "Next:"
+    typed = sys.argv[0]
+    program = typed if Path(typed).name == "multidrop" and which("multidrop") != typed else "multidrop"
+    yield from aligned(
+        [
+            (f"  {command_line([program, *words])}", what + _needs(extra, library))
+            for words, what, extra, library in (
+                (("demo", "--web"), "this plant on a page", "serve", "starlette"),
+                (("report", str(out)), "this recording as a page", "plot", "matplotlib"),
+                (("scan", "/dev/ttyUSB0"), "your own drives: only reads", "", ""),
+            )
+        ],
+        "<<",
+    )
+
+
+def _needs(extra: str, library: str) -> str:
+    return "" if not library or find_spec(library) else f"; needs pip install '.[{extra}]'"
 
 
 def _check_web(arguments: argparse.Namespace) -> None:
@@ -58,7 +106,7 @@ def _check_web(arguments: argparse.Namespace) -> None:
 def _make_room(out: Path) -> None:
     """Remove an earlier demo's recording. Raises ValueError for any other file."""
     with suppress(ValueError, TypeError, OSError):  # no file, or not a recording
-        if set(open_recording(out).metadata.get("drives", ())) == {name for name, *_ in DRIVES}:
+        if set(open_recording(out).metadata.get("drives", ())) == set(DRIVES):
             out.unlink()
     refuse_overwriting(out)
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from errno import EIO
 from functools import partial
@@ -31,10 +31,18 @@ from multidrop.cli.monitor_screen import (
 from multidrop.cli.support.arguments import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import logging_to, warn
-from multidrop.cli.support.polling import LiveDrive, LivePlant, PollingSession, SideReader, polling_session
+from multidrop.cli.support.polling import (
+    POINT_S,
+    LiveDrive,
+    LivePlant,
+    PollingSession,
+    SideReader,
+    polling_session,
+)
 from multidrop.cli.support.screen import Screen, TextLine
 from multidrop.cli.support.values import counted
 from multidrop.plant.model import Plant
+from multidrop.poller import Poller
 
 DRAW_S = 0.25
 SCROLL_S = 2.0  # between two pictures that scroll
@@ -65,17 +73,24 @@ def is_possible() -> bool:
     return sys.platform != "win32" and sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
+def watch(
+    plant: Plant,
+    *,
+    out: Path | None = None,
+    seconds: float | None = None,
+    beside: Callable[[Poller], AbstractContextManager[object]] = nullcontext,
+) -> dict[str, Any]:
     """Poll the plant and show it until the user quits or `seconds` have passed; return the poller's summary.
 
-    Closing the terminal ends the monitor too. Stops in progress are always finished first.
+    `beside` is in effect while it polls. Closing the terminal ends the monitor too. Stops in progress are
+    always finished first.
     """
     screen = Screen()
     _check_size(screen)
     live = LivePlant(plant, plant.metadata()["planned"])
     with polling_session(plant, out, live.add) as session:
         monitor = Monitor(live, session, screen)
-        with session.poller:
+        with session.poller, beside(session.poller):
             try:
                 monitor.show(seconds)
             finally:
@@ -102,7 +117,7 @@ class Monitor:
 
     def show(self, seconds: float | None) -> None:
         """Draw and obey keys until the user quits, a signal comes, or `seconds` have passed."""
-        begun = next_draw = next_tick = time.monotonic()
+        begun = next_draw = next_tick = next_point = time.monotonic()
         # Warnings on stderr would overwrite the screen.
         every = SCROLL_S if self._screen.scrolls else DRAW_S
         with (
@@ -118,11 +133,15 @@ class Monitor:
                     next_tick += 1.0
                     self._session.hand_out()
                     self._plant.tick(now, self._session.poller.statistics())
+                if now >= next_point:
+                    next_point = max(next_point + POINT_S, now)
+                    self._session.hand_out()
+                    self._plant.remember()
                 if now >= next_draw:
                     next_draw = max(next_draw + every, now)
                     self._session.hand_out()
                     self._screen.draw(self._picture())
-                key = wait_for_key(max(0.0, min(next_draw, next_tick) - time.monotonic()))
+                key = wait_for_key(max(0.0, min(next_draw, next_tick, next_point) - time.monotonic()))
                 if key:
                     self._obey(key)
                     next_draw = 0.0

@@ -6,9 +6,10 @@ Important states are shown in words and marks as well as in colours.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from math import ceil
 
 from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant, SideRead
 from multidrop.cli.support.screen import TextLine, cut, filled
@@ -16,11 +17,12 @@ from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
-WIDE = 100  # has room for more columns
+WIDE, WIDEST = 100, 110  # columns that have room for more
 OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside registers
 NEVER = "never"
 LEAST_VALUE, AROUND = 12, 13  # columns: of a register's value; of its age and the blanks together
 OLD = "?"  # before an old value
+HISTORY = "LAST MINUTE"  # heading
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 STOPS = "s stop   S stop all   q quit"
 ACKNOWLEDGE = (f"a acknowledge FAILURES   {STOPS}",)
@@ -148,7 +150,10 @@ def _ms(seconds: float) -> str:
 
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     """Return column widths by heading; fault and history share the rest of the line."""
-    columns = {"DRIVE": 5, "STATE": 10, "FREQUENCY": 10, "CURRENT": 10, "FAULT": 8, "AGE": 7}
+    state = 12 if width >= WIDE else 10
+    columns = {"DRIVE": 5, "STATE": state, "FREQUENCY": 10, "CURRENT": 10, "FAULT": 8, "AGE": 7}
+    if width >= WIDEST:
+        columns = {"DRIVE": 5, "MODEL": 14} | columns
     longest = max(columns_of(drive.name) for drive in plant.drives)
     most = 11 + max(0, width - WIDE) // 3
     columns["DRIVE"] += max(0, min(longest - 5, most, width - len(columns) - sum(columns.values())))
@@ -157,10 +162,10 @@ def _columns(plant: LivePlant, width: int) -> dict[str, int]:
     if width >= WIDE:
         columns["DELAY"] = 8
     left = max(0, width - 1 - sum(columns.values()) - len(columns))
-    more = min(left // 3, left - len("HISTORY"), 26) if left >= len("HISTORY") else left
+    more = min(left // 3, left - len(HISTORY), 26) if left >= len(HISTORY) else left
     columns["FAULT"] += more
     if left > more:
-        columns["HISTORY"] = left - more
+        columns[HISTORY] = left - more
     return columns
 
 
@@ -184,6 +189,7 @@ def _drive(
 
     cells = {
         "DRIVE": drive.name,
+        "MODEL": drive.polled.drive.model,
         "STATE": marked(drive.state, drive.state_register),
         "FREQUENCY": marked(drive.shown(FREQUENCY), FREQUENCY),
         "CURRENT": marked(drive.shown(CURRENT), CURRENT),
@@ -191,7 +197,7 @@ def _drive(
         "AGE": _age(drive.age(now_ns)),
         "DELAY": f"{_ms(drive.so_far.delays.p50)} ms" if drive.so_far.delays.replies else "",
         "MISSED": str(drive.so_far.misses.total() or ""),
-        "HISTORY": sparkline(list(drive.history), columns.get("HISTORY", 0), blocks),
+        HISTORY: sparkline(drive.history, columns.get(HISTORY, 0), blocks, drive.points),
     }
     style = "red" if drive.fault else "yellow" if drive.why_silent or old else ""
     text = _row(columns, cells, ">" if chosen else "!" if drive.fault else "")
@@ -259,11 +265,25 @@ def _age(seconds: float | None) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
 
 
-def sparkline(values: Sequence[float | None], width: int, blocks: str = BLOCKS) -> str:
-    """Draw the last `width` values, scaled from their smallest to their largest; None is a gap."""
-    values = values[-width:] if width > 0 else []
-    there = [value for value in values if value is not None]
+def sparkline(
+    history: Iterable[float | None], width: int, blocks: str = BLOCKS, points: int | None = None
+) -> str:
+    """Draw a history in at most `width` columns, from its smallest value to its largest; None is a gap.
+
+    If it has more points, a column is their mean. `points` is the number of points so far, including those
+    that the history has dropped: the same points share a column in each picture.
+    """
+    values = list(history)
+    share = max(1, ceil(len(values) / width)) if width > 0 else 0
+    if not share:
+        return ""
+    first = (len(values) if points is None else points) - len(values)
+    columns: dict[int, list[float]] = {}
+    for number, value in enumerate(values, first):
+        columns.setdefault(number // share, []).extend([] if value is None else [value])
+    means = [sum(column) / len(column) if column else None for column in columns.values()][-width:]
+    there = [mean for mean in means if mean is not None]
     low, high = min(there, default=0.0), max(there, default=0.0)
     low = min(low, 0.0)  # otherwise a steady value would look like zero, and noise like a swing
     scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
-    return "".join(" " if value is None else blocks[round((value - low) * scale)] for value in values)
+    return "".join(" " if mean is None else blocks[round((mean - low) * scale)] for mean in means)

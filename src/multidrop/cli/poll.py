@@ -8,8 +8,8 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from math import ceil
 from pathlib import Path
 from typing import Any, TextIO
@@ -77,11 +77,17 @@ def run(arguments: argparse.Namespace) -> int:
     rotation = rotation_of(arguments)
     if arguments.out and not rotation:
         refuse_overwriting(arguments.out)
-    return follow(plant_of(arguments.plant, arguments), arguments, rotation)
+    plant = plant_of(arguments.plant, arguments)
+    return conclude(plant, follow(plant, arguments, rotation), arguments)
 
 
-def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | None = None) -> int:
-    """Poll the plant as the polling arguments say, and print the summary."""
+def follow(
+    plant: Plant,
+    arguments: argparse.Namespace,
+    rotation: Rotation | None = None,
+    beside: Callable[[Poller], AbstractContextManager[object]] = nullcontext,
+) -> dict[str, Any]:
+    """Poll the plant as the polling arguments say, with `beside` in effect; return the summary."""
     if arguments.capture:
         check_capture(arguments.capture)
     if arguments.flight_recorder and arguments.flight_recorder.is_file():
@@ -94,7 +100,7 @@ def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | Non
         ExitStack() as stack,
     ):
         taps = _Taps(session.poller, arguments, stack)
-        with session.poller:
+        with session.poller, beside(session.poller):
             for _ in _ticks(arguments.seconds, session.interruption):
                 session.hand_out()
                 taps.collect()
@@ -102,7 +108,7 @@ def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | Non
                     table.draw_if_due(time.monotonic())
     if table:
         table.draw()
-    return conclude(plant, session.poller.summary() | taps.summary(), arguments)
+    return session.poller.summary() | taps.summary()
 
 
 class _Taps:

@@ -10,25 +10,25 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from multidrop.cli.support.arguments import add_port_option, plant_of
-from multidrop.cli.support.demo_plant import DRIVES, demo_port, plant_file, simulator, start_motors
+from multidrop.cli.support.demo_plant import Operator, demo_files, simulator
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
 from multidrop.cli.support.output import logging_by, print_text, warn
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
 from multidrop.drive.known_state import can_show_fault
 from multidrop.drive.named_verbs import verbs_of
-from multidrop.families import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 
 if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
     from multidrop.gateway.reload import Read
     from multidrop.gateway.settings import ServeSettings
 
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         print_text(f"{plant.path}: no mistake found; {_url(settings, settings.port)}, parts: {parts}")
         return 0
     with _logging(arguments.log, logging.INFO):
-        ready = partial(_tell_ready, settings)
+        ready = partial(_announce, settings)
         return _serve(plant, settings, ready, read)
 
 
@@ -87,14 +87,13 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
     _require_server()
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
-        path = folder / "demo.toml"
-        path.write_text(plant_file(demo_port(folder), _demo_registers()), "utf-8")
-        with simulator(path, folder), _logging(log, logging.WARNING):
+        path, faults = demo_files(folder)
+        with simulator(path, folder, faults), _logging(log, logging.WARNING), ExitStack() as stack:
             plant = load_plant(path)
-            start_motors(plant.lines[0], folder / "wear.sqlite")
 
-            def on_ready(port: int) -> None:
-                url = f"http://localhost:{port}/"
+            def on_ready(gateway: Gateway) -> None:
+                stack.enter_context(Operator([gateway.bus(line.name) for line in plant.lines]))
+                url = f"http://localhost:{gateway.port}/"
                 print_text(f"ready {url}\nCtrl-C ends it", flush=True)
                 if is_shown:
                     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
@@ -120,11 +119,6 @@ def _require_server() -> None:
         require_extra(library, "serve", "serve")
 
 
-def _demo_registers() -> list[str]:
-    models = dict.fromkeys(model for _, model, _ in DRIVES)
-    return list(dict.fromkeys(one.name for model in models for one in MODELS[model].readings()))
-
-
 def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     from multidrop.gateway.historian import HistorySettings
     from multidrop.gateway.http.rights import May, Right
@@ -144,12 +138,12 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     )
 
 
-def _tell_ready(settings: ServeSettings, port: int) -> None:
-    print_text(f"ready {_url(settings, port)}", flush=True)
+def _announce(settings: ServeSettings, gateway: Gateway) -> None:
+    print_text(f"ready {_url(settings, gateway.port)}", flush=True)
 
 
 def _serve(
-    plant: Plant, settings: ServeSettings, on_ready: Callable[[int], None], read: Read | None = None
+    plant: Plant, settings: ServeSettings, on_ready: Callable[[Gateway], None], read: Read | None = None
 ) -> int:
     from dataclasses import replace
 
@@ -174,7 +168,7 @@ def _serve(
         on_end_signals(end)
         if read:
             on_reload_signal(gateway.reload.begin, end)
-        await gateway.run(lambda: on_ready(gateway.port))
+        await gateway.run(lambda: on_ready(gateway))
 
     run_loop(live())
     return 0

@@ -1,80 +1,166 @@
-"""A simulated plant for demos: a line with every family on it, and its motors running."""
+"""The plant of the demos: three simulated lines, and an operator who runs their motors."""
 
 from __future__ import annotations
 
 import os
+import random
 import signal
 import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from multidrop.bus import Bus
 from multidrop.cli import main
-from multidrop.cli.support.output import print_text
-from multidrop.cli.support.values import counted
-from multidrop.errors import BadReply, Expired, NoReply, NotVerified, Unconfirmed
-from multidrop.families import MODELS
-from multidrop.plant.model import PlantLine
+from multidrop.drive.family import Drive
+from multidrop.drive.state import Condition
+from multidrop.errors import BusError
+from multidrop.families.registry import find_model
 
-DRIVES = (  # name, model, framing
-    ("erman", "erman-er-g-220", "rtu"),
-    ("che", "invt-che", "rtu"),
-    ("ibd", "innovert-ibd", "rtu"),
-    ("ibd-ascii", "innovert-ibd", "ascii"),
-    ("delixi", "delixi-modbus", "rtu"),
-    ("delixi-ascii", "delixi-modbus", "ascii"),
-    ("delixi-native", "delixi-native", "delixi"),
-    ("yd1000", "yd1000", "rtu"),
-)
-OPTIONS = {"maximum_frequency": 50}
+LINES = {  # drives by line: name, model, framing
+    "pumps": (
+        ("pump-1", "erman-er-g-220", "rtu"),
+        ("pump-2", "erman-er-g-220", "rtu"),
+        ("pump-3", "invt-che", "rtu"),
+        ("pump-4", "danfoss-fc51", "rtu"),
+        ("mixer-1", "yd1000", "rtu"),
+    ),
+    "fans": (
+        ("fan-1", "invt-che", "rtu"),
+        ("fan-2", "innovert-ibd", "rtu"),
+        ("fan-3", "innovert-ibd", "ascii"),
+        ("fan-4", "delta-vfd-el", "rtu"),
+        ("mixer-2", "yd1000", "rtu"),
+    ),
+    "belts": (
+        ("belt-1", "delixi-modbus", "rtu"),
+        ("belt-2", "delixi-modbus", "ascii"),
+        ("belt-3", "delixi-native", "delixi"),
+        ("belt-4", "abb-acs355", "rtu"),
+        ("belt-5", "invt-che", "rtu"),
+        ("belt-6", "delta-ms300", "rtu"),
+        ("belt-7", "optidrive-e3", "rtu"),
+    ),
+}
+DRIVES = [name for drives in LINES.values() for name, *_ in drives]
+POLLED = ("status", "output_frequency", "output_current", "fault", "last_fault")  # if their scale is known
+EVERY = "400 ms"
+MAXIMUM_HZ = 50
+TROUBLE = {  # faults of single drives
+    "fan-1": 'trip = "30 s"\nfirst = "4 s"',
+    "belt-5": 'trip = "50 s"',
+    "belt-6": 'silence = "40 s"\nsilent_for = "3 s"\nfirst = "2 s"',
+    "pump-2": 'silence = "70 s"',
+    "fan-3": "loss = 0.02",
+}
+DRIFT = 0.25  # of every load
+STEP_S = 0.5  # between two looks of the operator at a drive of each line
+CALM = 3  # of so many looks at a running motor, one changes its setpoint
 
 
-def demo_port(folder: Path) -> str:
-    """Return the simulated line's port: a link to a pseudo-terminal, or TCP if the system has none."""
+def demo_files(folder: Path) -> tuple[Path, Path]:
+    """Write the plant file and the faults' file into a folder; return their paths."""
+    plant, faults = folder / "demo.toml", folder / "faults.toml"
+    plant.write_text("\n".join(_plant_tables(folder)), "utf-8")
+    tables = (f"[drive.{name}]\ndrift = {DRIFT}\n{TROUBLE.get(name, '')}\n" for name in DRIVES)
+    faults.write_text("\n".join(tables), "utf-8")
+    return plant, faults
+
+
+def _plant_tables(folder: Path) -> Iterator[str]:
+    for line, drives in LINES.items():
+        yield f'[[line]]\nname = "{line}"\nport = "{_port(folder / line)}"\n'
+        for address, (name, model, framing) in enumerate(drives, 1):
+            family = find_model(model)
+            given = {"maximum_frequency": MAXIMUM_HZ, "confirmed": 1}
+            options = "".join(f"{key} = {value}\n" for key, value in given.items() if key in family.options)
+            yield (
+                f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
+                f"address = {address}\nbaudrate = {min(38400, max(family.baudrates))}\n{options}"
+                f'every = "{EVERY}"\npoll = {_polled(family)}\n'
+            )
+
+
+def _polled(family: type[Drive]) -> list[str]:
+    """Return the registers whose values have a name or a unit, so that a column can show them."""
+    found = [family.registers[name] for name in POLLED if name in family.registers]
+    return [one.name for one in found if one.step is not None or one.values is not None]
+
+
+def _port(link: Path) -> str:
+    """Return a simulated line's port: a link to a pseudo-terminal, or TCP if the system has none."""
     if hasattr(os, "openpty"):
-        return str(folder / "mixed")
+        return str(link)
     with socket.create_server(("127.0.0.1", 0)) as free:
         return f"socket://127.0.0.1:{free.getsockname()[1]}"
 
 
-def plant_file(port: str, registers: Sequence[str]) -> str:
-    """Return the text of a plant file that polls these registers of each drive that has them."""
-    tables = [f'[[line]]\nname = "mixed"\nport = "{port}"\n']
-    for address, (name, model, framing) in enumerate(DRIVES, 1):
-        family = MODELS[model]
-        options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
-        polled = [register for register in registers if register in family.registers]
-        tables.append(
-            f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
-            f"address = {address}\n{options}poll = {polled}\n"
-        )
-    return "\n".join(tables)
+class Operator:
+    """Runs motors during a `with` block: starts them, changes setpoints, resets trips.
+
+    A motor that another user has stopped stays stopped.
+    """
+
+    def __init__(self, buses: Iterable[Bus]) -> None:
+        self._is_over = threading.Event()
+        self._threads = [threading.Thread(target=self._work, args=(bus,), daemon=True) for bus in buses]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Send no further command. One in progress ends when the poller closes its port."""
+        self._is_over.set()
+
+    def _work(self, bus: Bus) -> None:
+        drives = list(bus.drives)
+        for drive in drives:
+            self._attempt(_start, drive)
+        for drive in cycle(drives):
+            if self._is_over.wait(STEP_S):
+                return
+            if not drive.stops_called[0]:
+                self._attempt(_look_after, drive)
+
+    def _attempt(self, command: Callable[[Drive], None], drive: Drive) -> None:
+        # A drive may be silent, or tripped, or too slow on a busy machine: it gets its next turn later.
+        if not self._is_over.is_set():
+            with suppress(BusError):
+                command(drive)
 
 
-def start_motors(line: PlantLine, ledger: Path) -> None:
-    """Start the simulated motors at different frequencies; say so on a terminal, because it takes seconds."""
-    if sys.stdout.isatty():
-        print_text(f"starting the motors of {counted(len(line.drives), 'simulated drive')} ...", flush=True)
-    with Bus(line.port, ledger=ledger) as bus:
-        for number, polled in enumerate(line.drives):
-            drive = bus.attach(polled.drive)
-            # On a busy machine a simulated drive may answer too late: its motor stays off.
-            with suppress(BadReply, Expired, NoReply, NotVerified, Unconfirmed):
-                drive.set_frequency(20.0 + 3 * number)
-                drive.start()
+def _start(drive: Any) -> None:
+    drive.set_frequency(random.randrange(20, MAXIMUM_HZ))
+    drive.start()
+
+
+def _look_after(drive: Any) -> None:
+    """Reset a trip, start a motor at rest, or change a setpoint."""
+    condition = drive.state().condition
+    if condition is Condition.FAULT:
+        drive.reset_fault()
+        _start(drive)
+    elif condition is Condition.STOPPED:
+        _start(drive)
+    elif random.randrange(CALM) == 0:
+        drive.set_frequency(random.randrange(20, MAXIMUM_HZ))
 
 
 @contextmanager
-def simulator(plant: Path, ports: Path) -> Iterator[None]:
+def simulator(plant: Path, ports: Path, faults: Path | None = None) -> Iterator[None]:
     """Simulate in a child process, so that simulator and poller do not share an interpreter."""
     words = [sys.executable, "-X", "utf8", "-m", __name__, str(plant)]
     if hasattr(os, "openpty"):
         words += ["--ports", str(ports)]
+    if faults is not None:
+        words += ["--faults", str(faults)]
     pipe = subprocess.PIPE
     # A session of its own (on Windows a group) shields the child from Ctrl-C: it must outlive the polling.
     apart: dict[str, Any] = {"start_new_session": True}

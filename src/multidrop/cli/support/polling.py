@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 from multidrop.cli.support.signals import Interruption, noting_signals
 from multidrop.cli.support.values import value_text
 from multidrop.core import UNASKED, Counters
+from multidrop.drive.known_state import StateReader
+from multidrop.drive.state import Condition, Direction
 from multidrop.errors import BusError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive, current_for
 from multidrop.poller import Poller
@@ -76,7 +78,8 @@ def polling_session(
             hand_out()  # the last rows of the closing poller, also after a failure
 
 
-HISTORY = 240  # points, one a second
+POINT_S = 0.25  # s between two points of a history
+HISTORY = 240  # points: the last minute
 RECENT = 5.0  # s over which rates are measured
 MISSED = 1.0  # s after which a value is old if the register was missed since
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
@@ -98,6 +101,10 @@ class LiveDrive:
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
+    points: int = 0  # ever added to the history
+
+    def __post_init__(self) -> None:
+        self._reader = StateReader(self.polled.drive)
 
     @property
     def name(self) -> str:
@@ -157,12 +164,23 @@ class LiveDrive:
     def state(self) -> str:
         """Return the state as far as the polled registers show it."""
         register = self.state_register
+        if register in (STATE, FREQUENCY) and (known := self._known_state()):
+            return known
         if register == STATE:
             return self.shown(STATE).lower()
         if register != FREQUENCY:
             return "fault" if register else "silent"
         row = self.newest.get(FREQUENCY)
         return "turns" if row and row.value else ""  # 0 Hz may be a stop, or a run at a setpoint of 0
+
+    def _known_state(self) -> str:
+        """Return the state by the family's own rules; "" if they need more than is polled."""
+        values = {name: row.value for name, row in self.newest.items() if name not in self.missed}
+        state = self._reader.state({name: value for name, value in values.items() if value is not None})
+        if state is None or state.condition is Condition.UNKNOWN:
+            return ""
+        is_reverse = state.condition is Condition.RUNNING and state.direction is Direction.REVERSE
+        return "reverse" if is_reverse else state.condition.value
 
     def _is_bare(self, row: Row) -> bool:
         """Return True for flags without a set bit, which name no state."""
@@ -175,6 +193,7 @@ class LiveDrive:
         name = FREQUENCY if FREQUENCY in polled else next(iter(polled), "")
         fresh = name in self.newest and name not in self.missed
         self.history.append(self.newest[name].value if fresh else None)
+        self.points += 1
 
 
 class LivePlant:
@@ -212,6 +231,10 @@ class LivePlant:
         for drive in self.drives:
             drive.so_far = statistics[drive.line.name].drives[drive.name]
             drive.recent = self.recent[drive.line.name].drives[drive.name]
+
+    def remember(self) -> None:
+        """Add a point to each drive's history; call this every POINT_S."""
+        for drive in self.drives:
             drive.remember()
 
 
