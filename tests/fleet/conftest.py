@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from nats_clusters import Cluster
 
 HERE = Path(__file__).parent
-if not os.environ.get("CI") and not all(map(find_spec, ("nats", "nkeys", "pyarrow", "rich", "starlette"))):
+if not os.environ.get("CI") and not all(map(find_spec, ("nats", "nkeys", "pyarrow", "starlette"))):
     collect_ignore_glob = ["*"]  # an extra is not installed; CI must have it
 
 

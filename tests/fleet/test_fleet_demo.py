@@ -15,7 +15,6 @@ import pytest
 from commands import MULTIDROP, Run
 from kills import BoundProcess
 from lines import PATIENCE, until
-from peers import require_module
 from terminals import on_terminal
 
 from multidrop.cli.fleet import demo_processes
