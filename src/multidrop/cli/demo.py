@@ -18,6 +18,7 @@ from multidrop.cli.support.demo_plant import DRIVES, Operator, demo_files, simul
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import command_line, print_text
 from multidrop.cli.support.values import aligned, counted
+from multidrop.extras import install_command
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.recording import open_recording
@@ -87,7 +88,7 @@ def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
 
 
 def _needs(extra: str, library: str) -> str:
-    return "" if not library or find_spec(library) else f"; needs pip install '.[{extra}]'"
+    return "" if not library or find_spec(library) else f"; first: {install_command(extra)}"
 
 
 def _check_web(arguments: argparse.Namespace) -> None:

@@ -191,8 +191,8 @@ def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
 
 # ---- the live table ----
 #
-# The monitor needs rich, takes over the terminal and its keys, and can stop motors. This table needs no
-# library, reads no keys, and stays on the terminal above the summary.
+# The monitor takes over the terminal and its keys, and can stop motors. This table reads no keys, and stays
+# on the terminal above the summary.
 
 
 EVERY = 0.5  # s between two drawings
