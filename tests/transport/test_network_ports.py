@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from lines import PATIENCE, until
 from namespaces import changing_network
 from serial import SerialException, rfc2217
-from servers.network_server import END, manager
+from network_server import END, manager
 from toy import Status, Toy
 
 from multidrop.bus import Bus
