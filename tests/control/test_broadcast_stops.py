@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
-from simulated_bus import SimulatedBus, is_write
+from simulated_bus import SimulatedBus, is_write, one
+from stop_frames import all_stopped
 from toy import Status, Toy
 
 from multidrop.control.audit_log import read_audit
@@ -19,8 +21,18 @@ from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, State
 from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import BusError, CancelledByStop, Expired, PortLost, Unconfirmed, WriteForbidden
-from multidrop.families import MODELS, InvtCHE
+from multidrop.errors import (
+    BusError,
+    CancelledByStop,
+    Expired,
+    LineError,
+    NoReply,
+    PortLost,
+    Unconfirmed,
+    WriteForbidden,
+)
+from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.invt_che import CHEControl
 from multidrop.sim import simulated
 
 BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]
@@ -298,3 +310,126 @@ def test_two_interruptions_say_of_each_drive_that_it_was_broadcast(monkeypatch: 
         line.bus.stop_all()
     told = "the stop was sent 1 to 2 times; the motor is not seen to stand"
     assert {*interruption.value.__notes__} == {f"invt-che@1: {told}", f"invt-che@2: {told}"}
+
+
+# ---- a stop of all drives ----
+
+
+def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
+    line = SimulatedBus(monkeypatch, *sims)
+    first, _ = (line.attach(sim.drive) for sim in sims)
+    for value in set(CHEControl) - {CHEControl.STOP}:
+        with pytest.raises(WriteForbidden, match="no harmless broadcast"):
+            line.bus.broadcast(first.control, value)
+    with pytest.raises(WriteForbidden, match="no harmless broadcast"):
+        line.bus.broadcast(first.setpoint, 50.0)
+    assert line.written == []
+    found = line.bus.broadcast(first.setpoint, 0.0)
+    assert line.written == ["00 06 20 00 00 00 83 DB"]
+    assert {name: each.condition for name, each in found.items() if isinstance(each, State)} == {
+        "invt-che@1": Condition.STOPPED,
+        "invt-che@2": Condition.STOPPED,
+    }
+    line.attach(InnovertIBD(3))
+    with pytest.raises(WriteForbidden, match="differ in family"):
+        line.bus.broadcast(first.control, CHEControl.STOP)
+    assert len(line.written) == 1
+
+
+def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        line.bus.check_identity(line.attach(sim.drive))
+    line.deafens = lambda request: request.address == 2
+    found = line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
+    assert line.written == ["00 06 10 00 00 05 4C D8"]
+    (first, second) = found.values()
+    assert isinstance(first, State)
+    assert first.condition is Condition.STOPPED
+    assert isinstance(second, NoReply)
+    assert second.drive == "invt-che@2"
+
+
+def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100 ms at least, by the serial-driver guide (V1.02, 2.4.1)."""
+    line, _, _ = one(monkeypatch, InvtCHE(1))
+    made: list[Exchange] = []
+
+    def keep(exchange: Exchange, **times: Any) -> Completion:
+        made.append(exchange)
+        return SimulatedBus.carry_out(line, exchange, **times)
+
+    monkeypatch.setattr(line, "carry_out", keep)
+    line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
+    stop, look = made[-2:]
+    assert (stop.request.address, look.request.address) == (0, 1)
+    driver = LineDriver()
+    driver.begin(stop)
+    driver.wait_until_write()
+    over = driver.now + 8 * stop.c.character_ns
+    driver.begin(look)
+    driver.wait_until_write()
+    assert driver.now == over + 100 * MS
+
+
+def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        drive = line.attach(sim.drive)
+        drive.set_frequency(20)
+        drive.start()
+    line.sleep(1)
+    begun = len(line.frames)
+    stopped = line.bus.stop_all()
+    assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
+    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
+    assert all(each.seconds < 11 for each in stopped.values())  # one ramp, not three after another
+    assert all_stopped(line, sims)
+
+
+def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The port fails with it, and comes back."""
+    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        drive = line.attach(sim.drive)
+        drive.set_frequency(20)
+        drive.start()
+
+    def fails(request: Message) -> bytes | None:
+        if request.address == 0:
+            raise LineError("hall", "the port was lost (hung up)")
+        return None
+
+    line.answers = fails
+    stopped = line.bus.stop_all()
+    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
+    assert {frame[:17] for frame in line.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}
+    assert all_stopped(line, sims)
+
+
+def test_stop_all_reports_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    sims: list[Any] = [
+        simulated(InvtCHE(1, maximum_frequency=50)),
+        simulated(ErmanERG220(2)),
+        simulated(InvtCHE(3)),
+    ]
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        line.attach(sim.drive)
+    sims[2]["device"] = 0x010A
+    line.loses = lambda request: request.address == 2
+    stopped = line.bus.stop_all()
+    assert {name: each.seen for name, each in stopped.items()} == {
+        "invt-che@1": Seen.STOPPED,
+        "erman-er-g-220@2": Seen.SENT,
+        "invt-che@3": Seen.FAILED,
+    }
+    assert "010AH" in stopped["invt-che@3"].why
+    assert not any(frame.startswith("03 06") for frame in line.written)
+    assert str(stopped["invt-che@1"]).startswith("invt-che@1: stopped after ")

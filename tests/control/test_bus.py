@@ -22,7 +22,6 @@ from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BadReply,
     BusError,
-    DriveException,
     LineError,
     NoReply,
     NotAttached,
@@ -31,7 +30,6 @@ from multidrop.errors import (
 )
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.innovert_ibd import IBDControl
-from multidrop.families.invt_che import parameter
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import peers
@@ -58,12 +56,6 @@ class Rig(Drive):
     def identify(self) -> Script[None]:
         """Take it for a rig: there is nothing else on these lines."""
         yield from ()
-
-
-class MyCHE(InvtCHE):
-    """A CHE whose owner has looked a parameter up."""
-
-    acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
 
 
 def unpaced(*drives: SimulatedDrive) -> Simulator:
@@ -186,26 +178,6 @@ def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
 
 
 @patient
-def test_a_write_returns_the_value_read_back() -> None:
-    rig = simulated(Rig(1))
-    with unpaced(rig) as sim, Bus(path(sim)) as bus:
-        ours = bus.attach(Rig, 1)
-        assert ours.write(ours.gain, 1.234) == 1.23
-        assert ours.write(ours.target, 1500) == 1500  # cannot be read: what was written
-    assert (rig["gain"], rig["target"]) == (1.23, 1500)
-    assert sent(rig)[0x06] == 2
-
-
-@patient
-def test_a_value_that_the_drive_clamps() -> None:
-    """IBD stores a value above the largest as the largest, and confirms it as it was sent."""
-    ibd = simulated(InnovertIBD(1))
-    with unpaced(ibd) as sim, Bus(path(sim)) as bus:
-        ours = bus.attach(InnovertIBD, 1)
-        assert ours.write(ours.acceleration_time, 4000.0) == 3600.0
-
-
-@patient
 def test_eeprom_is_written_on_change_only() -> None:
     rig = simulated(Rig(1))
     rig["limit"] = 10.0
@@ -216,21 +188,6 @@ def test_eeprom_is_written_on_change_only() -> None:
         assert ours.write(ours.limit, 12.5) == 12.5
         assert ours.write(ours.limit, 12.5) == 12.5
     assert rig.counters.eeprom_writes == {"limit": 1}
-
-
-@patient
-def test_the_ram_alias_is_written_if_there_is_one() -> None:
-    che = simulated(MyCHE(1))
-    with unpaced(che) as sim, Bus(path(sim)) as bus:
-        ours = bus.attach(MyCHE, 1)
-        for seconds in (5.0, 6.0, 7.0):
-            assert ours.write(ours.acceleration_time, seconds) == seconds
-    assert [(write.address, write.raw) for write in che.counters.writes] == [
-        (0x8008, 50),
-        (0x8008, 60),
-        (0x8008, 70),
-    ]
-    assert not che.counters.eeprom_writes
 
 
 MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
@@ -410,11 +367,6 @@ def test_a_mistake_is_raised_before_the_first_frame(mistake: str) -> None:
     assert rig.counters.requests == rig.counters.broadcasts == 0
 
 
-def test_a_verb_of_a_drive_that_is_on_no_bus() -> None:
-    with pytest.raises(NotAttached, match=r"^toy@1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"):
-        Toy(1).start()
-
-
 # ---- failures on the line ----
 
 
@@ -530,36 +482,6 @@ def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
     assert sent(rig)[0x06] == 1
 
 
-REFUSALS = [  # exception codes mean what the family's document says
-    (Rig(1), Rig.speed, "01 83 02", 0x02, "illegal address"),
-    (ErmanERG220(1), ErmanERG220.output_current, "01 84 03", 0x03, "bad addresses on read"),
-    (InvtCHE(1), InvtCHE.output_current, "01 83 12", 0x12, "write not allowed: out of range, "),
-    (
-        InnovertIBD(1),
-        InnovertIBD.output_current,
-        "01 83 02",
-        0x02,
-        "a code that the document does not explain",
-    ),
-]
-
-
-@patient
-@pytest.mark.parametrize(("drive", "register", "reply", "code", "meaning"), REFUSALS)
-def test_a_refusal_has_its_family_s_meaning(
-    drive: Drive, register: Any, reply: str, code: int, meaning: str
-) -> None:
-    there = simulated(drive)
-    with faulty(there, lambda _: checksums.rtu(reply)) as sim, Bus(path(sim)) as bus:
-        bus.attach(drive)
-        with pytest.raises(DriveException) as caught:
-            drive.read(register)
-    assert caught.value.code == code
-    assert caught.value.meaning.startswith(meaning)
-    assert str(caught.value).startswith(f"{drive.name} refuses {register.name}: code {code:02X}H, {meaning}")
-    assert there.counters.requests == 1  # an answer, which asking again would not change
-
-
 @table(
     ("drive", "least_ms", "most_ms"),
     [
@@ -586,26 +508,6 @@ def test_a_stop_to_all_of_one_family() -> None:
             bus.attach(drive.drive)
         bus.broadcast(InnovertIBD.control, IBDControl.STOP)
     assert [drive.counters.broadcasts for drive in drives] == [1, 1]
-
-
-@table(
-    ("drives", "value"),
-    [
-        ([InnovertIBD(1), InnovertIBD(2)], IBDControl.RUN),
-        ([InnovertIBD(1), InvtCHE(2)], IBDControl.STOP),
-        ([InnovertIBD(1), InnovertIBD(2, baudrate=19200)], IBDControl.STOP),
-        ([InnovertIBD(1), InnovertIBD(2, framing=Framing.ASCII)], IBDControl.STOP),
-    ],
-    ids=["a start", "another family", "another baud rate", "another framing"],
-)
-def test_a_broadcast_that_could_do_harm_is_refused(drives: list[Drive], value: IBDControl) -> None:
-    there = [simulated(drive) for drive in drives]
-    with unpaced(*there) as sim, Bus(path(sim)) as bus:
-        for each in there:
-            bus.attach(each.drive)
-        with pytest.raises(WriteForbidden):
-            bus.broadcast(InnovertIBD.control, value)
-    assert [each.counters.broadcasts for each in there] == [0, 0]
 
 
 # ---- one bus for all ----

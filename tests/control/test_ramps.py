@@ -6,20 +6,28 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 from lines import PATIENCE
+from motors import MAKE
 from simulated_bus import SimulatedBus, is_write, one
+from stop_frames import all_stopped, starts
 from toy import Toy
 
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message
-from multidrop.drive import Drive, Script, read
-from multidrop.drive.register import Kept, setting
+from multidrop.drive import Direction, Drive, Script, read
+from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import NoReply, WriteForbidden
-from multidrop.families import YD1000, InnovertIBD, InvtCHE
+from multidrop.errors import (
+    NoReply,
+    Unconfirmed,
+    WriteForbidden,
+)
+from multidrop.families import YD1000, DelixiModbus, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 
 # ---- ramps ----
@@ -275,3 +283,194 @@ def test_an_interruption_of_stops_without_threads_has_each_sent_once_more(
     with pytest.raises(KeyboardInterrupt):
         start_staggered(drives, 1.0)
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (1, 0.0), (2, 0.0)]
+
+
+# ---- setpoints and limits of a ramp ----
+
+
+def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        drive.set_frequency(20)
+    begun = line.seconds
+    start_staggered(drives, 2.0, Direction.FORWARD)
+    assert 4 <= line.seconds - begun < 6
+    assert all(sim.motor.energised for sim in sims)
+    line.bus.stop_all()
+    sims[1].trip(4)
+    line.frames.clear()
+    with pytest.raises(WriteForbidden, match="OC1"):
+        start_staggered(drives, 2.0)
+    assert [each[:17] for each in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
+    assert all_stopped(line, sims)
+
+
+def test_an_invalid_gap_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    line.frames.clear()
+    for gap in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=r"^gap = .* s: it must be 0 or more$"):
+            start_staggered([drive, drive], gap)
+    assert line.frames == []
+
+
+def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    ramp(drive, 20.0)  # 80 Hz in 10 s: 4 Hz in half a second
+    setpoints = [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written]
+    assert setpoints == [14.0, 18.0, 20.0]
+    with pytest.raises(ValueError, match=r"more than the drive's own, 8 Hz/s"):
+        ramp(drive, 0.0, rate=9)
+    with pytest.raises(ValueError, match=r"rate = 0 Hz/s is not above 0"):
+        ramp(drive, 0.0, rate=0)
+    with pytest.raises(ValueError, match=r"every = 0 s is not above 0"):
+        ramp(drive, 0.0, every=0)
+    ramp(drive, 19.0, rate=1.0)
+    assert line.written[-2][:17] == "01 06 10 01 07 9E"
+
+
+def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    with pytest.raises(WriteForbidden, match="give a rate"):
+        ramp(drive, 20.0)
+    ramp(drive, 2.0, rate=2.0)
+    assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
+
+
+@pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])
+def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    for hz in (5000.0, -5.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=r"Hz|finite"):
+            ramp(drive, hz, rate=5.0)
+    assert line.written == []
+    ramp(drive, 11, rate=5.0)
+    assert len(line.written) == 1
+
+
+def test_a_ramp_reads_the_drives_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(10)
+    line.frames.clear()
+    with pytest.raises(WriteForbidden, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
+        ramp(drive, 82.5)
+    assert line.written == []
+
+
+def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot be read: from the one of set_frequency it would be a jump."""
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    drive.write(drive.frequency, 10.0)
+    line.frames.clear()
+    ramp(drive, 14, rate=4.0)
+    assert [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written] == [12.0, 14.0]
+
+
+def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.loses = is_write
+    with pytest.raises(Unconfirmed):
+        drive.write(drive.frequency, 10.0)
+    for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
+        with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
+            act()
+
+
+def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    drive.set_frequency(40)
+    line.bus.broadcast(drive.frequency, 0)
+    with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
+        ramp(drive, 14, rate=4.0)
+
+
+class ShareToy(Toy):
+    """Its setpoint is a share of a frequency that its class does not state."""
+
+    share = setting(0x16, "%", step=0.01, span=(0, 100), kept=Kept.RAM)
+    setpoint_name = "share"
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.share, hz / 80 * 100)
+
+
+def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
+    with pytest.raises(
+        WriteForbidden, match=r"is in %: a ramp needs maximum_frequency, which is not declared"
+    ):
+        ramp(line.attach(ShareToy(1, name="toy")), 20.0, rate=5.0)
+    assert line.written == []
+
+
+class AliasToy(Toy):
+    """Its setpoint is kept in EEPROM, and written to an address that is not."""
+
+    frequency = setting(0x15, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, ram_address=0x115)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.frequency, hz)
+
+
+def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    line = SimulatedBus(monkeypatch, simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
+    toy = line.attach(AliasToy(1))
+    ramp(toy, 10, rate=8.0)
+    assert [frame[:17] for frame in line.written] == [
+        "01 06 01 15 01 90",
+        "01 06 01 15 03 20",
+        "01 06 01 15 03 E8",
+    ]
+    assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
+
+
+def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch)
+    toy = line.attach(Toy(1, name="toy"))
+    with pytest.raises(
+        WriteForbidden, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"
+    ):
+        ramp(toy, 20.0, rate=5.0)
+    assert line.frames == []
+
+
+def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, DelixiModbus(1))
+    with pytest.raises(WriteForbidden, match="EEPROM"):
+        ramp(drive, 20.0)
+    assert line.written == []
+
+
+class KeptToy(Toy):
+    """Its setpoint is declared a command, and yet kept in EEPROM."""
+
+    frequency = command(0x2000, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, moves=False)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        yield from self._hold(self.frequency, hz)
+
+
+def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line = SimulatedBus(monkeypatch, simulated(KeptToy(1)))
+    toy = line.attach(KeptToy(1))
+    toy.set_frequency(5)
+    line.frames.clear()
+    with pytest.raises(WriteForbidden, match="which a ramp would wear out"):
+        ramp(toy, 20.0, rate=5.0)
+    assert line.written == []

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-import json
-import threading
-from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from completions import completed
-from line_driver import MS, LineDriver
-from motors import MAKE, STARTS
+from motors import MAKE
 from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
+from stop_frames import starts
 from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.control import records
-from multidrop.control.audit_log import read_audit
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.outcome import Effect, Seen
-from multidrop.control.ramp import ramp, start_staggered
+from multidrop.control.outcome import Effect
 from multidrop.core import Completion, Exchange, Failure, Framing, Message, build_reply
-from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
-from multidrop.drive.register import COIL, Kept, command, reading, setting
+from multidrop.drive import Condition, Direction, Drive, Script, read, wait, write
+from multidrop.drive.register import COIL, Kept, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     DriveException,
     Expired,
-    LineError,
     NoReply,
     NotMaster,
     NotVerified,
@@ -39,18 +33,9 @@ from multidrop.errors import (
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.invt_che import CHEControl, parameter
 from multidrop.sim import simulated
-from multidrop.transport.aside_log import flush
 from multidrop.transport.exchange import READ_ATTEMPTS
 
 every_family = pytest.mark.parametrize("model", MAKE)
-
-
-def starts(line: SimulatedBus, model: str) -> list[str]:
-    return [
-        frame
-        for request, frame in line.frames
-        if request.function in (2, 5, 6, 15, 16) and STARTS[model](request)
-    ]
 
 
 # ---- rules ----
@@ -179,15 +164,6 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     assert looks == ["look"]
 
 
-def test_a_goodrive_is_not_taken_for_a_che(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    sim["device"] = 0x010A
-    for call in (lambda: drive.set_frequency(20), drive.start, drive.stop, drive.coast):
-        with pytest.raises(WriteForbidden, match="010AH"):
-            call()
-    assert line.written == []
-
-
 def test_an_ambiguous_ibd_needs_its_owners_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     for confirmed in (0, 1):
         line, drive, sim = one(monkeypatch, InnovertIBD(1, confirmed=confirmed))
@@ -274,32 +250,6 @@ def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.Monke
     with pytest.raises(DriveException, match="code 12H, write not allowed: out of range"):
         assert outcome.value
     assert len(line.written) == 1
-
-
-def test_a_refused_raw_request_is_recorded_as_refused(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
-    refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
-    line.answers = lambda request: refusal if request.function == 6 else None
-    with pytest.raises(DriveException, match="code 12H"):
-        drive.send_raw(6, 0x1000, b"\0\5")
-    line.bus.close()
-    assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
-
-
-@pytest.mark.parametrize("is_lost", [False, True])
-def test_the_outcome_of_a_raw_request_is_recorded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_lost: bool
-) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1), audit=tmp_path / "audit")
-    line.loses = lambda request: is_lost
-    with pytest.raises(Unconfirmed) if is_lost else nullcontext():
-        drive.send_raw(6, 0x0000, b"\x00\x01")
-    line.bus.close()
-    (entry,) = read_audit(tmp_path / "audit")
-    assert entry["write"] == "raw request 01 06 00 00 00 01 48 0A"
-    assert entry["outcome"] == ("unconfirmed" if is_lost else "done")
 
 
 def test_a_drive_that_refuses_to_read_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -511,489 +461,7 @@ def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatc
     assert ledger.wear(0) == []
 
 
-def test_a_ledger_that_cannot_be_kept_keeps_the_write_back(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "file").write_text("")
-    line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "file" / "wear")
-    with pytest.raises(OSError, match="file"):
-        drive.set_frequency(10)
-    assert line.written == []
-
-
-# ---- broadcast, stop all ----
-
-
-def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    line = SimulatedBus(monkeypatch, *sims)
-    first, _ = (line.attach(sim.drive) for sim in sims)
-    for value in set(CHEControl) - {CHEControl.STOP}:
-        with pytest.raises(WriteForbidden, match="no harmless broadcast"):
-            line.bus.broadcast(first.control, value)
-    with pytest.raises(WriteForbidden, match="no harmless broadcast"):
-        line.bus.broadcast(first.setpoint, 50.0)
-    assert line.written == []
-    found = line.bus.broadcast(first.setpoint, 0.0)
-    assert line.written == ["00 06 20 00 00 00 83 DB"]
-    assert {name: each.condition for name, each in found.items() if isinstance(each, State)} == {
-        "invt-che@1": Condition.STOPPED,
-        "invt-che@2": Condition.STOPPED,
-    }
-    line.attach(InnovertIBD(3))
-    with pytest.raises(WriteForbidden, match="differ in family"):
-        line.bus.broadcast(first.control, CHEControl.STOP)
-    assert len(line.written) == 1
-
-
-def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        line.bus.check_identity(line.attach(sim.drive))
-    line.deafens = lambda request: request.address == 2
-    found = line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
-    assert line.written == ["00 06 10 00 00 05 4C D8"]
-    (first, second) = found.values()
-    assert isinstance(first, State)
-    assert first.condition is Condition.STOPPED
-    assert isinstance(second, NoReply)
-    assert second.drive == "invt-che@2"
-
-
-def all_stopped(line: SimulatedBus, sims: list[Any]) -> bool:
-    for sim in sims:
-        sim.pass_time(line.seconds)
-    return not any(sim.motor.energised for sim in sims)
-
-
-def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 ms at least, by the serial-driver guide (V1.02, 2.4.1)."""
-    line, _, _ = one(monkeypatch, InvtCHE(1))
-    made: list[Exchange] = []
-
-    def keep(exchange: Exchange, **times: Any) -> Completion:
-        made.append(exchange)
-        return SimulatedBus.carry_out(line, exchange, **times)
-
-    monkeypatch.setattr(line, "carry_out", keep)
-    line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
-    stop, look = made[-2:]
-    assert (stop.request.address, look.request.address) == (0, 1)
-    driver = LineDriver()
-    driver.begin(stop)
-    driver.wait_until_write()
-    over = driver.now + 8 * stop.c.character_ns
-    driver.begin(look)
-    driver.wait_until_write()
-    assert driver.now == over + 100 * MS
-
-
-def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        drive = line.attach(sim.drive)
-        drive.set_frequency(20)
-        drive.start()
-    line.sleep(1)
-    begun = len(line.frames)
-    stopped = line.bus.stop_all()
-    assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
-    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
-    assert all(each.seconds < 11 for each in stopped.values())  # one ramp, not three after another
-    assert all_stopped(line, sims)
-
-
-def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The port fails with it, and comes back."""
-    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        drive = line.attach(sim.drive)
-        drive.set_frequency(20)
-        drive.start()
-
-    def fails(request: Message) -> bytes | None:
-        if request.address == 0:
-            raise LineError("hall", "the port was lost (hung up)")
-        return None
-
-    line.answers = fails
-    stopped = line.bus.stop_all()
-    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
-    assert {frame[:17] for frame in line.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}
-    assert all_stopped(line, sims)
-
-
-def test_stop_all_on_a_line_of_every_family(monkeypatch: pytest.MonkeyPatch) -> None:
-    sims = [simulated(make(address)) for address, make in enumerate(MAKE.values(), 1)]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        drive = line.attach(sim.drive)
-        drive.set_frequency(20)
-        drive.start()
-    begun = line.seconds
-    stopped = line.bus.stop_all()
-    assert [each.seen for each in stopped.values()] == [Seen.STOPPED] * 6
-    assert line.seconds - begun < 10  # the ramps went side by side
-    assert all_stopped(line, sims)
-    assert not any(frame.startswith(("00 ", ":00")) for frame in line.written)
-
-
-def test_stop_all_reports_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    sims: list[Any] = [
-        simulated(InvtCHE(1, maximum_frequency=50)),
-        simulated(ErmanERG220(2)),
-        simulated(InvtCHE(3)),
-    ]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        line.attach(sim.drive)
-    sims[2]["device"] = 0x010A
-    line.loses = lambda request: request.address == 2
-    stopped = line.bus.stop_all()
-    assert {name: each.seen for name, each in stopped.items()} == {
-        "invt-che@1": Seen.STOPPED,
-        "erman-er-g-220@2": Seen.SENT,
-        "invt-che@3": Seen.FAILED,
-    }
-    assert "010AH" in stopped["invt-che@3"].why
-    assert not any(frame.startswith("03 06") for frame in line.written)
-    assert str(stopped["invt-che@1"]).startswith("invt-che@1: stopped after ")
-
-
-# ---- several motors, slowly ----
-
-
-def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    line = SimulatedBus(monkeypatch, *sims)
-    drives = [line.attach(sim.drive) for sim in sims]
-    for drive in drives:
-        drive.set_frequency(20)
-    begun = line.seconds
-    start_staggered(drives, 2.0, Direction.FORWARD)
-    assert 4 <= line.seconds - begun < 6
-    assert all(sim.motor.energised for sim in sims)
-    line.bus.stop_all()
-    sims[1].trip(4)
-    line.frames.clear()
-    with pytest.raises(WriteForbidden, match="OC1"):
-        start_staggered(drives, 2.0)
-    assert [each[:17] for each in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
-    assert all_stopped(line, sims)
-
-
-def test_an_invalid_gap_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    drive.set_frequency(20)
-    line.frames.clear()
-    for gap in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=r"^gap = .* s: it must be 0 or more$"):
-            start_staggered([drive, drive], gap)
-    assert line.frames == []
-
-
-def test_all_that_was_started_is_stopped_though_the_system_gives_no_thread(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """And none waits for another that is silent."""
-
-    class NoThread(threading.Thread):
-        def start(self) -> None:
-            raise RuntimeError("can't start new thread")
-
-    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    line = SimulatedBus(monkeypatch, *sims)
-    drives = [line.attach(sim.drive) for sim in sims]
-    for drive in drives:
-        drive.set_frequency(20)
-    line.loses = lambda request: request.address == 1 and bool(starts(line, "invt-che")[1:])
-    sims[2].trip(4)
-    monkeypatch.setattr(threading, "Thread", NoThread)
-    with pytest.raises(WriteForbidden, match="OC1"):
-        start_staggered(drives, 2.0)
-    sent = [frame[:17] for frame in line.written]
-    assert not any(sim.motor.goal for sim in sims)
-    begun = sent.index("01 06 10 00 00 05")
-    assert sent.index("02 06 10 00 00 05") < begun + 4
-
-
-def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
-    drive.set_frequency(10)
-    line.frames.clear()
-    ramp(drive, 20.0)  # 80 Hz in 10 s: 4 Hz in half a second
-    setpoints = [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written]
-    assert setpoints == [14.0, 18.0, 20.0]
-    with pytest.raises(ValueError, match=r"more than the drive's own, 8 Hz/s"):
-        ramp(drive, 0.0, rate=9)
-    with pytest.raises(ValueError, match=r"rate = 0 Hz/s is not above 0"):
-        ramp(drive, 0.0, rate=0)
-    with pytest.raises(ValueError, match=r"every = 0 s is not above 0"):
-        ramp(drive, 0.0, every=0)
-    ramp(drive, 19.0, rate=1.0)
-    assert line.written[-2][:17] == "01 06 10 01 07 9E"
-
-
-def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    with pytest.raises(WriteForbidden, match="give a rate"):
-        ramp(drive, 20.0)
-    ramp(drive, 2.0, rate=2.0)
-    assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
-
-
-@pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])
-def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
-    drive.set_frequency(10)
-    line.frames.clear()
-    for hz in (5000.0, -5.0, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match=r"Hz|finite"):
-            ramp(drive, hz, rate=5.0)
-    assert line.written == []
-    ramp(drive, 11, rate=5.0)
-    assert len(line.written) == 1
-
-
-def test_a_ramp_reads_the_drives_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
-    drive.set_frequency(10)
-    line.frames.clear()
-    with pytest.raises(WriteForbidden, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
-        ramp(drive, 82.5)
-    assert line.written == []
-
-
-def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It cannot be read: from the one of set_frequency it would be a jump."""
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
-    drive.set_frequency(40)
-    drive.write(drive.frequency, 10.0)
-    line.frames.clear()
-    ramp(drive, 14, rate=4.0)
-    assert [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written] == [12.0, 14.0]
-
-
-def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
-    drive.set_frequency(40)
-    line.loses = is_write
-    with pytest.raises(Unconfirmed):
-        drive.write(drive.frequency, 10.0)
-    for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
-        with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
-            act()
-
-
-def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
-    drive.set_frequency(40)
-    line.bus.broadcast(drive.frequency, 0)
-    with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
-        ramp(drive, 14, rate=4.0)
-
-
-class ShareToy(Toy):
-    """Its setpoint is a share of a frequency that its class does not state."""
-
-    share = setting(0x16, "%", step=0.01, span=(0, 100), kept=Kept.RAM)
-    setpoint_name = "share"
-
-    @verb
-    def set_frequency(self, hz: float) -> Script[None]:
-        yield from self._hold(self.share, hz / 80 * 100)
-
-
-def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
-    with pytest.raises(
-        WriteForbidden, match=r"is in %: a ramp needs maximum_frequency, which is not declared"
-    ):
-        ramp(line.attach(ShareToy(1, name="toy")), 20.0, rate=5.0)
-    assert line.written == []
-
-
-class AliasToy(Toy):
-    """Its setpoint is kept in EEPROM, and written to an address that is not."""
-
-    frequency = setting(0x15, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, ram_address=0x115)
-
-    @verb
-    def set_frequency(self, hz: float) -> Script[None]:
-        yield from self._hold(self.frequency, hz)
-
-
-def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    line = SimulatedBus(monkeypatch, simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
-    toy = line.attach(AliasToy(1))
-    ramp(toy, 10, rate=8.0)
-    assert [frame[:17] for frame in line.written] == [
-        "01 06 01 15 01 90",
-        "01 06 01 15 03 20",
-        "01 06 01 15 03 E8",
-    ]
-    assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
-
-
-def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch)
-    toy = line.attach(Toy(1, name="toy"))
-    with pytest.raises(
-        WriteForbidden, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"
-    ):
-        ramp(toy, 20.0, rate=5.0)
-    assert line.frames == []
-
-
-def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, DelixiModbus(1))
-    with pytest.raises(WriteForbidden, match="EEPROM"):
-        ramp(drive, 20.0)
-    assert line.written == []
-
-
-class KeptToy(Toy):
-    """Its setpoint is declared a command, and yet kept in EEPROM."""
-
-    frequency = command(0x2000, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, moves=False)
-
-    @verb
-    def set_frequency(self, hz: float) -> Script[None]:
-        yield from self._hold(self.frequency, hz)
-
-
-def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(KeptToy(1)))
-    toy = line.attach(KeptToy(1))
-    toy.set_frequency(5)
-    line.frames.clear()
-    with pytest.raises(WriteForbidden, match="which a ramp would wear out"):
-        ramp(toy, 20.0, rate=5.0)
-    assert line.written == []
-
-
-# ---- the log, the watchdog ----
-
-
-def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    log = tmp_path / "audit.jsonl"
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
-    drive.set_frequency(20)
-    line.loses = lambda request: request.function == 6
-    with pytest.raises(Unconfirmed):
-        drive.start()
-    line.bus.close()
-    noted = list(read_audit(log))
-    assert [(record["write"], record["sent"][:17], record["outcome"]) for record in noted] == [
-        ("setpoint = 40.00 %", "01 06 20 00 0F A0", "done"),
-        ("control = FORWARD", "01 06 10 00 00 01", "unconfirmed"),
-    ]
-    assert noted[0]["held"] == 40
-    assert noted[0]["time"].startswith("2023-11-14T22:")
-    assert (noted[1]["drive"], noted[1]["address"], noted[1]["port"]) == ("invt-che@1", 1, "hall")
-
-
-def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
-    drive.stop()
-    line.bus.close()
-    flush(60)
-    assert [each[:17] for each in line.written] == ["01 06 10 00 00 05"]
-    assert "the audit log cannot be written" in caplog.text
-
-
-LOST = LineError("hall", "the port was lost")
-LOST.is_sent = True
-
-
-def test_a_write_during_a_port_failure_is_recorded_as_unconfirmed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    log = tmp_path / "audit.jsonl"
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
-    drive.set_frequency(20)
-    carry_out = line.carry_out
-
-    def fail(exchange: Exchange, **times: Any) -> Completion:
-        if exchange.request.function == 6:
-            raise LOST
-        return carry_out(exchange, **times)
-
-    monkeypatch.setattr(line, "carry_out", fail)
-    with pytest.raises(Unconfirmed):
-        drive.start()
-    line.bus.close()
-    assert [(each["write"], each["outcome"]) for each in read_audit(log)][1:] == [
-        ("control = FORWARD", "unconfirmed")
-    ]
-
-
-ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], object], str]] = {
-    "port lost at the reading back": (
-        LOST,
-        3,
-        lambda line, drive: drive.set_frequency(30),
-        "setpoint = 60.00 %",
-    ),
-    "interrupted": (KeyboardInterrupt(), 6, lambda line, drive: drive.start(), "control = FORWARD"),
-    "port lost in a raw request": (
-        LOST,
-        6,
-        lambda line, drive: drive.send_raw(6, 0x1000, b"\0\5"),
-        "raw request 01 06 10 00 00 05 4D 09",
-    ),
-    "port lost in a broadcast": (
-        LOST,
-        6,
-        lambda line, drive: line.bus.broadcast(drive.control, CHEControl.STOP),
-        "control = STOP",
-    ),
-}
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_a_write_without_an_outcome_is_recorded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ending: str
-) -> None:
-    failure, function, act, what = ENDINGS[ending]
-    log = tmp_path / "audit.jsonl"
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
-    drive.set_frequency(20)
-    before = len(line.written)
-    carry_out = line.carry_out
-
-    def fail(exchange: Exchange, **times: Any) -> Completion:
-        if exchange.request.function == function and (function == 6 or len(line.written) > before):
-            raise failure
-        return carry_out(exchange, **times)
-
-    monkeypatch.setattr(line, "carry_out", fail)
-    with pytest.raises((type(failure), Unconfirmed)):
-        act(line, drive)
-    line.bus.close()
-    (record,) = list(read_audit(log))[1:]
-    assert (record["write"], record["outcome"], bool(record["why"])) == (what, "unconfirmed", True)
-
-
-def test_a_torn_tail_harms_no_other_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    log = tmp_path / "audit.jsonl"
-    log.write_text('{"write": "a"}\n{"write": "b')
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
-    drive.set_frequency(20)
-    line.bus.close()
-    assert [each["write"] for each in read_audit(log)] == ["a", "setpoint = 40.00 %"]
-    assert json.loads(log.read_text().splitlines()[-1])["outcome"] == "done"
+# ---- the watchdog, identity checks of own families ----
 
 
 def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> None:

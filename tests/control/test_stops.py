@@ -27,7 +27,6 @@ from multidrop.errors import (
     CancelledByStop,
     DriveException,
     LineError,
-    NoReply,
     PortLost,
     Unconfirmed,
 )
@@ -107,14 +106,6 @@ def test_a_stop_does_not_delay_other_drives(monkeypatch: pytest.MonkeyPatch) -> 
     Meanwhile(line, 2, one_of_them.stop)
     other.start()
     assert sims[1].motor.energised
-
-
-def test_a_start_after_a_stop_is_carried_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    drive.set_frequency(20)
-    drive.stop()
-    drive.start()
-    assert sim.motor.energised
 
 
 def test_a_start_during_a_stop_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -565,20 +556,7 @@ def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: 
     assert len(writes(line)) > 3
 
 
-# ---- what is said of what was sent ----
-
-
 # ---- one drive, one bus ----
-
-
-def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    line.deafens = lambda request: True
-    with pytest.raises(Unconfirmed):
-        drive.stop(seconds=1)
-    with pytest.raises(NoReply):
-        drive.start()
-    assert first(line, 0, STARTS["invt-che"]) is None
 
 
 class Hanging(logging.Handler):

@@ -22,8 +22,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lines import PATIENCE, until
 from namespaces import changing_network
-from serial import SerialException, rfc2217
 from network_server import END, manager
+from serial import SerialException, rfc2217
 from toy import Status, Toy
 
 from multidrop.bus import Bus

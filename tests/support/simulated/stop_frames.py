@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from motors import MAKE
+from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.core import Completion, Exchange, Message
@@ -58,6 +58,18 @@ class Own(Drive):
 
 def writes(line: SimulatedBus, begun: int = 0) -> list[Message]:
     return [request for request, _ in line.frames[begun:] if is_write(request)]
+
+
+def starts(line: SimulatedBus, model: str) -> list[str]:
+    """Return the sent frames that start a motor of this family."""
+    return [frame for request, frame in line.frames if is_write(request) and STARTS[model](request)]
+
+
+def all_stopped(line: SimulatedBus, sims: list[Any]) -> bool:
+    """Return True if no motor turns any more."""
+    for sim in sims:
+        sim.pass_time(line.seconds)
+    return not any(sim.motor.energised for sim in sims)
 
 
 def first(line: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
