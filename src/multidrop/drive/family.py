@@ -21,6 +21,7 @@ from multidrop.drive.declaration_check import (
 from multidrop.drive.line_settings import Settings, check_agreed_silence, framing_on
 from multidrop.drive.link import NO_LINK, Link, RegisterAccess, not_attached
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
+from multidrop.drive.parameters import Parameter, ParameterSpace
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
@@ -96,6 +97,7 @@ class Drive(RegisterAccess):
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # what to set on its keypad
     line_parameters: ClassVar[str] = ""  # the parameters for its address, baud rate and format
+    parameter_space: ClassVar[ParameterSpace | None] = None  # None: the document has no rule for addresses
     no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
@@ -536,7 +538,8 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
     if not isinstance(register, Register):
         hint = "use its attribute, or drive.register(NAME)"
         raise TypeError(f"{register!r} is not a register of {drive.name}: {hint}")
-    if drive.registers.get(register.name) is not register:
+    is_parameter = isinstance(register, Parameter) and isinstance(drive, register.family)
+    if not is_parameter and drive.registers.get(register.name) is not register:
         raise ValueError(
             f"this {register.name} is not a register of {drive.name}, which is a {drive._kind()}"
         )

@@ -7,6 +7,7 @@ from enum import IntEnum
 
 from multidrop.drive import Drive, WriteForbidden
 from multidrop.drive.options import Option
+from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import Register, Table, Worded, reading, setting
 from multidrop.drive.script import Script, read
 
@@ -133,6 +134,12 @@ class DelixiParameters(Drive):
 
     def __init_subclass__(cls, *, table: Table | None = None) -> None:
         if table is not None:
+            cls.parameter_space = ParameterSpace(
+                groups=tuple(ParameterGroup(f"P{group:02}.", group * 100, range(100)) for group in range(6)),
+                table=table,
+                monitors=("P05.*",),
+                line=("P04.29", "P04.28", "P04.30"),
+            )
             for name, register in DelixiParameters.registers.items():
                 moved: Register[float] = replace(register, table=table)
                 moved.__set_name__(cls, name)

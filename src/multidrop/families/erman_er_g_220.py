@@ -8,6 +8,7 @@ from typing import Any, Unpack
 from multidrop.drive import Advice, BusError, Drive, DriveException, Unconfirmed, WriteForbidden
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
+from multidrop.drive.parameters import ParameterSpace
 from multidrop.drive.register import (
     COIL,
     HOLDING,
@@ -155,6 +156,7 @@ class ErmanERG220(Drive):
         3: "bad addresses on read or write (the table has it for reads, the examples for writes too)",
         4: "bad addresses on write",
     }
+    parameter_space = ParameterSpace(named=r"^([bdE]\.\d+);")  # the menu's names
     options = {
         "acknowledged_fault": Option(
             "", (0, 0xFFFF_FFFF), "the drive's last fault, as its number, once it has been dealt with"

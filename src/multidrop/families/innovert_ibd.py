@@ -6,6 +6,7 @@ from enum import IntEnum, IntFlag
 
 from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, WriteForbidden
 from multidrop.drive.options import Option
+from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import HOLDING, command, reading, setting
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
@@ -140,6 +141,13 @@ class InnovertIBD(Drive):
     line_parameters = (
         "PrH.00 baud rate (1 is 9600), PrH.01 format (0 to 2: ASCII, 3 to 5: RTU; each 8N1, 8E1, 8O1), "
         "PrH.02 address"
+    )
+    parameter_space = ParameterSpace(  # the letters from C on are inferred
+        groups=tuple(
+            ParameterGroup(f"Pr{letter}.", hundred * 100, range(100))
+            for hundred, letter in enumerate("bCdEFGH", start=1)
+        ),
+        never=dict.fromkeys(("PrC.*", "Prd.*", "PrE.*", "PrF.*", "PrG.*", "PrH.*"), INFERRED),
     )
     options = {
         "maximum_frequency": Option("Hz", (1, 400), "the highest setpoint that may be written"),

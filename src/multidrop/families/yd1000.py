@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 from multidrop.drive import BusError, Drive, DriveException, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.drive.options import Option
+from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import HOLDING, Details, Kept, Register, command, reading, setting
 from multidrop.drive.script import Pulse, Script, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
@@ -216,6 +217,15 @@ class YD1000(Drive):
     line_parameters = (
         "F800 baud rate (0 to 3: 1200, 2400, 4800, 9600; it must be 3, and an S7e is fixed at 1200), F801 "
         "parity (0 none, 1 even, 2 odd; it must be 1), both in effect after a reset or power-on; F802 address"
+    )
+    parameter_space = ParameterSpace(  # 6.1, 6.2 and 7
+        groups=(
+            ParameterGroup("", 0x0000, range(25), digits=4, as_hex=True),
+            ParameterGroup("F", 0x0000, range(100, 900), digits=3, as_hex=True),
+        ),
+        line=("F801", "F800", "F802"),
+        never={"F11*": COMMAND, "F103": COMMAND, "F104": COMMAND},
+        firmware="cpu_version",
     )
     options = {
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; without it, dEC and 5 s"),

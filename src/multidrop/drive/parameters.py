@@ -1,0 +1,159 @@
+"""Parameter spaces: a family's rule from a parameter's code to its address.
+
+A family has one as `parameter_space`. Most parameters are not declared as registers: the rule is enough to
+save and restore them as raw counts. A declared setting adds its name, unit, limits and factory value.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from typing import Any
+
+from multidrop.drive.register import HOLDING, Access, Kept, Register, Table
+from multidrop.errors import Unsupported
+
+MONITOR = "it is a monitor"
+LINE_PARAMETER = "it changes the drive's end of the line"
+PASSWORD = "it is a password"
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters with consecutive addresses: `prefix` and an index of at least `digits` digits.
+
+    With `as_hex`, the index's decimal digits are sent as hex digits: F170 is at `start` + 0170H.
+    """
+
+    prefix: str
+    start: int
+    indices: range
+    digits: int = 2
+    as_hex: bool = False
+
+    def codes(self) -> Mapping[str, int]:
+        """Return each code's address."""
+        base = 16 if self.as_hex else 10
+        return {
+            f"{self.prefix}{index:0{self.digits}d}": self.start + int(str(index), base)
+            for index in self.indices
+        }
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """The parameters of a family. Codes in the fields below may be patterns, such as "P05.*".
+
+    `groups` is the rule. Without a rule, `named` is a regular expression: its first group is the code in a
+    declared setting's `place`. `monitors` are values that the drive changes itself: they are neither saved
+    nor compared. `line` has the drive's address, baud rate, format and protocol, in the order of writing.
+    `never` gives reasons for codes that are not written, besides the reasons of declared settings. `firmware`
+    is the name of the register with the firmware version.
+    """
+
+    groups: tuple[ParameterGroup, ...] = ()
+    named: str = ""
+    table: Table = HOLDING
+    monitors: tuple[str, ...] = ()
+    line: tuple[str, ...] = ()
+    passwords: tuple[str, ...] = ()
+    never: Mapping[str, str] = field(default_factory=dict)
+    firmware: str = ""
+
+    def codes(self, registers: Mapping[str, Register[Any]]) -> dict[str, tuple[int, Table]]:
+        """Return the address and table of each code, given the family's registers."""
+        found = {code: (at, self.table) for group in self.groups for code, at in group.codes().items()}
+        if self.named:
+            for register in registers.values():
+                match = re.search(self.named, register.place)
+                if match and register.access is Access.SETTING:
+                    found[match[1]] = register.address, register.table
+        return {code: place for code, place in found.items() if not _matches(code, self.monitors)}
+
+    def reason(self, code: str) -> str:
+        """Return why this code is never written; "" if no field forbids it."""
+        if _matches(code, self.line):
+            return LINE_PARAMETER
+        if _matches(code, self.passwords):
+            return PASSWORD
+        return next((why for pattern, why in self.never.items() if fnmatchcase(code, pattern)), "")
+
+
+def _matches(code: str, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatchcase(code, pattern) for pattern in patterns)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter(Register[Any]):
+    """A parameter as a register of its family: declared, or only known by the rule.
+
+    It is always written to the memory that keeps it, even if its setting has a RAM address.
+    """
+
+    code: str = ""
+    family: Any = None
+    is_declared: bool = False
+    is_line: bool = False  # the drive's address, baud rate, format or protocol
+
+    def changed(self, **facts: Any) -> Parameter:
+        """Return a copy with other facts."""
+        own = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
+        copy = Parameter(**own | facts)
+        copy.__set_name__(self.family, self.name)
+        return copy
+
+    def text(self, raw: int) -> str:
+        """Return a raw count as text: a value with its unit, or the count if nothing is declared."""
+        if not self.is_declared:
+            return str(raw)
+        return self.format(self.decode(raw)) if self.step is not None else f"{raw} raw"
+
+    @property
+    def default_raw(self) -> int | None:
+        """The raw count from the factory, if the manual prints it."""
+        return None if self.default is None else int(self.coding.count_of(self.default))
+
+
+def parameters_of(family: Any) -> Mapping[str, Parameter]:
+    """Return a family's parameters by code, in the manual's order; `family` is the class of a drive.
+
+    Raises Unsupported if the family has no rule for the addresses of its parameters.
+    """
+    return _parameters_of(family)
+
+
+@lru_cache(maxsize=64)
+def _parameters_of(family: Any) -> Mapping[str, Parameter]:
+    space: ParameterSpace | None = family.parameter_space
+    if space is None:
+        raise Unsupported(
+            f"the addresses of {family.title or family.__name__}'s parameters follow no known rule, so only "
+            "its registers can be read and written"
+        )
+    declared = {
+        (register.table.read_space, register.address): register
+        for register in family.registers.values()
+        if register.words == 1 and register.part is None
+    }
+    found: dict[str, Parameter] = {}
+    for code, (address, table) in space.codes(family.registers).items():
+        register = declared.get((table.read_space, address))
+        if register is None:
+            made = Parameter(address, Access.SETTING, table=table, kept=Kept.EEPROM, code=code, family=family)
+            name = code
+        elif register.access is not Access.SETTING:
+            continue
+        else:
+            facts = {one.name: getattr(register, one.name) for one in fields(register) if one.init}
+            if register.ram_address is not None:
+                facts |= {"ram_address": None, "kept": Kept.EEPROM}
+            made = Parameter(**facts, code=code, family=family, is_declared=True)
+            name = register.name
+        is_line = _matches(code, space.line)
+        made = made.changed(never=space.reason(code) or made.never, is_line=is_line)
+        made.__set_name__(family, name)
+        found[code] = made
+    return found
