@@ -22,6 +22,7 @@ YEARS = 10
 BUDGET = CYCLES // YEARS  # writes of one register in a year
 NO_HOME = Path("/nonexistent")  # the home of a user without one
 LATEST = 6e10  # UTC in s: later times, or as long before 1970, are damage
+YEARLY = "times in a year"  # part of the reason if the budget is used up
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
 
 
@@ -93,7 +94,7 @@ class Ledger:
                 )
             if wear.this_year >= self.budget:
                 return (
-                    f"it was written {wear.this_year} times in a year, and its EEPROM survives {CYCLES} "
+                    f"it was written {wear.this_year} {YEARLY}, and its EEPROM survives {CYCLES} "
                     f"writes: {self.budget} a year for {YEARS} years"
                 )
             ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import partial
 from typing import Any
 
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.author import Author, is_noted_first, present_author
-from multidrop.control.eeprom_ledger import LEAST_INTERVAL, Ledger, LedgerCell
+from multidrop.control.eeprom_ledger import LEAST_INTERVAL, YEARLY, Ledger, LedgerCell
 from multidrop.control.outcome import Effect, Stopped
 from multidrop.control.rules import refused
 from multidrop.core import Message, build_request
@@ -31,8 +32,23 @@ CALLED_S = 0.05  # longest time that a stop waits for its record
 CLOSING_NS = 1_000_000_000  # longest time that closing waits for other threads' records
 
 _log = logging.getLogger("multidrop.control")
+_commissioning: ContextVar[bool] = ContextVar("multidrop commissioning", default=False)
 _audit_thread = AsideThread("multidrop audit")
 _ledger_thread = AsideThread("multidrop ledger")
+
+
+@contextmanager
+def commissioning() -> Iterator[None]:
+    """Within the block, do not apply LEAST_INTERVAL: a person sets a drive up.
+
+    Each write is still counted in the ledger, the yearly budget still applies, and the audit record has
+    `commissioning`. The block applies to this thread or task.
+    """
+    token = _commissioning.set(True)
+    try:
+        yield
+    finally:
+        _commissioning.reset(token)
 
 
 class WriteRecords:
@@ -50,18 +66,14 @@ class WriteRecords:
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger before it is sent. Raises WriteForbidden if the budget is used up.
 
-        Raises it too if the last write of an EEPROM register was less than LEAST_INTERVAL ago.
+        Raises it too if the last write of an EEPROM register was less than LEAST_INTERVAL ago, unless within
+        `commissioning`.
         """
-        least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
+        least = LEAST_INTERVAL if kept is Kept.EEPROM and not _commissioning.get() else 0.0
         ledger = self._ledger.at(self._line.identity)
         why = ledger.enter(self._cell(drive, register), clock.utc_ns() / 1e9, least)
         if why:
-            way, advice = "write it less often, or take a setpoint that is kept in RAM", None
-            if kept is Kept.UNKNOWN:
-                declared = f'ram = ["{register.name}"]'
-                written = f"write {declared} below its [[line.drive]]"
-                advice = Advice(f"declare {declared}", f"add --ram {register.name}", written)
-                way = f"if you know that this drive keeps it in RAM, {advice.program}"
+            way, advice = _way_out(drive, register, kept, is_yearly=YEARLY in why)
             refusal = refused(drive, register, f"{why}; {way}", advice)
             refusal.is_budget = True
             raise refusal
@@ -142,7 +154,8 @@ class WriteRecords:
     def _complete(self, record: dict[str, Any]) -> dict[str, Any]:
         """Add the port and the author."""
         author = {key: text for key, text in present_author()._asdict().items() if text}
-        return {"port": self._line.port, **record, **author}
+        set_up = {"commissioning": True} if _commissioning.get() else {}
+        return {"port": self._line.port, **record, **author, **set_up}
 
     def catch_up(self) -> None:
         """Write the queued records and count the queued writes; log a failure as a warning."""
@@ -211,3 +224,20 @@ class WriteRecords:
         if self.audit is not None:
             self.audit.close()
             self.audit = None
+
+
+def _way_out(
+    drive: Drive, register: Register[Any], kept: Kept, *, is_yearly: bool
+) -> tuple[str, Advice | None]:
+    """Return what the caller can do instead of a write that the ledger refuses."""
+    if kept is Kept.UNKNOWN:
+        declared = f'ram = ["{register.name}"]'
+        written = f"write {declared} below its [[line.drive]]"
+        advice = Advice(f"declare {declared}", f"add --ram {register.name}", written)
+        return f"if you know that this drive keeps it in RAM, {advice.program}", advice
+    if register.name == drive.setpoint_name:
+        return "change it less often: this family has no setpoint in RAM", None
+    if is_yearly or drive.parameter_space is None:
+        return "set it on the drive's panel", None
+    advice = Advice("params.apply(..., commissioning=True)", "`multidrop params apply --commissioning`")
+    return f"wait, set it on the drive's panel, or use {advice.program}", advice
