@@ -31,7 +31,7 @@ FLOORS = [
     {"bus"},
     {"polling"},
     {"poller"},
-    {"recording", "sim", "scan", "importers"},
+    {"recording", "sim", "scan", "importers", "params"},
     {"capture", "report", "history"},
     {"gateway", "fleet"},
     {"cli"},

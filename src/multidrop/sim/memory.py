@@ -52,7 +52,7 @@ class Memory:
         self._written: dict[tuple[int, int], MemoryCell] = {}
         self.aliases: set[tuple[int, int]] = set()  # addresses whose writes do not reach the EEPROM
         for register in drive.registers.values():
-            self._declare(register)
+            self.declare(register)
         for text in drive.texts.values():
             self.make_readable(text.table, self._addresses(text))
 
@@ -63,7 +63,8 @@ class Memory:
             cell = self._cells[place] = MemoryCell(table, address)
         return cell
 
-    def _declare(self, register: Register[Any]) -> None:
+    def declare(self, register: Register[Any]) -> None:
+        """Add the register's cells, and its factory value."""
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)

@@ -1,0 +1,205 @@
+"""Parameter files: TOML and CSV, and the CSV of a public backup tool for INVT's GD20."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from multidrop.drive.parameters import Parameter, parameters_of
+from multidrop.errors import Unsupported
+from multidrop.params.values import ParameterSet
+from multidrop.printable import plain_whole, printable
+from multidrop.toml_check import parse_document
+
+FORMAT = 1  # of the files that this version writes; it refuses higher numbers
+MOST_BYTES = 1_000_000
+FACTS = ("model", "title", "firmware", "saved")
+COLUMNS = ("code", "raw", "name", "value", "factory")
+GD20_COLUMNS = {"grupo_parametro", "codigo_funcao", "valor_parametro"}
+GD20_MODEL = "invt-goodrive"
+_FACT = re.compile(r"#\s*(\w+):\s*(.*?)\s*$")
+
+
+def is_parameter_file(path: Path | str) -> bool:
+    """Return True if the name is a CSV file's, or a TOML file there has parameters."""
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return True
+    if path.suffix.lower() != ".toml" or not path.is_file():
+        return False
+    try:
+        return "parameters" in parse_document(path.read_bytes())
+    except (OSError, ValueError):
+        return False
+
+
+def load(path: Path | str) -> ParameterSet:
+    """Return the parameters in a TOML or CSV file. Raises ValueError, in one sentence, if it is wrong."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as failure:
+        raise ValueError(f"{path}: the parameter file cannot be read: {failure.strerror}") from failure
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"{path}: is too long for a parameter file")
+    try:
+        facts, values = _from_csv(data) if path.suffix.lower() == ".csv" else _from_toml(data)
+    except ValueError as mistake:
+        raise ValueError(f"{path}: {mistake}") from mistake
+    if not values:
+        raise ValueError(f"{path}: has no parameters")
+    return ParameterSet(values=values, source=str(path), **{"model": "", **facts})
+
+
+def save(found: ParameterSet, path: Path | str, family: Any = None) -> None:
+    """Write a new TOML or CSV file, by the path's suffix.
+
+    Raises ValueError for another suffix, or if the file exists already. `family`, a drive's class,
+    gives names, units and factory values.
+    """
+    path = Path(path)
+    check_name(path)
+    text = to_csv(found, family) if path.suffix.lower() == ".csv" else to_toml(found, family)
+    try:
+        with path.open("x", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+    except FileExistsError:
+        raise ValueError(f"{path} exists already, and is not replaced: name another file") from None
+
+
+def check_name(path: Path) -> None:
+    """Raise ValueError unless a parameter file can be made under this name."""
+    if path.suffix.lower() not in (".toml", ".csv"):
+        raise ValueError(f"{path}: a parameter file's name ends in .toml or .csv")
+    if path.exists():
+        raise ValueError(f"{path} exists already, and is not replaced: name another file")
+
+
+# ---- TOML ----
+
+
+def to_toml(found: ParameterSet, family: Any = None) -> str:
+    """Return a set as TOML: a raw count for each code, with a comment for each declared parameter."""
+    facts = {name: getattr(found, name) for name in FACTS}
+    lines = [f"format = {FORMAT}"]
+    lines += [f'{name} = "{_plain(value)}"' for name, value in facts.items() if value]
+    lines += ["", "[parameters]  # raw counts; only these are read"]
+    known = _known(family)
+    for code, raw in found.values.items():
+        name, value, factory = _words(known.get(code), raw)
+        comment = f"  # {name} = {value}" if name else ""
+        comment += f" (factory {factory})" if factory else ""
+        lines.append(f'"{_plain(code)}" = {raw}{comment}')
+    return "\n".join(lines) + "\n"
+
+
+def _from_toml(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
+    document = parse_document(data)
+    if "line" in document:
+        raise ValueError("is a plant file, not a parameter file; name a drive of it, as PLANT.toml DRIVE")
+    values = document.get("parameters")
+    if not isinstance(values, dict):
+        raise ValueError("is not a parameter file: it has no [parameters]")
+    _check_format(document.get("format"))
+    facts = {name: str(document[name]) for name in FACTS if name in document}
+    return facts, {code: _raw(code, raw) for code, raw in values.items()}
+
+
+def _check_format(given: object) -> None:
+    if isinstance(given, int) and given > FORMAT:
+        raise ValueError(
+            f"has format {given}, and this version of multidrop reads format {FORMAT}: use a newer version"
+        )
+    if given not in (None, FORMAT):
+        raise ValueError(f"format = {given!r} is not {FORMAT}")
+
+
+def _raw(code: str, raw: object) -> int:
+    if isinstance(raw, int) and not isinstance(raw, bool) and -(2**31) <= raw < 2**32:
+        return raw
+    raise ValueError(f"{code} = {raw!r} is not a raw count, such as 100")
+
+
+# ---- CSV ----
+
+
+def to_csv(found: ParameterSet, family: Any = None) -> str:
+    """Return a set as CSV with semicolons, as `to_toml` does; only code and raw count are read again."""
+    out = io.StringIO()
+    out.write(f"# format: {FORMAT}\n")
+    for name in FACTS:
+        if value := getattr(found, name):
+            out.write(f"# {name}: {_plain(value)}\n")
+    rows = csv.writer(out, delimiter=";", lineterminator="\n")
+    rows.writerow(COLUMNS)
+    known = _known(family)
+    rows.writerows((code, raw, *_words(known.get(code), raw)) for code, raw in found.values.items())
+    return out.getvalue()
+
+
+def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as failure:
+        raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
+    lines = text.splitlines()
+    facts = {match[1]: match[2] for line in lines if (match := _FACT.match(line))}
+    if "format" in facts:
+        number = facts.pop("format")
+        _check_format(int(number) if number.isascii() and number.isdecimal() else number)
+    table = [line for line in lines if line.strip() and not line.startswith("#")]
+    delimiter = ";" if table and ";" in table[0] else ","
+    rows = csv.DictReader(table, delimiter=delimiter)
+    names = {(name or "").strip().lower(): name for name in rows.fieldnames or ()}
+    facts = {name: value for name, value in facts.items() if name in FACTS}
+    if {*names} >= GD20_COLUMNS:
+        group, index, value = (names[name] for name in sorted(GD20_COLUMNS, key=_gd20_order))
+        found = {f"P{_whole(row[group]):02}.{_whole(row[index]):02}": _whole(row[value]) for row in rows}
+        return {"model": GD20_MODEL, **facts}, found
+    if not {"code", "raw"} <= {*names}:
+        if GD20_COLUMNS - {"valor_parametro"} <= {*names}:
+            raise ValueError("lists parameters without values; name the tool's backup, not its list")
+        raise ValueError("is not a parameter file: its first row has no code and raw")
+    found = {}
+    for row in rows:
+        code = (row[names["code"]] or "").strip()
+        if code in found:
+            raise ValueError(f"{code} is there twice")
+        found[code] = _raw(code, _whole(row[names["raw"]]))
+    return facts, found
+
+
+def _gd20_order(name: str) -> int:
+    return ("grupo_parametro", "codigo_funcao", "valor_parametro").index(name)
+
+
+def _whole(text: str | None) -> int:
+    return plain_whole((text or "").strip())
+
+
+# ---- texts ----
+
+
+def _known(family: Any) -> Mapping[str, Parameter]:
+    try:
+        return {} if family is None else parameters_of(family)
+    except Unsupported:
+        return {}
+
+
+def _words(parameter: Parameter | None, raw: int) -> tuple[str, str, str]:
+    """Return a declared parameter's name, value and factory value; empty texts for others."""
+    if parameter is None or not parameter.is_declared:
+        return "", "", ""
+    default = parameter.default_raw
+    return parameter.name, parameter.text(raw), "" if default is None else parameter.text(default)
+
+
+def _plain(text: str) -> str:
+    """Return a text that needs no escape in a TOML string, a comment or a line of CSV."""
+    return printable(text).replace("\\", "/").replace('"', "'")

@@ -1,0 +1,245 @@
+"""Parameter sets: read from a drive, its manual or a file; and their differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from multidrop.core import Framing
+from multidrop.drive.family import Drive
+from multidrop.drive.parameters import Parameter, parameters_of
+from multidrop.errors import DriveException, NoReply, NotAttached, NoValue, Unsupported
+from multidrop.iso_time import format_time
+from multidrop.planning.blocks import Block, blocks, halves
+from multidrop.transport import clock
+
+ILLEGAL_FUNCTION = 1  # exception code: no parameter can be read
+GROUP_END = 10  # after this many unanswered reads in a row, read only the group's declared parameters
+READ_EXPIRY = 60.0  # s until a read's turn, on a line that is polled
+ATTEMPTS = 3
+
+Progress = Callable[[int, int], None]  # called with the number done, and the total
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """Parameters as raw counts by code, such as {"P00.03": 5000}.
+
+    `model` is "" if a file does not state it. `source` is the drive's name or the file's path. `saved` is UTC
+    in ISO 8601, `firmware` the drive's raw version; both are "" if unknown.
+    """
+
+    model: str
+    values: Mapping[str, int]
+    source: str = ""
+    title: str = ""
+    firmware: str = ""
+    saved: str = ""
+
+
+class Difference(NamedTuple):
+    """A parameter that differs: its raw counts on both sides, None if a side lacks it, and their texts."""
+
+    code: str
+    name: str  # of the declared register, or ""
+    first: int | None
+    second: int | None
+    first_text: str
+    second_text: str
+
+
+def parameter_of(family: Any, code: str) -> Parameter:
+    """Return the parameter of this code. Raises ValueError if the family has none."""
+    known = parameters_of(family)
+    if code not in known:
+        first = next(iter(known))
+        raise ValueError(f"{family.title or family.__name__} has no parameter {code}; its first is {first}")
+    return known[code]
+
+
+def text_of(family: Any, code: str, raw: int | None) -> str:
+    """Return a raw count as text, with the unit if the parameter is declared; "-" for None."""
+    if raw is None:
+        return "-"
+    try:
+        return parameters_of(family)[code].text(raw)
+    except (KeyError, Unsupported, AttributeError):  # of a model that is not known here
+        return str(raw)
+
+
+# ---- reading ----
+
+
+def read(
+    drive: Drive, codes: Iterable[str] | None = None, *, progress: Progress | None = None
+) -> ParameterSet:
+    """Return all parameters of a drive, or those of `codes`; parameters that it does not have are left out.
+
+    Reads blocks of parameters, and splits a block that the drive refuses. Raises Unsupported if the family
+    has no rule for addresses, ValueError for an unknown code, WriteForbidden if the drive is of another
+    family, and NoReply, BadReply, DriveException or LineError if reading fails.
+    """
+    family: Any = type(drive)
+    if drive.bus is None:
+        raise NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
+    known = parameters_of(family)
+    wanted = [*known.values()] if codes is None else [parameter_of(family, code) for code in codes]
+    drive.bus.check_identity(drive)
+    reader = _Reader(drive, len(wanted), progress)
+    reader.read(wanted)
+    order = {code: at for at, code in enumerate(known)}
+    values = {code: reader.values[code] for code in sorted(reader.values, key=order.__getitem__)}
+    space = family.parameter_space
+    firmware = space.firmware if space else ""
+    return ParameterSet(
+        drive.model,
+        values,
+        source=drive.name,
+        title=drive.title,
+        firmware=f"{drive.read(firmware):g}" if firmware else "",
+        saved=format_time(clock.utc_ns())[:19] + "Z",
+    )
+
+
+@dataclass
+class _Reader:
+    """Reads parameters, and learns which ones the drive lacks and how long its blocks may be."""
+
+    drive: Drive
+    total: int
+    progress: Progress | None
+    values: dict[str, int] = field(default_factory=dict)
+    most: int = 0  # longest block that the drive answers, once it has refused a longer one; 0: not learnt
+    done: int = 0
+    silent: int = 0  # number of reads in a row that were not answered
+    group: str = ""  # of the newest parameter
+
+    def read(self, wanted: Sequence[Parameter]) -> None:
+        found = sorted(blocks(self.drive, wanted), key=lambda block: block.start)
+        for block in found:
+            self._read(block)
+
+    def _read(self, block: Block) -> bool:
+        """Read a block, in parts if it is refused. Return True if the drive has all of its parameters."""
+        kept = self._without_group_end(block)
+        if kept is None:
+            return False
+        block = kept
+        parts = halves(self.drive, block) if self.most and block.count > self.most else ()
+        if parts:
+            return self._read_all(parts)
+        try:
+            raws = self._ask(block)
+        except DriveException as refusal:
+            if refusal.code == ILLEGAL_FUNCTION or self.drive.is_passing(refusal.code):
+                raise
+        except NoReply:
+            self._check_answers()  # some drives do not answer a read of a missing parameter
+            self.silent += 1
+        else:
+            self._note(block.registers, raws)
+            return True
+        parts = halves(self.drive, block)
+        if not parts:
+            self._note(block.registers, [None])
+            return False
+        is_whole = self._read_all(parts)
+        if is_whole:  # each part was answered: the block was too long
+            self.most = max(part.count for part in parts)
+        return is_whole
+
+    def _read_all(self, parts: Sequence[Block]) -> bool:
+        answered = [self._read(part) for part in parts]  # each one, also after a refusal
+        return all(answered)
+
+    def _without_group_end(self, block: Block) -> Block | None:
+        """Return the block without parameters after the end of its group; None if none is left."""
+        kept: list[Parameter] = []
+        for parameter in block.registers:
+            assert isinstance(parameter, Parameter)
+            group = parameter.code[:-2]
+            if group != self.group:
+                self.group, self.silent = group, 0
+            if self.silent < GROUP_END or parameter.is_declared:
+                kept.append(parameter)
+            else:
+                self._count()
+        if len(kept) == len(block.registers):
+            return block
+        return Block.of(self.drive, kept) if kept else None
+
+    def _ask(self, block: Block) -> list[int | None]:
+        """Return the raw counts of a block's parameters."""
+        drive, table = self.drive, block.table
+        if drive.framing is Framing.DELIXI or table.read is None:
+            (parameter,) = block.registers
+            assert isinstance(parameter, Parameter)
+            plain = parameter.changed(values=None, step=1, offset=0, span=None, invalid=())
+            try:
+                return [int(drive.read(plain))]
+            except NoValue:
+                return [None]
+        data = drive.link.read_raw(drive, table.read, block.start, block.count, READ_EXPIRY, ATTEMPTS)
+        raws = [one.coding.raw_in(data, block.offset(one)) for one in block.registers]
+        return [None if raw is None else int(raw) for raw in raws]
+
+    def _note(self, parameters: Sequence[Any], raws: Sequence[int | None]) -> None:
+        for parameter, raw in zip(parameters, raws, strict=True):
+            self._count()
+            if raw is not None:
+                self.silent = 0
+                self.values[parameter.code] = raw
+
+    def _count(self) -> None:
+        self.done += 1
+        if self.progress:
+            self.progress(self.done, self.total)
+
+    def _check_answers(self) -> None:
+        """Raise NoReply if the drive does not answer a read that it answers otherwise."""
+        readable = (one for one in self.drive.registers.values() if one.readable)
+        probe = self.drive.echo_probe or next(readable, None)
+        if probe is not None:
+            self.drive.read(probe)
+
+
+# ---- comparing ----
+
+
+def defaults(drive: Drive | type[Drive]) -> ParameterSet:
+    """Return the factory values that the family's manual prints. Raises Unsupported if it prints none."""
+    family: Any = drive if isinstance(drive, type) else type(drive)
+    raws = {code: one.default_raw for code, one in parameters_of(family).items()}
+    known = {code: raw for code, raw in raws.items() if raw is not None}
+    if not known:
+        raise Unsupported(f"the manual of {family.title} prints no factory values")
+    return ParameterSet(family.model, known, source="factory values", title=family.title)
+
+
+def compare(first: ParameterSet, second: ParameterSet, family: Any = None) -> list[Difference]:
+    """Return the parameters that differ, in the order of `first`.
+
+    `family`, a drive's class, gives names and units. Raises ValueError if the sets are of different models.
+    """
+    check_same_model(first, second)
+    known = {} if family is None else parameters_of(family)
+    found: list[Difference] = []
+    for code in dict.fromkeys((*first.values, *second.values)):
+        one, other = first.values.get(code), second.values.get(code)
+        if one == other:
+            continue
+        name = known[code].name if code in known and known[code].is_declared else ""
+        found.append(
+            Difference(code, name, one, other, text_of(family, code, one), text_of(family, code, other))
+        )
+    return found
+
+
+def check_same_model(first: ParameterSet, second: ParameterSet) -> None:
+    """Raise ValueError if both sets state their model, and not the same one."""
+    if first.model and second.model and first.model != second.model:
+        raise ValueError(
+            f"{first.source} has parameters of {first.model}, and {second.source} of {second.model}: "
+            "they are not comparable"
+        )
