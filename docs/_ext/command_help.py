@@ -12,6 +12,7 @@ from docutils.parsers.rst import Directive
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
+from multidrop.cli.params import ACTIONS as PARAMS
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED
 
@@ -62,7 +63,11 @@ class Help(Sections):
     """Each command's own help."""
 
     def names(self) -> list[str]:
-        return [*COMMANDS, *(f"fleet {action}" for action in FLEET)]
+        return [
+            *COMMANDS,
+            *(f"fleet {action}" for action in FLEET),
+            *(f"params {action}" for action in PARAMS),
+        ]
 
     def title(self, name: str) -> str:
         return f"multidrop {name}"

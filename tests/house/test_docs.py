@@ -297,7 +297,8 @@ def test_mentioned_commands_parse(mentioned: str, monkeypatch: pytest.MonkeyPatc
     module = importlib.import_module(f"multidrop.cli.{COMMANDS[words[0]][0]}")
     arguments = words[1:]
     if hasattr(module, "ACTIONS") and arguments:
-        module = importlib.import_module(f"{module.__name__}.{module.ACTIONS[arguments.pop(0)][0]}")
+        name = module.ACTIONS[arguments.pop(0)][0]
+        module = importlib.import_module(f"{module.__name__}.{name}") if name else module
     is_typed_so = arguments and not arguments[0].startswith("--")
     if is_typed_so:
         monkeypatch.setattr(module, "run", lambda arguments: 0)

@@ -44,6 +44,7 @@ COMMANDS = {  # name: module in this package, and help
     "set-frequency": ("verbs", "write a drive's frequency setpoint"),
     "release-control": ("verbs", "return control of a stopped motor to its panel and terminals"),
     "ports": ("ports", "list this computer's serial ports, their adapters and who may open them"),
+    "params": ("params", "save, compare and write the parameters of a drive"),
     "scan": ("scan", "find the drives on a line, by reading only"),
     "plan": ("plan", "predict the load of a plant file's lines; opens no port"),
     "wear": ("wear", "list the writes to EEPROMs, and how many are left"),
@@ -194,7 +195,7 @@ def _run(command: str, words: list[str]) -> int:
             return DONE if words else MISTAKE
         command, *words = words
         name, text = _found("action", command, module.ACTIONS, prog)
-        module = importlib.import_module(f"{module.__name__}.{name}")
+        module = importlib.import_module(f"{module.__name__}.{name}") if name else module
         prog = f"{prog} {command}"
     parser = _Parser(prog=prog, description=text[0].upper() + text[1:] + ".", allow_abbrev=False)
     parser.set_defaults(command=command)

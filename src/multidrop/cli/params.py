@@ -1,0 +1,351 @@
+"""`multidrop params`: saves, compares, lists and writes the parameters of one drive."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from multidrop import params
+from multidrop.cli import DONE, FAILED
+from multidrop.cli.support.arguments import (
+    Target,
+    add_json_argument,
+    add_target_arguments,
+    add_writing_arguments,
+    is_plant,
+    target_of,
+)
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import aligned, counted
+from multidrop.cli.support.writing import confirm, reporting_interruption
+from multidrop.drive.parameters import parameters_of
+from multidrop.errors import Unsupported, WriteForbidden
+from multidrop.families.registry import find_model
+from multidrop.params import ParameterSet, files
+from multidrop.printable import printable
+
+ACTIONS = {  # name: module in this package ("": this one), and help
+    "save": ("", "read all parameters of a drive into a new TOML or CSV file"),
+    "diff": ("", "compare files and drives; exit status 1 if they differ"),
+    "apply": ("", "write a file's parameters to a stopped drive, if they differ"),
+    "list": ("", "list the parameters of a drive or a model"),
+}
+_FURTHER = {"save": ("FILE",), "diff": (), "apply": (), "list": ()}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    action = parser.get_default("command")
+    parser.set_defaults(command=f"params {action}", action=action)
+    add_target_arguments(parser, *_FURTHER[action])
+    parser.usage = "\n       ".join(f"{parser.prog} {way} [options]" for way in _WAYS[action])
+    if action == "diff":
+        parser.add_argument("--defaults", action="store_true", help="compare a drive with the factory values")
+    if action == "apply":
+        add_writing_arguments(parser)
+        parser.add_argument("--dry-run", action="store_true", help="print the plan, and write nothing")
+        parser.add_argument(
+            "--also",
+            metavar="CODE",
+            action="append",
+            default=[],
+            help="also write this parameter of the drive's line, such as its address; may be repeated",
+        )
+        parser.add_argument(
+            "--commissioning",
+            action="store_true",
+            help="write a register again within a minute; only at a terminal",
+        )
+    add_json_argument(parser)
+
+
+_DRIVES = ("PORT MODEL ADDRESS", "PLANT.toml DRIVE")
+_WAYS = {
+    "save": [f"{drive} FILE" for drive in _DRIVES],
+    "diff": [
+        *(f"FILE {drive}" for drive in _DRIVES),
+        "FILE FILE",
+        "PLANT.toml DRIVE PLANT.toml DRIVE",
+        *(f"--defaults {drive}" for drive in _DRIVES),
+    ],
+    "apply": [f"FILE {drive}" for drive in _DRIVES],
+    "list": [*_DRIVES, "MODEL"],
+}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return _ACTS[arguments.action](arguments)
+
+
+# ---- save ----
+
+
+def _save(arguments: argparse.Namespace) -> int:
+    target, words = _drive_of(arguments, arguments.words)
+    if len(words) != 1:
+        raise _mistaken(arguments, "give the drive, and one file to write")
+    files.check_name(Path(words[0]))
+    found = _read(target)
+    params.save(found, words[0], type(target.drive))
+    if arguments.json:
+        print_text(json.dumps(_as_json(found) | {"file": words[0]}, indent=2))
+    else:
+        print_text(f"{words[0]}: {counted(len(found.values), 'parameter')} of {target.drive.name}")
+    return DONE
+
+
+def _read(target: Target, codes: Sequence[str] | None = None) -> ParameterSet:
+    with _Progress("read") as progress, target.open_bus():
+        return params.read(target.drive, codes, progress=progress)
+
+
+# ---- diff ----
+
+
+def _diff(arguments: argparse.Namespace) -> int:
+    words = list(arguments.words)
+    if arguments.defaults:
+        target, words = _drive_of(arguments, words)
+        _check_no_more(arguments, words)
+        family: Any = type(target.drive)
+        first = params.defaults(family)
+        second = _read(target, [*first.values])
+    else:
+        one, words = _side(arguments, words)
+        if isinstance(one, Target) and len(words) == 1 and not params.is_parameter_file(words[0]):
+            words = [one.words[0], *words]  # another drive of the same plant
+        other, words = _side(arguments, words)
+        _check_no_more(arguments, words)
+        first, second = _both(one, other)
+        family = _family_of(one, other, first)
+    different = params.compare(first, second, family)
+    if arguments.json:
+        print_text(json.dumps(_differences_as_json(first, second, different), indent=2))
+    elif different:
+        head = ("CODE", "NAME", first.source, second.source)
+        rows = [(each.code, each.name, each.first_text, each.second_text) for each in different]
+        print_text("\n".join(aligned([head, *rows], "<<>>")))
+    else:
+        print_text(f"{first.source} and {second.source} have the same parameters")
+    return FAILED if different else DONE
+
+
+def _side(arguments: argparse.Namespace, words: list[str]) -> tuple[Target | ParameterSet, list[str]]:
+    """Return the drive or the file that the next words name, and the words after it."""
+    if words and _is_file(words):
+        return params.load(words[0]), words[1:]
+    return _drive_of(arguments, words)
+
+
+def _is_file(words: list[str]) -> bool:
+    """Return True if the first word is a parameter file, or a missing file that cannot be a plant's."""
+    first = words[0]
+    if "://" in first or Path(first).suffix.lower() not in (".toml", ".csv"):
+        return False
+    return params.is_parameter_file(first) or not Path(first).exists()
+
+
+def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[ParameterSet, ParameterSet]:
+    """Return both sides; of a drive that is compared with a file, only the file's parameters are read."""
+    models = [each.drive.model if isinstance(each, Target) else each.model for each in (one, other)]
+    if all(models) and models[0] != models[1]:
+        names = [each.drive.name if isinstance(each, Target) else each.source for each in (one, other)]
+        raise ValueError(f"{names[0]} has parameters of {models[0]}, and {names[1]} of {models[1]}")
+    codes = [[*each.values] if isinstance(each, ParameterSet) else None for each in (one, other)]
+    first = _read(one, codes[1]) if isinstance(one, Target) else one
+    second = _read(other, codes[0]) if isinstance(other, Target) else other
+    return first, second
+
+
+def _family_of(one: Target | ParameterSet, other: Target | ParameterSet, first: ParameterSet) -> Any:
+    """Return the class that gives names and units; None for a model that is not known here."""
+    for side in (one, other):
+        if isinstance(side, Target):
+            return type(side.drive)
+    with suppress(ValueError, Unsupported):
+        family = find_model(first.model)
+        parameters_of(family)
+        return family
+    return None
+
+
+# ---- apply ----
+
+
+def _apply(arguments: argparse.Namespace) -> int:
+    if not arguments.words or not _is_file(arguments.words):
+        raise _mistaken(arguments, "give a parameter file, and then the drive")
+    if arguments.commissioning and not sys.stdin.isatty():
+        raise WriteForbidden("nothing was sent: --commissioning is for a person at a terminal")
+    given = params.load(arguments.words[0])
+    target, words = _drive_of(arguments, arguments.words[1:])
+    _check_no_more(arguments, words)
+    drive = target.drive
+    with reporting_interruption(drive, "apply") as known, target.open_bus(arguments.audit):
+        known.clear()
+        with _Progress("read") as progress:
+            made = params.plan(drive, given, also=arguments.also, progress=progress)
+        if not arguments.json:
+            print_text("\n".join(made.lines()) or f"{drive.name} has these parameters already")
+        if arguments.dry_run:
+            return _print_plan(arguments, made)
+        if made.writes:
+            count = counted(len(made.writes), "parameter")
+            confirm(f"Write {count} to {drive.name} on {target.port}?", arguments)
+
+        def report(number: int, total: int, change: params.ParameterChange, said: str) -> None:
+            known[:] = [f"{drive.name}: {number} of {counted(total, 'parameter')} done, up to {change}"]
+            if not arguments.json:
+                print_text(f"{number}/{total} {change}: {said}", flush=True)
+
+        result = params.apply_plan(made, commissioning=arguments.commissioning, report=report)
+    if arguments.json:
+        print_text(json.dumps(_applied_as_json(result), indent=2))
+    else:
+        print_text("\n".join(_applied_lines(result)))
+    if result.failure is not None:
+        raise result.failure
+    return DONE if result.ok else FAILED
+
+
+def _print_plan(arguments: argparse.Namespace, made: params.ApplyPlan) -> int:
+    if arguments.json:
+        print_text(json.dumps(_plan_as_json(made), indent=2))
+    else:
+        print_text(f"{counted(len(made.writes), 'parameter')} to write; nothing was written")
+    return DONE
+
+
+def _applied_lines(result: params.Applied) -> list[str]:
+    rest = len(result.plan.writes) - len(result.written)
+    lines = [f"{counted(len(result.written), 'parameter')} written, {rest} not"]
+    if result.earlier:
+        lines += ["before, and not finished:", *(f"  {sentence}" for sentence in result.earlier)]
+    if result.failure is not None:
+        lines.append("run the command again to write the rest")
+    return lines
+
+
+# ---- list ----
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    words = arguments.words
+    if len(words) == 1 and not is_plant(words[0]):
+        family: Any = find_model(words[0])
+        held: dict[str, int] | None = None
+    else:
+        target, rest = _drive_of(arguments, words)
+        _check_no_more(arguments, rest)
+        family = type(target.drive)
+        held = dict(_read(target).values)
+    known = parameters_of(family)
+    shown = [one for code, one in known.items() if (one.is_declared if held is None else code in held)]
+    rows = []
+    for one in shown:
+        default = one.default_raw
+        raw = None if held is None else held[one.code]
+        rows.append(
+            {
+                "code": one.code,
+                "name": one.name if one.is_declared else "",
+                "value": "" if raw is None else one.text(raw),
+                "factory": "" if default is None else one.text(default),
+                "not_written": one.never,
+            }
+            | ({} if raw is None else {"raw": raw})
+        )
+    if arguments.json:
+        print_text(json.dumps({"model": family.model, "parameters": rows}, indent=2))
+        return DONE
+    head = ("CODE", "NAME", "VALUE", "FACTORY", "NOT WRITTEN BECAUSE")
+    table = [
+        (str(row["code"]), str(row["name"]), str(row["value"]), str(row["factory"]), str(row["not_written"]))
+        for row in rows
+    ]
+    print_text("\n".join(aligned([head, *table], "<<>><")))
+    if held is None and len(known) > len(shown):
+        print_text(f"\nand {len(known) - len(shown)} codes by rule, which are saved as raw counts")
+    return DONE
+
+
+# ---- arguments and output ----
+
+
+def _drive_of(arguments: argparse.Namespace, words: Sequence[str]) -> tuple[Target, list[str]]:
+    """Return the drive that the first of these words name, and the words after it."""
+    return target_of(argparse.Namespace(**vars(arguments) | {"words": [*words]}))
+
+
+def _check_no_more(arguments: argparse.Namespace, words: Sequence[str]) -> None:
+    if words:
+        raise _mistaken(arguments, f"unrecognized arguments: {' '.join(words)}")
+
+
+def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
+    return ValueError(f"{sentence}; see `multidrop {arguments.command} --help`")
+
+
+class _Progress:
+    """Shows progress in one line on a terminal's stderr, and removes it at the end."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._is_shown = sys.stderr.isatty()
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __call__(self, done: int, total: int) -> None:
+        if self._is_shown:
+            print(f"\r{printable(self._what)} {done} of {total}", end="", file=sys.stderr, flush=True)
+
+    def __exit__(self, *failure: object) -> None:
+        if self._is_shown:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def _as_json(found: ParameterSet) -> dict[str, Any]:
+    facts = {name: getattr(found, name) for name in files.FACTS if getattr(found, name)}
+    return {"source": found.source, **facts, "parameters": dict(found.values)}
+
+
+def _differences_as_json(
+    first: ParameterSet, second: ParameterSet, different: list[params.Difference]
+) -> dict[str, Any]:
+    return {
+        "first": first.source,
+        "second": second.source,
+        "differences": [each._asdict() for each in different],
+    }
+
+
+def _plan_as_json(made: params.ApplyPlan) -> dict[str, Any]:
+    return {
+        "drive": made.drive.name,
+        "source": made.source,
+        "writes": [_change_as_json(change) for change in made.writes],
+        "not_written": dict(made.left),
+        "notes": [*made.notes],
+    }
+
+
+def _change_as_json(change: params.ParameterChange) -> dict[str, Any]:
+    return {"code": change.parameter.code, "before": change.before, "after": change.after}
+
+
+def _applied_as_json(result: params.Applied) -> dict[str, Any]:
+    return {
+        "drive": result.plan.drive.name,
+        "written": [_change_as_json(change) for change in result.written],
+        "not_written": dict(result.plan.left) | result.refused,
+        "earlier": result.earlier,
+        "failure": "" if result.failure is None else str(result.failure),
+    }
+
+
+_ACTS = {"save": _save, "diff": _diff, "apply": _apply, "list": _list}
