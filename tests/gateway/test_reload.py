@@ -449,7 +449,7 @@ dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_rows_amid_a_reload_are_described_as_what_they_were_read_as(
+def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The drive is of another family already, and polled, while another line takes its time."""

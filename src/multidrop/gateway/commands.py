@@ -10,11 +10,11 @@ import asyncio
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from multidrop import Bus, BusError, Drive, Plant, WriteForbidden
 from multidrop.control import (
@@ -37,10 +37,11 @@ from multidrop.control.commands import (
 from multidrop.drive import verb_arguments
 from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
-from multidrop.gateway.stops_amid_reload import ChangingLines, drives_of, names_of, stop_meant
 from multidrop.plant import drive_meant
+from multidrop.supervisor import supervisor
 
 MOST_AGE_S = 5.0  # an older write or verb, such as one that a network delayed, is refused; stops never are
+LOOK_S = 0.02  # during a reload: interval of checking for changed drives that must be stopped again
 MOST_WRITES = 8  # concurrent writes on one line; stops are not counted
 BUSY = "too many writes are under way"  # a `rule` of WriteForbidden
 UNAUDITED = "the audit log cannot be written"  # a `rule` of WriteForbidden
@@ -74,11 +75,17 @@ VERBS: Mapping[str, VerbRule] = {
 STOPPING = frozenset(verb for verb, rule in VERBS.items() if rule.role is Right.STOP)
 
 
-class PolledLines(ChangingLines, Protocol):
-    """The part of a Poller that commands need."""
+class PolledLines(Protocol):
+    """The polled lines, which a reload may change at any moment."""
 
     @property
     def plant(self) -> Plant: ...
+    @property
+    def plant_now(self) -> Plant: ...
+    @property
+    def plant_coming(self) -> Plant | None:
+        """The plant of a reload in progress; None without one."""
+
     def bus(self, line: str) -> Bus: ...
 
 
@@ -106,7 +113,7 @@ class Commands:
         self._ended_ns: dict[str, int] = {}  # by drive: when its latest command ended
         self.plant_ns: int | None = None  # when the plant was reloaded (CLOCK_BOOTTIME)
 
-    def begin_anew(self) -> None:
+    def note_reload(self) -> None:
         """Note that the plant was reloaded: a name may now be another drive's."""
         self.plant_ns = boottime_ns()
 
@@ -312,6 +319,88 @@ def _written_by(caller: Caller) -> Iterator[None]:
 
 def _printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else "?" for sign in text)[:200].strip()
+
+
+# ---- stops during a reload ----
+
+
+class StopEnd(Protocol):
+    """The result of a stop."""
+
+    @property
+    def is_done(self) -> bool: ...
+
+
+T = TypeVar("T", bound=StopEnd)
+
+
+def drives_of(plant: Plant) -> dict[str, Drive]:
+    return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
+
+
+def names_of(lines: PolledLines) -> dict[str, None]:
+    """Return the names of all drives of the present plant, and of the new plant during a reload."""
+    plants = (lines.plant_now, lines.plant_coming or lines.plant_now)
+    return dict.fromkeys(name for plant in plants for name in drives_of(plant))
+
+
+async def stop_meant(
+    lines: PolledLines,
+    drives: Iterable[str] | None,
+    stop: Callable[[Plant, list[str]], Coroutine[Any, Any, dict[str, T]]],
+) -> dict[str, T]:
+    """Stop the drives with these names, or all if None; return the result of each drive's latest stop.
+
+    Names may have another spelling (see `drive_meant`). `stop` is called with the present plant and the
+    names. If a reload changes a drive before all stops have ended, that drive is stopped again as soon as it
+    is attached. If a stop failed and lines have changed since, the drive is stopped once more at the end.
+    """
+    known = names_of(lines)
+    meant = {name: drive_meant(name, known) for name in drives or ()}
+    others = _also_meant(lines, meant.values())
+    names = None if drives is None else dict.fromkeys([*meant.values(), *others])
+    before = lines.plant_now.lines
+    sent: dict[str, Drive | None] = {}
+    begun: list[asyncio.Task[dict[str, T]]] = []
+    while True:
+        is_settled, plant = lines.plant_coming is None, lines.plant_now
+        there = drives_of(plant)
+        wanted = there if names is None else names
+        left = [one for one in wanted if one not in sent or there.get(one, sent[one]) is not sent[one]]
+        pending = [stopping for stopping in begun if not stopping.done()]
+        if left:
+            sent |= {name: there.get(name) for name in left}
+            begun.append(supervisor().start("stop", stop(plant, left)))
+        elif pending:
+            await asyncio.wait(pending, timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED)
+        elif is_settled:
+            break
+        else:
+            await asyncio.sleep(LOOK_S)
+    results = {name: end for stopping in begun for name, end in stopping.result().items()}
+    failed = [name for name, end in results.items() if not end.is_done]
+    if failed and plant.lines != before:
+        results |= await stop(plant, failed)
+    return results if drives is None else {one: results[meant.get(one, one)] for one in (*meant, *others)}
+
+
+def _also_meant(lines: PolledLines, names: Collection[str]) -> list[str]:
+    """Return the present names of drives that have one of these names in the new plant.
+
+    A stop by such a name may mean either drive. A drive is left out if the new plant has another family at
+    its address, because the same stop frame may mean something else there.
+    """
+    coming = {} if lines.plant_coming is None else _by_place(lines.plant_coming)
+    wanted = {place: type(drive) for place, drive in coming.items() if drive.name in names}
+    return [
+        drive.name
+        for place, drive in _by_place(lines.plant_now).items()
+        if wanted.get(place) is type(drive) and drive.name not in names
+    ]
+
+
+def _by_place(plant: Plant) -> dict[tuple[str, int], Drive]:
+    return {(line.port, polled.drive.address): polled.drive for line in plant.lines for polled in line.drives}
 
 
 # ---- results ----

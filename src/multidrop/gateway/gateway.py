@@ -17,7 +17,7 @@ from typing import Any
 import uvicorn
 
 import multidrop
-from multidrop import Batch, Bus, LineError, Plant, Poller
+from multidrop import Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
@@ -30,7 +30,6 @@ from multidrop.gateway.live.alarms import Alarm, Alarms
 from multidrop.gateway.live.drive_reads import Identities, SideReads
 from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub
-from multidrop.gateway.live.newcomers import Newcomers
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 from multidrop.gateway.live.views import troubles_of
 from multidrop.gateway.parts import LiveParts, PartContext
@@ -88,7 +87,6 @@ class Gateway:
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant, now_and_slept_ns)
-        self.newcomers = Newcomers()
         self.alarms = Alarms(utc_ms(), self._note_alarm)
         self.alarm_file = AlarmFile(settings.alarms) if settings.alarms else None
         self._is_restored = self.alarm_file is None
@@ -243,22 +241,19 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch to the hub and to all parts; during a reload, keep rows of the new plant back."""
-        while self.newcomers.has_room and (batch := poller.take()):
+        """Give each batch to the hub and to all parts, even if one of them fails."""
+        while batch := poller.take():
             self._has_news = True
-            self.feed(batch if self.plant_coming is None else self.newcomers.keep(batch, self.plant, poller))
+            batch = self.reload.without_changed_drives(batch)
+            self.guarded("hub", self.hub.take, batch)
+            for name, feed in self.feeds.items():
+                self.guarded(name, feed.take, batch)
         if self.clock() - self._looked >= LOOK_S:
             self._looked = self.clock()
             self.guarded("events", self._look_for_events)
             if self._has_news:
                 self._has_news = False
                 self.guarded("frames", self.frames.note_news)
-
-    def feed(self, batch: Batch) -> None:
-        """Give a batch to the hub and to all parts, even if one of them fails."""
-        self.guarded("hub", self.hub.take, batch)
-        for name, feed in self.feeds.items():
-            self.guarded(name, feed.take, batch)
 
     def _look_for_events(self) -> None:
         if not self._is_restored and not self._restore_alarms():

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from multidrop import Plant, PlantError, Poller
+from multidrop import Batch, Plant, PlantError, Poller
 from multidrop.gateway.parts import PARTS
 from multidrop.gateway.settings import AUDIT_S, check_writable
 from multidrop.supervisor import Hung, supervisor
@@ -56,6 +56,7 @@ class Reload:
         self._is_wanted = False
         self._is_overtaken = asyncio.Event()  # set when a later reload was requested
         self.coming: Plant | None = None  # the plant that is being adopted; None otherwise
+        self._changed: frozenset[str] = frozenset()  # drives that the adoption changes
 
     @property
     def has_file(self) -> bool:
@@ -122,6 +123,8 @@ class Reload:
         if gateway.audit:  # the adoption opens this log
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         replaced = await gateway.parts.replace(settings.parts, plant)
+        gateway.hand_out(poller)
+        self._changed = _changed_drives(gateway.plant, plant)
         self.coming = plant
         try:
             unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
@@ -134,7 +137,7 @@ class Reload:
             raise
         finally:
             self.coming = None
-            gateway.newcomers.release(gateway.feed)
+            self._changed = frozenset()
         gateway.note_unopened(unopened)
         self.mistakes, self.restart = (), tuple(self._after_restart(plant, settings))
         for sentence in self.restart:
@@ -152,17 +155,25 @@ class Reload:
             gateway.forget(name)
         gateway.plant = plant
         gateway.revision += 1
-        gateway.seen_frames.begin_anew()
-        gateway.commands.begin_anew()
+        gateway.seen_frames.note_reload()
+        gateway.commands.note_reload()
         self._take_up_rights(settings)
-        gateway.side_reads.begin_anew()
+        gateway.side_reads.cancel()
         gateway.guarded("hub", gateway.hub.adopt, plant, planned)
         gateway.guarded("statistics", gateway.recent.adopt, plant, planned)
         for name, feed in gateway.feeds.items():
             if hasattr(feed, "adopt"):
                 gateway.guarded(name, feed.adopt, plant)
-        gateway.newcomers.release(gateway.feed)
+        self._changed = frozenset()
         gateway.guarded("frames", gateway.frames.note_news)
+
+    def without_changed_drives(self, batch: Batch) -> Batch:
+        """Remove the rows of drives that the reload in progress changes: either plant may describe them."""
+        columns = batch.columns() if self._changed else None
+        if columns is None or self._changed.isdisjoint(columns.drives):
+            return batch
+        names = columns.drives
+        return batch.at([at for at, drive in enumerate(columns.drive) if names[drive] not in self._changed])
 
     def _after_restart(self, plant: Plant, settings: ServeSettings) -> Iterator[str]:
         """Yield a sentence for each changed key of [serve] that takes effect only after a restart."""
@@ -192,6 +203,20 @@ class Reload:
             _log.error("the plant goes on as before: %s", mistake)
         self.mistakes = tuple(mistakes)
         return Reloaded(False, "the plant goes on as before: the file has mistakes", self.mistakes)
+
+
+def _changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
+    """Return the drives that only one plant has, or whose rows mean something else in the other."""
+    meanings = [
+        {
+            one.drive.name: (type(one.drive), one.drive.address, one.polls)
+            for line in plant.lines
+            for one in line.drives
+        }
+        for plant in (before, coming)
+    ]
+    ours, theirs = meanings
+    return frozenset(name for name in ours | theirs if ours.get(name) != theirs.get(name))
 
 
 def _sentence(failure: Exception) -> str:

@@ -75,10 +75,7 @@ def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_readings_of_another_line_of_the_same_name_are_not_compared(recent: RecentStatistics) -> None:
-    """A reading of it may come while its plant is being adopted."""
+def test_a_reopened_line_counts_from_zero(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
-    recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
-    assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
-    recent.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
-    assert recent.line("hall")["rate"] == 10.0
+    recent.tick(101.0, 101_000, {"hall": replace(reading(1, per_s=20), epoch=2)})
+    assert recent.line("hall")["rate"] == 20.0

@@ -89,7 +89,7 @@ def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
 
 def test_frames_of_another_plant_count_for_nothing(times: Times) -> None:
     times.frames.note(7)
-    times.frames.begin_anew()
+    times.frames.note_reload()
     assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
     times.frames.note(8)
     assert times.rule(8) == ""

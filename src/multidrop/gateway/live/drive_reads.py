@@ -65,7 +65,7 @@ class SideReads:
         """The number of drives being read."""
         return len(self._tasks)
 
-    def begin_anew(self) -> None:
+    def cancel(self) -> None:
         """Cancel all reads after a reload, because names may mean other drives now."""
         for task in self._tasks.values():
             task.cancel()
@@ -75,7 +75,7 @@ class SideReads:
     async def close(self) -> None:
         """Cancel all reads, and wait for their end."""
         tasks = [*self._tasks.values()]
-        self.begin_anew()
+        self.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _read(self, line: str, drive: Drive, registers: list[str]) -> None:

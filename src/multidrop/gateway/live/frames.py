@@ -288,7 +288,7 @@ class SeenFrames:
             del self._made[old]
             self._came.pop(old, None)
 
-    def begin_anew(self) -> None:
+    def note_reload(self) -> None:
         """Note a reload: a name in an earlier frame may mean another drive now."""
         self._newest_before = self._newest
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
-from multidrop import Plant, PlantLine
+from multidrop import Plant
 from multidrop.transport import LineStatistics, Statistics
 
 SECONDS = 5.0  # averaging time of a line's use, and refresh interval of the last minute's figures
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]
-T = TypeVar("T", float, int)
 
 
 class RecentStatistics:
@@ -29,24 +27,16 @@ class RecentStatistics:
         self._figures: dict[str, dict[str, Any]] = {}  # by line, from the newest reading
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # few, because a reading is large
         self._hours: dict[str, deque[dict[str, Any]]] = {}  # figures of whole minutes by line
-        self._lines: Mapping[str, PlantLine] = {}
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Use another plant, and forget the readings of lines whose counters start again."""
-        before, self._lines = self._lines, {line.name: line for line in plant.lines}
-        goes_on = {
-            name for name, line in self._lines.items() if name in before and _counts_on(before[name], line)
-        }
-        _keep(self._recent, goes_on)
-        _keep(self._minutes, goes_on)
-        self._hours = {name: minutes for name, minutes in self._hours.items() if name in goes_on}
-        self.newest = _of_lines(self.newest, goes_on)
+        """Use another plant. Statistics of a line or drive that was opened again count from zero."""
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
-        self._minute = {name: self._last_minute(name) for name in self._lines}
+        self._hours = {name: minutes for name, minutes in self._hours.items() if name in self._planned}
+        self.newest = {name: line for name, line in self.newest.items() if name in self._planned}
         self._due = 0.0
-        self._figures = {name: self._line_figures(name, minute) for name, minute in self._minute.items()}
+        self._refresh()
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
         """Add a reading; `now` is monotonic time in s."""
@@ -61,13 +51,17 @@ class RecentStatistics:
         is_complete = reading.keys() == self._minute.keys() and None not in self._minute.values()
         if now >= self._due or not is_complete:
             self._due = now + SECONDS
-            self._minute = {line: self._last_minute(line) for line in reading}
-            self._drives = {
-                name: _of_minute(statistics)
-                for line, minute in self._minute.items()
-                for name, statistics in (minute or reading[line]).drives.items()
-            }
+            self._refresh()
         self._figures = {line: self._line_figures(line, minute) for line, minute in self._minute.items()}
+
+    def _refresh(self) -> None:
+        """Compute the figures of the last minute."""
+        self._minute = {line: self._last_minute(line) for line in self.newest}
+        self._drives = {
+            name: _of_minute(statistics)
+            for line, minute in self._minute.items()
+            for name, statistics in (minute or self.newest[line]).drives.items()
+        }
 
     def line(self, name: str) -> dict[str, Any]:
         """Return a line's measured and planned use, its rate, and the last minute's delay and misses."""
@@ -85,13 +79,11 @@ class RecentStatistics:
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
         """Return the used share of a line's time and its exchanges per second, over SECONDS."""
-        before = self._recent[0][1].get(name) if self._recent else None
-        now = self.newest.get(name)
-        if before is None or now is None or before is now or before.epoch != now.epoch:
+        recent = self._since(self._recent[0][1], name) if self._recent else None
+        if recent is None:
             return None, None
-        seconds = max(now.seconds - before.seconds, 1e-9)
-        used_s = (now.counters.ideal_ns - before.counters.ideal_ns) / 1e9
-        return round(used_s / seconds, 4), round((now.exchanges - before.exchanges) / seconds, 1)
+        seconds = max(recent.seconds, 1e-9)
+        return round(recent.used_s / seconds, 4), round(recent.exchanges / seconds, 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
         """Return a drive's share of misses in the last minute, and its response delay."""
@@ -122,23 +114,6 @@ class RecentStatistics:
         begin_ms, before = self._minutes[-1] if self._minutes else (0, {})
         minute = self._since(before, line)
         return [{"time": begin_ms, "asked": asked_of(minute), "misses": misses_of(minute)}] if minute else []
-
-
-def _counts_on(before: PlantLine, line: PlantLine) -> bool:
-    """Return True if a line has the same port and drives as before, so its counters continue."""
-    drives = [[polled.drive for polled in one.drives] for one in (before, line)]
-    is_same = len(drives[0]) == len(drives[1]) and all(a is b for a, b in zip(*drives, strict=True))
-    return is_same and replace(before, drives=()) == replace(line, drives=())
-
-
-def _keep(readings: deque[tuple[T, Reading]], names: set[str]) -> None:
-    kept = [(time, _of_lines(reading, names)) for time, reading in readings]
-    readings.clear()
-    readings.extend(kept)
-
-
-def _of_lines(reading: Reading, names: set[str]) -> Reading:
-    return {name: found for name, found in reading.items() if name in names}
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:

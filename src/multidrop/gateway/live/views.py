@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from multidrop import Drive
 from multidrop.control import Ledger
 from multidrop.exposition import MetricFamily
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.recent_statistics import asked_of, misses_of
 from multidrop.gateway.metrics import Figures
-from multidrop.gateway.stops_amid_reload import drives_of
 from multidrop.plant import drive_meant
 from multidrop.supervisor import Hung, supervisor
 from multidrop.transport import Statistics

@@ -10,7 +10,7 @@ import pytest
 from lines import PATIENCE, line, plant, polled
 
 from multidrop import YD1000, Drive, InvtCHE, Plant
-from multidrop.gateway.stops_amid_reload import stop_meant
+from multidrop.gateway.commands import stop_meant
 
 Names = dict[str, Drive]
 
