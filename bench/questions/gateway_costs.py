@@ -34,7 +34,6 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.connections import Connections, Watched
 from multidrop.gateway.http.routes import make_app
 from multidrop.gateway.live.frames import WHOLE
-from multidrop.gateway.live.views import figures_of
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server.server import ModbusServer
@@ -158,7 +157,7 @@ class Worker:
 
     def metrics(self) -> None:
         gateway = self.gateway
-        expose_metrics(families_of(gateway.hub, gateway.recent.newest, figures_of(gateway)), "")
+        expose_metrics(families_of(gateway), "")
 
     def masters(self, start: int, words: int) -> Callable[[], None]:
         """Return a function that reads these words of all drives."""

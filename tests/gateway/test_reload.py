@@ -118,8 +118,8 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
         plant = gateway.get("/api/plant").json
         assert (plant["mistakes"], plant["revision"]) == (mistakes, revision)
         assert drives == [polled.drive for polled in gateway.gateway.plant.lines[0].drives]
-        taken = gateway.gateway.hub.seen_at("pump-2") or 0
-        until(lambda: (gateway.gateway.hub.seen_at("pump-2") or 0) > taken)
+        taken = gateway.gateway.hub.last_answer("pump-2") or (0,)
+        until(lambda: (gateway.gateway.hub.last_answer("pump-2") or (0,)) > taken)
 
         path.unlink()
         (mistake,) = reload(gateway)["mistakes"]

@@ -81,7 +81,10 @@ TIED = (  # groups of files that name each other in annotations
     {"drive/family.py", "drive/verbs.py"},
     {"polling/batch.py", "polling/tables.py"},
     {"sim/drive.py", "sim/protocol.py"},
-    {f"gateway/{name}.py" for name in ("gateway", "reload", "live/views", "http/routes")},
+    {
+        f"gateway/{name}.py"
+        for name in ("gateway", "reload", "metrics", "live/views", "live/descriptions", "http/routes")
+    },
 )
 MOST_LINES_OF_A_FILE = 600
 IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")

@@ -265,7 +265,7 @@ class Gateway:
         for line in self.plant.lines:
             lost = lost_of(self.hub, line.name)
             self.alarms.look_at_line(now, line.name, lost)
-            if lost is None and any(self.hub.seen_at(polled.drive.name) for polled in line.drives):
+            if lost is None and any(self.hub.last_answer(polled.drive.name) for polled in line.drives):
                 self.alarms.note_there(line.name)
             if lost is None and self.hub.taken:
                 self.hub.unopened.pop(line.name, None)  # a later loss has another reason

@@ -1,65 +1,60 @@
-"""The plant as Prometheus metric families. Pure.
+"""The plant as Prometheus metric families.
 
 A silent drive has no values: its series disappear, so an old value never looks current.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
 from multidrop.transport import LineStatistics
 
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+
 Sample = tuple[str, Mapping[str, str], float]  # the name's suffix, labels, value
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
 
 
-class Figures(NamedTuple):
-    """Figures of the gateway itself."""
-
-    version: str
-    viewers: int
-    frames: int
-    dropped: int  # number of rows
-    failures: Mapping[str, int]  # number of failures of each part, by name
-    parts: Sequence[MetricFamily]  # the parts' own metrics
-
-
-def families_of(
-    hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures
-) -> Iterator[MetricFamily]:
+def families_of(gateway: Gateway) -> Iterator[MetricFamily]:
     """Yield the metrics of the plant, and of the gateway itself."""
-    yield MetricFamily(
-        "multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)]
-    )
-    yield MetricFamily(
-        "multidrop_value", "gauge", "Newest values of polled registers, in their units.", _values(hub)
-    )
+    version = [("_info", {"version": gateway.version}, 1.0)]
+    yield MetricFamily("multidrop_build", "info", "The version.", version)
+    yield from plant_families(gateway.hub, gateway.recent.newest)
+    dropped = gateway.poller.dropped if gateway.poller else 0
+    yield counter("multidrop_rows_dropped", "Rows dropped because they were not taken in time.", dropped)
+    yield counter("multidrop_frames", "Frames made for viewers.", gateway.frames.made)
+    yield MetricFamily("multidrop_viewers", "gauge", "Waiting viewers.", [("", {}, gateway.frames.viewers)])
+    counts = dict.fromkeys(("hub", *gateway.feeds), 0) | gateway.failures
+    failures = [("_total", {"part": name}, float(n)) for name, n in counts.items()]
+    yield MetricFamily("multidrop_part_failures", "counter", "Failures by part.", failures)
+    for feed in gateway.feeds.values():
+        with suppress(Exception):  # a failing part hides only its own figures
+            yield from getattr(feed, "figures", list)()
+
+
+def plant_families(hub: Hub, statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:
+    """Yield the metrics of values, drives and lines."""
+    values, text = _values(hub), "Newest values of polled registers, in their units."
+    yield MetricFamily("multidrop_value", "gauge", text, values)
     yield MetricFamily("multidrop_drive_state", "stateset", "State of each drive.", _states(hub))
-    yield MetricFamily(
-        "multidrop_line_up", "gauge", "1 while a line's port is present, 0 while it is lost.", _ups(hub)
-    )
+    up = "1 while a line's port is present, 0 while it is lost."
+    yield MetricFamily("multidrop_line_up", "gauge", up, _ups(hub))
     yield from _line_families(statistics)
     yield from _drive_families(statistics)
-    yield counter(
-        "multidrop_rows_dropped", "Rows dropped because they were not taken in time.", figures.dropped
-    )
-    yield counter("multidrop_frames", "Frames made for viewers.", figures.frames)
-    yield MetricFamily("multidrop_viewers", "gauge", "Waiting viewers.", [("", {}, figures.viewers)])
-    failures = [("_total", {"part": name}, float(n)) for name, n in figures.failures.items()]
-    yield MetricFamily("multidrop_part_failures", "counter", "Failures by part.", failures)
-    yield from figures.parts
 
 
 def _values(hub: Hub) -> Iterator[Sample]:
     for line in hub.plant.lines:
         for polled in line.drives:
             name = polled.drive.name
-            for register, (_, _, good, is_fresh) in zip(hub.polled(name), hub.known(name), strict=True):
-                if good is None or not is_fresh:
+            for register, _, good, is_current in hub.known(name):
+                if good is None or not is_current:
                     continue
                 labels = {"line": line.name, "drive": name, "register": register.name}
                 labels["unit"] = register.value_unit

@@ -66,14 +66,14 @@ def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
 
 def is_fresh(hub: Hub) -> bool:
     """Return True where the frequency of the first pump is that of now, though a miss came after it."""
-    return next(fresh for name, _, _, fresh in hub.known("pump-1") if name == "output_frequency")
+    return next(current for one, _, _, current in hub.known("pump-1") if one.name == "output_frequency")
 
 
 def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
     assert hub.newest("pump-1", "status") is None
     assert {good for _, _, good, _ in hub.known("pump-1")} == {None}
     assert hub.state("pump-1") == "unknown"
-    assert hub.seen_at("pump-1") is None
+    assert hub.last_answer("pump-1") is None
     assert hub.newest("pump-9", "status") is None
     assert hub.state("pump-9") == "unknown"
 
@@ -81,7 +81,7 @@ def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
 def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
-    good = next(good for name, _, good, _ in hub.known("pump-1") if name == "output_frequency")
+    good = next(good for one, _, good, _ in hub.known("pump-1") if one.name == "output_frequency")
     assert good == (UTC_0 + sent, sent, 25.0, 0)
     assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply", 10**9)
     assert is_fresh(hub)
@@ -124,7 +124,7 @@ def test_drive_is_silent_after_many_lost_replies_not_one(hub: Hub, clock: HubClo
     assert hub.seen("pump-1") == Shown("silent", "not asked: drive is silent")
     assert hub.seen("pump-1").why_silent == "not asked: drive is silent"
     assert hub.seen("pump-1").fault is None
-    assert hub.seen_at("pump-1") == UTC_0 + 10 * PERIOD
+    assert hub.last_answer("pump-1")[:2] == (UTC_0 + 10 * PERIOD, 10 * PERIOD)
     hub.take(all_of(23, STANDBY))
     assert hub.state("pump-1") == "stands"
 
@@ -216,31 +216,6 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     assert is_fresh(hub)
     clock.now_ns += row.holds_ns + 1
     assert not is_fresh(hub)
-
-
-def holds_s(hub: Hub, register: str = "output_frequency") -> float:
-    row = hub.newest("pump-1", register)
-    assert row is not None
-    assert hub.holds_s("pump-1", register) == row.holds_ns / SECOND
-    return row.holds_ns / SECOND
-
-
-def test_one_long_pause_lets_no_value_hold_for_longer(hub: Hub, clock: HubClock) -> None:
-    """A poller that stood still for a minute reads once, and stands still again."""
-    for at in (8, 9, 10, 610):
-        hub.take(all_of(at, FORWARD, 25))
-    assert holds_s(hub) == 1
-    clock.now_ns = 610 * PERIOD + SECOND + 1
-    assert not is_fresh(hub)
-    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
-
-
-def test_values_of_a_slower_line_stay_fresh_for_three_real_rounds(hub: Hub) -> None:
-    for at in (0, 50, 90, 150):
-        hub.take(all_of(at, FORWARD, 25))
-    assert holds_s(hub) == pytest.approx(3 * 4)  # the shorter one of the latest two rounds
-    hub.take(all_of(151, FORWARD, 25))
-    assert holds_s(hub) == 1
 
 
 def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:

@@ -16,7 +16,7 @@ from multidrop.core import Counters, Status
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.live.recent_statistics import MINUTES, RecentStatistics
 from multidrop.gateway.live.views import line_views
-from multidrop.gateway.metrics import Figures, families_of
+from multidrop.gateway.metrics import plant_families
 from multidrop.transport.statistics import LineStatistics, line_statistics
 
 MINUTE_MS = 60_000
@@ -70,7 +70,7 @@ def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp
     gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), recent=recent)
     drive = line_views(gateway)["hall"]["drives"]["pump-1"]
     assert (drive["p50"], drive["p99"]) == (None, None)
-    families = families_of(gateway.hub, recent.newest, Figures("0", 0, 0, 0, {}, []))
+    families = plant_families(gateway.hub, recent.newest)
     (delays,) = [one for one in families if one.name == "multidrop_response_delay_seconds"]
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 

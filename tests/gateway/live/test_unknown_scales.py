@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from lines import line, plant, polled
 
-from multidrop import Drive, reading, setting
+from multidrop import Drive, PolledDrive, reading, setting
 from multidrop.core import NumberFormat
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
-from multidrop.gateway.http.rights import May
-from multidrop.gateway.live.descriptions import describe
+from multidrop.gateway.live.descriptions import describe_line
 from multidrop.gateway.live.hub import Hub, Known, Newest
-from multidrop.gateway.metrics import Figures, families_of
+from multidrop.gateway.metrics import plant_families
 from multidrop.gateway.modbus_server.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, CommonBlock
 from multidrop.gateway.mqtt.home_assistant import discovery
-
-FIGURES = Figures("1", 0, 0, 0, {}, [])
 
 
 class FullHub(Hub):
@@ -28,14 +26,19 @@ class FullHub(Hub):
         return Newest(1, 1, 25.0, "ok", 1)
 
     def known(self, drive: str) -> Iterator[Known]:
-        for register in self.polled(drive):
-            yield register.name, (1, 1, 25.0, 0), (1, 1, 25.0, 0), True
+        for register, *_ in super().known(drive):
+            yield register, (1, 1, 25.0, 0), (1, 1, 25.0, 0), True
 
 
 class Fan(Drive):
     """A user's own, whose manual gives a unit and no scale."""
 
     pressure = setting(1, "Pa", step=None, moves=False)
+
+
+def described(*drives: PolledDrive) -> dict[str, Any]:
+    hub = Hub(plant(line("/dev/null", *drives)))
+    return describe_line(hub, hub.plant.lines[0])
 
 
 def number(words: list[int], at: int) -> int:
@@ -45,15 +48,7 @@ def number(words: list[int], at: int) -> int:
 @pytest.mark.parametrize("model", MODELS)
 def test_only_scaled_values_have_a_unit(model: str) -> None:
     drive = MODELS[model](1)
-    told = describe(
-        Hub(plant(line("/dev/null", polled(drive, drive.readings())))),
-        May(),
-        None,
-        revision=1,
-        version="1",
-        is_demo=False,
-    )
-    for register in told["lines"][0]["drives"][0]["registers"]:
+    for register in described(polled(drive, drive.readings()))["drives"][0]["registers"]:
         known = drive.registers[register["name"]]
         assert register["unit"] == ("raw count" if known.step is None else known.unit)
         if known.writable and known.values is None:  # a dialog has a span for each
@@ -76,7 +71,7 @@ def test_the_common_block_has_no_number_for_a_raw_count() -> None:
 def test_a_metric_of_raw_counts_says_so() -> None:
     drive = DelixiModbus(1, name="fan")
     hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
-    (values,) = (family for family in families_of(hub, {}, FIGURES) if family.name == "multidrop_value")
+    (values,) = (family for family in plant_families(hub, {}) if family.name == "multidrop_value")
     assert [labels["unit"] for _, labels, _ in values.samples] == ["Hz", "raw count"]
 
 
@@ -98,9 +93,8 @@ class Transmitter(Drive):
 
 
 def test_the_page_knows_no_digits_of_a_float() -> None:
-    hub = Hub(plant(line("/dev/null", polled(Transmitter(1), Transmitter.readings()))))
-    told = describe(hub, May(), None, revision=1, version="1", is_demo=False)
-    registers = {each["name"]: each for each in told["lines"][0]["drives"][0]["registers"]}
+    told = described(polled(Transmitter(1), Transmitter.readings()))
+    registers = {each["name"]: each for each in told["drives"][0]["registers"]}
     assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
     assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
 

@@ -16,9 +16,8 @@ from lines import line, plant, polled, until
 from multidrop import NoReply
 from multidrop.control.eeprom_ledger import LedgerCell
 from multidrop.families import ErmanERG220, InvtCHE
-from multidrop.gateway.http.rights import May
 from multidrop.gateway.live import drive_reads
-from multidrop.gateway.live.descriptions import describe
+from multidrop.gateway.live.descriptions import describe_line
 from multidrop.gateway.live.hub import Hub
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
@@ -60,7 +59,7 @@ def test_description_has_data_of_plant_file_and_manual(gateway: Served) -> None:
 def test_drives_of_one_line_have_their_own_speeds() -> None:
     drives = [polled(drive, drive.readings()) for drive in (ErmanERG220(1), InvtCHE(2), InvtCHE(3))]
     hub = Hub(plant(line("/dev/null", *drives)))
-    (told,) = describe(hub, May(), None, revision=1, version="1", is_demo=False)["lines"]
+    told = describe_line(hub, hub.plant.lines[0])
     assert told["speed"] == "38400 8N1, 9600 8N1"
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 

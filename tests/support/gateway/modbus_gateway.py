@@ -10,23 +10,18 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.drive import Drive
 from multidrop.gateway.http.rights import Caller
+from multidrop.gateway.live.hub import KeptRow, Newest
 from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
 PATIENCE = 30.0  # s, for required events
-
-
-class FakeRow(NamedTuple):
-    monotonic_ns: int
-    value: float | None
-    holds_ns: int = 1_000_000_000
 
 
 class FakeHub:
@@ -38,16 +33,17 @@ class FakeHub:
         self.states: dict[str, str] = {}
         self.woken_ns = 0
 
-    def newest(self, drive: str, register: str) -> FakeRow | None:
+    def newest(self, drive: str, register: str) -> Newest | None:
         key = drive, register
         if key not in self.values:
             return None
         age = round(self.ages.get(key, 0.0) * 1e9)
-        return FakeRow(time.monotonic_ns() - age, self.values[key])
+        return Newest(0, time.monotonic_ns() - age, self.values[key], "", 1_000_000_000)
 
-    def answered_ns(self, drive: str) -> int | None:
+    def last_answer(self, drive: str) -> KeptRow | None:
         rows = [self.newest(*key) for key in self.values if key[0] == drive]
-        return max((row.monotonic_ns for row in rows if row and row.value is not None), default=None)
+        good = [(0, row.monotonic_ns, row.value, 0) for row in rows if row and row.value is not None]
+        return max(good, default=None)
 
     def woke_ns(self) -> int:
         return self.woken_ns
@@ -179,7 +175,8 @@ class Gateway(NamedTuple):
 def serving(plant: Plant, settings: ModbusSettings) -> Iterator[Gateway]:
     """Run a server of this plant over fakes."""
     hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
-    with in_thread(lambda: ModbusServer(plant, hub, commands, settings, line.ask)) as server:
+    fakes: Any = plant, hub, commands
+    with in_thread(lambda: ModbusServer(*fakes, settings, line.ask)) as server:
         yield Gateway(server, hub, commands, line)
 
 

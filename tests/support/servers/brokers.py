@@ -23,7 +23,7 @@ from peers import require_module, require_program
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.http.rights import Caller, May
-from multidrop.gateway.live.hub import Known, Shown
+from multidrop.gateway.live.hub import KeptRow, Known, Shown
 from multidrop.gateway.parts import PartContext
 
 PATIENCE_S = 30.0  # for an event that is immediate on an idle machine
@@ -211,10 +211,10 @@ class ScriptedHub:
         for register in self.polled(drive):
             value = self.values.get((drive, register.name))
             row = None if value is None else (7_000_000, 7_000_000, value, 0)
-            yield register.name, row, row, row is not None
+            yield register, row, row, row is not None
 
-    def seen_at(self, drive: str) -> int | None:
-        return 7_000_000
+    def last_answer(self, drive: str) -> KeptRow | None:
+        return 7_000_000, 7_000_000, 0.0, 0
 
     def state(self, drive: str) -> str:
         return self.states[drive]

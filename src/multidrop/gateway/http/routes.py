@@ -38,7 +38,7 @@ from multidrop.gateway.http.page_files import PageFiles
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.frames import WHOLE, Frames
-from multidrop.gateway.live.views import drive_view, figures_of, health_of, line_views
+from multidrop.gateway.live.views import drive_view, health_of, line_views
 from multidrop.gateway.metrics import families_of
 from multidrop.supervisor import Hung, supervisor
 
@@ -170,20 +170,7 @@ class _Pages:
     # ---- queries ----
 
     async def plant(self, request: Request) -> Response:
-        gateway = self._gateway
-        described = describe(
-            gateway.hub,
-            gateway.settings.may,
-            caller_of(request).role,
-            revision=gateway.revision,
-            version=gateway.version,
-            is_demo=gateway.settings.is_demo,
-            has_file=gateway.reload.has_file,
-            mistakes=gateway.reload.mistakes,
-            has_fleet="fleet" in gateway.feeds,
-            can_stop_fleet=getattr(gateway.feeds.get("fleet"), "can_stop", False),
-        )
-        return JsonResponse(described)
+        return JsonResponse(describe(self._gateway, caller_of(request).role))
 
     async def drive(self, request: Request) -> Response:
         try:
@@ -205,9 +192,7 @@ class _Pages:
         return JsonResponse(health, 503 if health["status"] == "failed" else 200)
 
     async def metrics(self, request: Request) -> Response:
-        gateway = self._gateway
-        families = families_of(gateway.hub, gateway.recent.newest, figures_of(gateway))
-        kind, text = expose_metrics(families, request.headers.get("accept", ""))
+        kind, text = expose_metrics(families_of(self._gateway), request.headers.get("accept", ""))
         return PlainTextResponse(text, headers={"content-type": kind, "vary": "accept"})
 
     async def audit(self, request: Request) -> Response:

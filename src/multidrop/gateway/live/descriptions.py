@@ -1,54 +1,46 @@
-"""Description of a plant for the page: lines, drives, registers and the caller's rights. Pure."""
+"""Description of a plant for the page: lines, drives, registers and the caller's rights."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import Flag
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from multidrop import Drive, PlantLine, PolledDrive, Register
 from multidrop.drive import verbs_of
-from multidrop.gateway.http.rights import May, Right
+from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.hub import Hub
+
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
 
 FREQUENCIES = ("output_frequency", "motor_speed")
 CURRENTS = ("output_current",)
 
 
-def describe(
-    hub: Hub,
-    may: May,
-    right: Right | None,
-    *,
-    revision: int,
-    version: str,
-    is_demo: bool,
-    has_file: bool = False,
-    mistakes: Sequence[str] = (),
-    has_fleet: bool = False,
-    can_stop_fleet: bool = False,
-) -> dict[str, Any]:
+def describe(gateway: Gateway, right: Right | None) -> dict[str, Any]:
     """Return the answer to GET /api/plant for a caller with this right."""
     is_writer = right is Right.WRITE
+    may, fleet = gateway.settings.may, gateway.feeds.get("fleet")
     return {
-        "revision": revision,
-        "version": version,
-        "name": hub.plant.path.name,
-        "demo": is_demo,
-        "file": has_file,  # a reload is possible
-        "fleet": has_fleet,  # /api/fleet is available
-        "fleet_stop": can_stop_fleet,  # /api/fleet/stop is available
-        "mistakes": list(mistakes),  # in the file, if the newest reload was refused
+        "revision": gateway.revision,
+        "version": gateway.version,
+        "name": gateway.hub.plant.path.name,
+        "demo": gateway.settings.is_demo,
+        "file": gateway.reload.has_file,  # a reload is possible
+        "fleet": fleet is not None,  # /api/fleet is available
+        "fleet_stop": getattr(fleet, "can_stop", False),  # /api/fleet/stop is available
+        "mistakes": gateway.reload.mistakes,  # in the file, if the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),
             "write": sorted(may.write) if is_writer else [],
             "verbs": sorted(may.verbs) if is_writer else [],
         },
-        "lines": [_line(hub, line) for line in hub.plant.lines],
+        "lines": [describe_line(gateway.hub, line) for line in gateway.hub.plant.lines],
     }
 
 
-def _line(hub: Hub, line: PlantLine) -> dict[str, Any]:
+def describe_line(hub: Hub, line: PlantLine) -> dict[str, Any]:
+    """Return a line's part of the description."""
     speeds = dict.fromkeys(str(polled.drive.settings) for polled in line.drives)
     return {
         "name": line.name,

@@ -74,21 +74,21 @@ def frame_of(
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     """Return a drive's part of the frame. A fresh value is a pair: value, index of its age in `ages_ms`."""
     shown = hub.seen(name)
-    seen, answered_ns = hub.seen_at(name), hub.answered_ns(name)
+    answer = hub.last_answer(name)
     now = time_ns, hub.now_ns()
     places = Places()
     values: dict[str, tuple[Any, ...]] = {}
-    for register, newest, good, is_fresh in hub.known(name):
-        if is_fresh and good is not None and newest is good:
-            values[register] = _finite(good[2]), places[good[:2]]
+    for register, newest, good, is_current in hub.known(name):
+        if is_current and good is not None and newest is good:
+            values[register.name] = _finite(good[2]), places[good[:2]]
         else:
-            values[register] = _unknown(hub, newest, good, places, now)
+            values[register.name] = _unknown(hub, newest, good, places, now)
     return {
         "state": shown.state,
         "fault": shown.fault,
         "why": shown.why_silent,
         "note": shown.note,
-        "seen": None if seen is None or answered_ns is None else places[seen, answered_ns],
+        "seen": None if answer is None else places[answer[:2]],
         "ages_ms": [_age_ms(now, asked) for asked in places],
         "values": values,
     }

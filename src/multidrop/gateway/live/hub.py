@@ -7,16 +7,15 @@ sleep, all earlier rows are stale.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 from multidrop import Batch, Condition, Plant, PolledDrive, Register
 from multidrop.drive import FAULT_RECORDS, StateReader
-
-STALE_NS = 1_000_000_000  # a value stays current at least this long,
-STALE_PERIODS = 3  # and for at least this many polling intervals
+from multidrop.plant import current_for
 
 KeptRow = tuple[int, int, float, int]  # time, monotonic time, value (meaningless in a miss), status
-Known = tuple[str, KeptRow | None, KeptRow | None, bool]  # register, newest row, newest good row, is it fresh
+Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # newest row, newest good one, is it fresh
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 UNNAMED = "it shows a fault"  # words of a fault without a text
 NOT_ASKED = "not asked recently"  # words of state UNKNOWN, without any fresh value
@@ -37,32 +36,21 @@ _ANSWERED = ("exception ", "no valid value")  # prefixes of the status of a miss
 
 
 class RegisterRows:
-    """The newest rows of one register of one drive."""
+    """The newest rows of one polled register of one drive."""
 
-    __slots__ = ("good", "intervals_ns", "least_ns", "newest", "since_ns")
+    __slots__ = ("good", "holds_ns", "newest", "register", "since_ns")
 
-    def __init__(self, least_ns: int, since_ns: int = 0) -> None:
-        self.since_ns = since_ns  # earlier rows belong to another drive of the same name
+    def __init__(self, register: Register[Any], period_s: float, since_ns: int) -> None:
+        self.register = register
+        self.holds_ns = round(current_for(period_s) * 1e9)  # how long a value stays current
+        self.since_ns = since_ns  # rows requested earlier belong to another drive of the same name
         self.newest: KeptRow | None = None
         self.good: KeptRow | None = None
-        self.least_ns = least_ns  # planned interval
-        self.intervals_ns = 0, 0  # the latest two intervals between consecutive samples
 
-    @property
-    def holds_ns(self) -> int:
-        """How long a value stays current, in ns.
-
-        The line may be slower than planned, so measured intervals count too. One long interval may be only a
-        pause, so the shorter of the latest two is used.
-        """
-        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, min(self.intervals_ns)))
-
-    def is_fresh(self, now_ns: int, woke_ns: int) -> bool:
+    def is_current(self, now_ns: int, woke_ns: int) -> bool:
         """Return True if the newest value is current and was requested after the computer's last sleep."""
-        if self.good is None or self.good[1] < woke_ns:
-            return False
-        age = now_ns - self.good[1]
-        return age <= STALE_NS or age <= self.holds_ns
+        good = self.good
+        return good is not None and good[1] >= woke_ns and now_ns - good[1] <= self.holds_ns
 
 
 class FreshValues(Mapping[str, float]):
@@ -81,7 +69,7 @@ class FreshValues(Mapping[str, float]):
 
     def get(self, register: str, default: Any = None) -> Any:
         cell = self._cells.get(register)
-        if cell is None or cell.good is None or not cell.is_fresh(self._now_ns, self._woke_ns):
+        if cell is None or cell.good is None or not cell.is_current(self._now_ns, self._woke_ns):
             return default
         return cell.good[2]
 
@@ -127,25 +115,17 @@ class _Trip(NamedTuple):
 
 
 class _Watched:
-    """One drive of the plant, with its registers' rows and its fault record."""
+    """One drive of the plant, with the rows of its polled registers and its fault record."""
 
-    def __init__(self, polled: PolledDrive, cycle_ns: int, since_ns: int) -> None:
+    def __init__(self, polled: PolledDrive, cycle_s: float, since_ns: int) -> None:
         self.polled = polled
-        self.since_ns = since_ns  # rows requested earlier belong to another drive of the same name
-        self.names = tuple(poll.register.name for poll in polled.polls)
-        self.cycle_ns = cycle_ns  # planned cycle of its line
         self.reader = StateReader(polled.drive)
         self.record: float | None = None  # fault record as last seen
         self.trip: _Trip | None = None
-        self.cells: dict[str, RegisterRows] = {}
-
-    def cell(self, register: str) -> RegisterRows:
-        """Return the rows of a register; add an empty object for a new register."""
-        if register not in self.cells:
-            every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
-            least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
-            self.cells[register] = RegisterRows(least_ns, self.since_ns)
-        return self.cells[register]
+        self.cells = {
+            poll.register.name: RegisterRows(poll.register, max(cycle_s, poll.every or 0.0), since_ns)
+            for poll in polled.polls
+        }
 
 
 class Hub:
@@ -180,12 +160,12 @@ class Hub:
         self._watched = {}
         planned = plant.metadata()["planned"] if planned is None else planned
         for line in plant.lines:
-            cycle_ns = round(planned[line.name]["cycle_ms"] * 1e6)
+            cycle_s = planned[line.name]["cycle_ms"] / 1e3
             for polled in line.drives:
                 known = before.get(polled.drive.name)
                 stays = known is not None and known.polled == polled
                 self._watched[polled.drive.name] = (
-                    known if known is not None and stays else _Watched(polled, cycle_ns, since_ns)
+                    known if known is not None and stays else _Watched(polled, cycle_s, since_ns)
                 )
 
     def take(self, batch: Batch) -> None:
@@ -215,8 +195,6 @@ class Hub:
                 continue
             row = (time, monotonic_ns, value, status)
             if status == 0:
-                if cell.good is not None and cell.newest is cell.good:
-                    cell.intervals_ns = cell.intervals_ns[1], monotonic_ns - cell.good[1]
                 cell.good = row
             cell.newest = row
             if time > self.time:
@@ -225,7 +203,7 @@ class Hub:
 
     def _cell(self, drive: str, register: str) -> RegisterRows | None:
         watched = self._watched.get(drive)
-        return watched.cell(register) if watched else None
+        return watched.cells.get(register) if watched else None
 
     def now_ns(self) -> int:
         """Return the present time by the clock of rows, CLOCK_MONOTONIC."""
@@ -253,23 +231,17 @@ class Hub:
 
     def newest(self, drive: str, register: str) -> Newest | None:
         """Return the newest row, which may be a miss; None before the first request."""
-        watched = self._watched.get(drive)
-        cell = watched.cells.get(register) if watched else None
+        cell = self._cell(drive, register)
         if cell is None or cell.newest is None:
             return None
         time, monotonic_ns, value, status = cell.newest
         good = None if status else value
         return Newest(time, monotonic_ns, good, self._statuses[status], cell.holds_ns)
 
-    def polled(self, drive: str) -> tuple[Register[Any], ...]:
-        """Return a drive's polled registers in the plant file's order."""
-        watched = self._watched.get(drive)
-        return tuple(poll.register for poll in watched.polled.polls) if watched else ()
-
     def holds_s(self, drive: str, register: str) -> float | None:
         """Return how long a value stays current, in s; None for a register that is not polled."""
-        watched = self._watched[drive]
-        return watched.cell(register).holds_ns / 1e9 if register in watched.names else None
+        cell = self._cell(drive, register)
+        return cell.holds_ns / 1e9 if cell else None
 
     @property
     def drives(self) -> Iterator[str]:
@@ -278,33 +250,19 @@ class Hub:
 
     def known(self, drive: str) -> Iterator[Known]:
         """Yield each polled register of a drive with its rows (see `Known`), in the plant file's order."""
-        watched = self._watched.get(drive)
-        if watched is None:
-            return
         now_ns, woke_ns = self._times()
-        cells = watched.cells
-        for name in watched.names:
-            cell = cells.get(name)
-            if cell is None:
-                yield name, None, None, False
-            else:
-                yield name, cell.newest, cell.good, cell.is_fresh(now_ns, woke_ns)
+        for cell in self._watched[drive].cells.values():
+            yield cell.register, cell.newest, cell.good, cell.is_current(now_ns, woke_ns)
 
     def status(self, code: int) -> str:
         """Return the text of a row's status code."""
         return self._statuses[code]
 
-    def answered_ns(self, drive: str) -> int | None:
-        """Return when a drive's newest value was requested (monotonic, ns); None if it never answered."""
+    def last_answer(self, drive: str) -> KeptRow | None:
+        """Return a drive's newest value of any register; None if it never answered."""
         watched = self._watched.get(drive)
-        cells = watched.cells.values() if watched else ()
-        return max([cell.good[1] for cell in cells if cell.good], default=None)
-
-    def seen_at(self, drive: str) -> int | None:
-        """Return when a drive's newest value was requested (UTC, ns); None if it never answered."""
-        watched = self._watched.get(drive)
-        cells = watched.cells.values() if watched else ()
-        return max([cell.good[0] for cell in cells if cell.good], default=None)
+        good = [cell.good for cell in watched.cells.values() if cell.good] if watched else []
+        return max(good, default=None, key=itemgetter(1))
 
     # ---- states ----
 
@@ -332,7 +290,7 @@ class Hub:
     def _look(self, watched: _Watched) -> Shown:
         fresh = FreshValues(watched.cells, *self._times())
         shown = self._shown(watched, fresh)
-        if FAULT_REGISTER not in watched.names:
+        if FAULT_REGISTER not in watched.cells:
             _look_for_trip(watched)
         if watched.trip is None or shown.state == SILENT:
             return shown
@@ -356,16 +314,13 @@ class Hub:
         if is_turning:
             return Shown(RUNS, None)
         note = found.note if found is not None else _lack(watched)
-        return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.names) else None, note)
+        return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.cells) else None, note)
 
     def _unseen(self, watched: _Watched) -> Shown:
         """Return the state of a drive without fresh values: silent, refusing, or not asked recently."""
-        polls = watched.polled.polls
-        newest = [
-            cell.newest for poll in polls if (cell := watched.cells.get(poll.register.name)) and cell.newest
-        ]
+        newest = [cell.newest for cell in watched.cells.values() if cell.newest]
         misses = [row for row in newest if row[3] != 0]
-        if not misses or len(misses) < len(polls):
+        if not misses or len(misses) < len(watched.cells):
             return Shown(UNKNOWN, NOT_ASKED)
         reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
         if any(reason.startswith(_ANSWERED) for reason in reasons):
@@ -381,12 +336,12 @@ def _lack(watched: _Watched) -> str:
         return "its family has no register for its state"
     if not reader.lacks:
         return "at rest its state takes two readings one after the other, which polled values are not"
-    return f"{reader.lacks} is {'not known' if reader.lacks in watched.names else 'not polled'}"
+    return f"{reader.lacks} is {'not known' if reader.lacks in watched.cells else 'not polled'}"
 
 
 def _look_for_trip(watched: _Watched) -> None:
     """Note a fault that a change of the fault record shows. The first record read may be of an old fault."""
-    name = next((name for name in FAULT_RECORDS if name in watched.names), "")
+    name = next((name for name in FAULT_RECORDS if name in watched.cells), "")
     cell = watched.cells.get(name)
     if cell is None or cell.good is None:
         return

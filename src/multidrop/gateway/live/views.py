@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from multidrop import Drive
 from multidrop.control import Ledger
-from multidrop.exposition import MetricFamily
 from multidrop.gateway.commands import drives_of
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.recent_statistics import asked_of, misses_of
-from multidrop.gateway.metrics import Figures
 from multidrop.plant import drive_meant
-from multidrop.supervisor import Hung, supervisor
+from multidrop.supervisor import supervisor
 from multidrop.transport import Statistics
 
 if TYPE_CHECKING:
@@ -31,7 +28,6 @@ async def drive_view(gateway: Gateway, name: str) -> dict[str, Any]:
     bus = gateway.poller.buses.get(line.name) if gateway.poller else None
     port = bus.line.identity if bus else line.port
     wear = await _wear_within(gateway.ledger, port, drive)
-    found = gateway.side_reads.look(gateway.plant, name)
     statistics = gateway.recent.drive(line.name, name)
     return {
         "drive": name,
@@ -39,7 +35,7 @@ async def drive_view(gateway: Gateway, name: str) -> dict[str, Any]:
         "misses": misses_of(statistics) if statistics else {},
         "asked": asked_of(statistics) if statistics else 0,
         "timeout_ms": round(statistics.timeout * 1e3, 1) if statistics else None,
-        "values": found,
+        "values": gateway.side_reads.look(gateway.plant, name),
         "ledger": wear,
     }
 
@@ -64,25 +60,21 @@ def _usual_delays(statistics: Statistics) -> dict[str, float | None]:
 
 
 async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
-    """Return a drive's EEPROM wear; an empty list if the ledger's file is locked or its disk hangs."""
-    with contextlib.suppress(Hung):
-        return await supervisor().within("ledger", LEDGER_S, partial(_wear, ledger, port, drive))
-    return []
+    """Return this year's writes to each cell of a drive's EEPROM, and the yearly budget.
 
+    The list is empty if the ledger's file is locked or its disk hangs.
+    """
 
-def _wear(ledger: Ledger, port: str, drive: Drive) -> list[dict[str, Any]]:
-    """Return this year's writes to each cell of a drive's EEPROM, and the yearly budget."""
-    with contextlib.suppress(OSError):
+    def wear() -> list[dict[str, Any]]:
         book = ledger.at(port)
+        found = book.wear_of(port, drive.address, drive.ledger_name, time.time())
         return [
-            {
-                "register": wear.cell.register,
-                "year": wear.this_year,
-                "budget": book.budget,
-                "total": wear.writes,
-            }
-            for wear in book.wear_of(port, drive.address, drive.ledger_name, time.time())
+            {"register": one.cell.register, "year": one.this_year, "budget": book.budget, "total": one.writes}
+            for one in found
         ]
+
+    with contextlib.suppress(OSError):  # Hung is one
+        return await supervisor().within("ledger", LEDGER_S, wear)
     return []
 
 
@@ -176,19 +168,6 @@ def _health_of_part(feed: object) -> str:
         return str(getattr(feed, "health", str)()) or "ok"
     except Exception as failure:  # the exception is a problem of the part, too
         return f"{type(failure).__name__}: {failure}"
-
-
-def figures_of(gateway: Gateway) -> Figures:
-    """Return the gateway's own metrics."""
-    parts: list[MetricFamily] = []
-    for feed in gateway.feeds.values():
-        said = getattr(feed, "figures", None)
-        if said is not None:
-            with contextlib.suppress(Exception):  # a failing part hides only its own figures
-                parts += said()
-    dropped = gateway.poller.dropped if gateway.poller else 0
-    failures = {name: gateway.failures.get(name, 0) for name in ("hub", *gateway.feeds)} | gateway.failures
-    return Figures(gateway.version, gateway.frames.viewers, gateway.frames.made, dropped, failures, parts)
 
 
 def _drive_figures(statistics: Statistics | None) -> dict[str, Any] | None:

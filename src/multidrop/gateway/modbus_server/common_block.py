@@ -6,10 +6,11 @@ Numbers of two words have the high word first. A value that is not fresh reads a
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 from multidrop import PolledDrive, Register
-from multidrop.gateway.modbus_server.words import NewestRow, is_fresh
+from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.modbus_server.words import is_fresh
 
 COMMON_LENGTH = 16  # words of the block
 STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # offsets in words
@@ -20,15 +21,6 @@ NO_NUMBER = -(1 << 31)  # 8000 0000H: unknown, or out of range
 NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ms
 
 _PER_UNIT = 100
-
-
-class CommonSource(Protocol):
-    """The methods of the hub that the block uses."""
-
-    def newest(self, drive: str, register: str) -> NewestRow | None: ...
-    def answered_ns(self, drive: str) -> int | None: ...
-    def woke_ns(self) -> int: ...
-    def state(self, drive: str) -> str: ...
 
 
 class CommonBlock:
@@ -43,7 +35,7 @@ class CommonBlock:
             (SETPOINT, polled.drive.setpoint_name, None),
         )
 
-    def words(self, hub: CommonSource, now_ns: int) -> list[int]:
+    def words(self, hub: Hub, now_ns: int) -> list[int]:
         """Return the words of the block at the monotonic time `now_ns`."""
         state, woke_ns = hub.state(self._name), hub.woke_ns()
         words = [0] * COMMON_LENGTH
@@ -55,14 +47,12 @@ class CommonBlock:
         words[AGE : AGE + 2] = _two_words(self._age(hub, now_ns, woke_ns))
         return words
 
-    def _fresh_value(
-        self, hub: CommonSource, now_ns: int, woke_ns: int, name: str, unit: str | None
-    ) -> float | None:
+    def _fresh_value(self, hub: Hub, now_ns: int, woke_ns: int, name: str, unit: str | None) -> float | None:
         """Return the fresh value of a polled register in this unit (None: its own); None without one."""
         row = hub.newest(self._name, name) if (name, unit) in self._polled else None
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
-    def _fault(self, hub: CommonSource, now_ns: int, woke_ns: int, state: str) -> int:
+    def _fault(self, hub: Hub, now_ns: int, woke_ns: int, state: str) -> int:
         """Return the number that the drive's family gives the present fault, or a constant from above."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
@@ -71,14 +61,14 @@ class CommonBlock:
             return FAULT_WITHOUT_NUMBER
         return int(value)
 
-    def _age(self, hub: CommonSource, now_ns: int, woke_ns: int) -> int:
+    def _age(self, hub: Hub, now_ns: int, woke_ns: int) -> int:
         """Return the time since the drive's newest value was requested, in ms."""
-        newest = hub.answered_ns(self._name)
-        if newest is None:
+        answer = hub.last_answer(self._name)
+        if answer is None:
             return NEVER
-        if newest < woke_ns:  # requested before a sleep of unknown length
+        if answer[1] < woke_ns:  # requested before a sleep of unknown length
             return LONGEST_AGE
-        return min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
+        return min(max(now_ns - answer[1], 0) // 1_000_000, LONGEST_AGE)
 
 
 def _units(register: Register[Any]) -> tuple[str | None, ...]:

@@ -9,19 +9,20 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Awaitable, Sequence
+from collections.abc import Awaitable
 from contextlib import suppress
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from multidrop import Batch, BusError, Plant, Register
-from multidrop.control import CommandResult
 from multidrop.drive import Carrier
 from multidrop.gateway.clock import monotonic_ns
+from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right
+from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.modbus_server.clients import SWEEP_S, Answer, ModbusClient, ModbusPort, RoundShare
-from multidrop.gateway.modbus_server.common_block import STOP, CommonSource
+from multidrop.gateway.modbus_server.common_block import STOP
 from multidrop.gateway.modbus_server.line_share import LineShare, PassingBusy
 from multidrop.gateway.modbus_server.protocol import (
     WRITES,
@@ -46,14 +47,6 @@ Settings = ModbusSettings
 _log = logging.getLogger("multidrop.gateway")
 
 
-class ModbusCommands(Protocol):
-    """The methods of Commands that the server uses."""
-
-    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]: ...
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult: ...
-    def ended_ns(self, drive: str) -> int: ...
-
-
 def build(settings: ModbusSettings, context: PartContext) -> ModbusServer:
     """Return the listening server. Raises OSError if a port cannot be opened."""
     server = ModbusServer(context.plant, context.hub, context.commands, settings, context.ask)
@@ -71,8 +64,8 @@ class ModbusServer:
     def __init__(
         self,
         plant: Plant,
-        hub: CommonSource,
-        commands: ModbusCommands,
+        hub: Hub,
+        commands: Commands,
         settings: ModbusSettings,
         ask: Ask,
     ) -> None:

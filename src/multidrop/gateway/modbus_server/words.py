@@ -14,11 +14,12 @@ import struct
 from collections.abc import Callable, Iterable
 from enum import Enum
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 from multidrop import PolledDrive, Register
 from multidrop.core import NumberFormat
 from multidrop.drive import Carrier, Table
+from multidrop.gateway.live.hub import Newest
 
 _FLOATS = {
     NumberFormat.F16: (">e", ">H"),
@@ -37,17 +38,6 @@ def reading_function(table: Table) -> int:
     return code if code in _FUNCTIONS.get(table.carrier, ()) else 0
 
 
-class NewestRow(Protocol):
-    """The newest row of a register from the hub."""
-
-    @property
-    def monotonic_ns(self) -> int: ...
-    @property
-    def value(self) -> float | None: ...
-    @property
-    def holds_ns(self) -> int: ...
-
-
 class Lack(Enum):
     """The reason why a range cannot be answered from polled rows."""
 
@@ -55,7 +45,7 @@ class Lack(Enum):
     STALE = "polled, but the newest row is a miss or old"
 
 
-def is_fresh(row: NewestRow | None, now_ns: int, since_ns: int = 0) -> bool:
+def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
     """Return True if a row has a current value that is not older than `since_ns`."""
     if row is None or row.value is None:
         return False
@@ -120,7 +110,7 @@ class _Place:
         self._value: float | None = None
         self._data: bytes | None = None
 
-    def word(self, row: NewestRow | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
+    def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
         """Return the word (of a coil: the bit) at this offset in the newest row, or why there is none.
 
         Misses, stale rows and rows older than `since_ns` have none.
@@ -155,7 +145,7 @@ class DriveWords:
         self,
         function: int,
         addresses: range,
-        newest: Callable[[str], NewestRow | None],
+        newest: Callable[[str], Newest | None],
         now_ns: int,
         since_ns: int = 0,
     ) -> list[int] | Lack:
@@ -184,7 +174,7 @@ class DriveWords:
         return words
 
 
-def _newest_word(found: list[tuple[NewestRow | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
+def _newest_word(found: list[tuple[Newest | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
     """Return the word from the newest of the rows of registers that share an address."""
     lack = Lack.STALE
     for row, place, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):

@@ -253,10 +253,10 @@ class JsonTopics:
         self._available.clear()
 
     def _state(self, drive: str) -> bytes:
-        seen_ns = self._hub.seen_at(drive)
+        answer = self._hub.last_answer(drive)
         shown = self._hub.seen(drive)
         said = {
-            "time": None if seen_ns is None else seen_ns // 1_000_000,
+            "time": None if answer is None else answer[0] // 1_000_000,
             "state": shown.state,
             "fault": shown.fault,
             "values": fresh_values(self._hub, drive),
@@ -280,7 +280,7 @@ class JsonTopics:
         }
         said = discovery(
             drive,
-            self._hub.polled(name),
+            [register for register, *_ in self._hub.known(name)],
             topics,
             prefix=self._settings.prefix,
             version=self._context.version,

@@ -136,8 +136,8 @@ def shown(register: Register[Any], value: float) -> float | str:
 def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
     """Return the values of a drive's polled registers; None for stale, infinite and missing ones."""
     return {
-        name: shown(register, good[2])
-        if is_fresh and good is not None and newest is good and isfinite(good[2])
+        register.name: shown(register, good[2])
+        if is_current and good is not None and newest is good and isfinite(good[2])
         else None
-        for register, (name, newest, good, is_fresh) in zip(hub.polled(drive), hub.known(drive), strict=True)
+        for register, newest, good, is_current in hub.known(drive)
     }
