@@ -43,7 +43,7 @@ SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the time limits for starting and closing parts."""
-    for module, name in ((parts, "START_S"), (parts, "BUILD_S"), (reload, "QUICK_S")):
+    for module, name in ((parts, "BUILD_S"), (reload, "QUICK_S")):
         monkeypatch.setattr(module, name, SHORT_S)
     monkeypatch.setattr(historian, "CLOSING_S", SHORT_S)
 
@@ -273,7 +273,7 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
         gateway.await_state("pump-1", "stands")
         monkeypatch.setattr(views, "LEDGER_S", SHORT_S)
         monkeypatch.setattr(web, "AUDIT_S", SHORT_S)
-        monkeypatch.setattr(views, "_wear", wait)
+        monkeypatch.setattr(gateway.gateway.ledger, "at", wait)
         monkeypatch.setattr(web, "newest_records", wait)
         assert gateway.get("/api/drive/pump-1").json["ledger"] == []
         assert gateway.get("/api/audit").status == 503

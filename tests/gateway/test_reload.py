@@ -100,7 +100,7 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
         )
         told = reload(gateway)
         assert told["done"] is False
-        assert told["text"] == "the plant goes on as before: the file has mistakes"
+        assert told["text"] == "the previous plant stays in use: the file has mistakes"
         lines = told["mistakes"]
         assert [mistake.partition(": ")[0] for mistake in lines] == [str(path)] * 3
         path.write_text(path.read_text() + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')

@@ -82,7 +82,7 @@ def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
         path.write_text(path.read_text().replace('"pump-2"', '"fan-2"'))
         told = reload(gateway, MODBUS.format(number, 22) + '[serve.history]\nfolder = "h"\n')
     assert told["done"] is False
-    assert told["text"] == "the plant goes on as before: the file has mistakes"
+    assert told["text"] == "the previous plant stays in use: the file has mistakes"
     (mistake,) = told["mistakes"]
     assert mistake.startswith(f"[serve.modbus]: listen: 127.0.0.1:{number} cannot be opened")
     assert parts(gateway) == {"modbus": "ok"}

@@ -125,7 +125,7 @@ class Gateway:
             if self.alarm_file is not None:
                 keeping = supervisor().thread("alarms", inf, self.alarm_file.run)
                 supervisor().watch("alarms", lambda: not keeping.done())
-            built = await self.parts.build(self.settings.parts)
+            await self.parts.build(self.settings.parts, self.plant)
             await self._find_audit()
             poller = self._made = Poller(nothing, ledger=self.ledger, audit=self.audit)
             self.poller = poller.__enter__()  # `_close` closes it in a thread, because that may take long
@@ -136,7 +136,7 @@ class Gateway:
                 return
             self.note_unopened(adopting.result())
             self.plant = poller.plant
-            self.parts.take_up(built)
+            self.parts.take_up()
             supervisor().keep("polling", self._take_all())
             supervisor().keep("statistics", self._tick())
             supervisor().keep("identities", self.identities.run())
@@ -293,10 +293,6 @@ class Gateway:
             _log.warning("alarm of %s: %s: %s", where, alarm.kind, alarm.text)
         if self.alarm_file is not None:
             self.alarm_file.note(alarm)
-
-    def forget(self, name: str) -> None:
-        """End the alarms of a drive or a line that was removed."""
-        self.alarms.forget(name, utc_ms())
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from multidrop import Batch, Plant
 from multidrop.extras import install_command
@@ -20,8 +20,10 @@ from multidrop.gateway.commands import Commands
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
 
-START_S = 2.0  # how long a start waits for parts whose files do not answer
-BUILD_S = 5.0  # how long a reload waits for such parts
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+
+BUILD_S = 3.0  # how long a start or a reload waits for parts whose files do not answer
 END_S = 3.0  # time limit for closing a part
 
 # Module of each part, imported when its table is used. It has `Settings`, a frozen dataclass of the table's
@@ -68,16 +70,6 @@ class Part(Protocol):
         """Finish; called after the last batch."""
 
 
-class PartHost(Protocol):
-    """The methods of the gateway that LiveParts uses."""
-
-    plant: Plant
-
-    def part_context(self, plant: Plant) -> PartContext: ...
-    def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None: ...
-    def count_failure(self, name: str) -> None: ...
-
-
 def build(name: str, settings: object, context: PartContext) -> Part:
     """Return the part of this table. If a library is missing, raises ValueError that names the extra."""
     try:
@@ -92,15 +84,7 @@ class Building(NamedTuple):
     """A part under construction in a thread: its files may be on a disk that does not answer."""
 
     settings: Any
-    plant: Plant
     part: asyncio.Future[Part]
-
-
-class Replacement(NamedTuple):
-    """Parts that were built but not started, and the settings of the parts that they replace."""
-
-    built: dict[str, Building]
-    before: Mapping[str, Any]
 
 
 class LiveParts:
@@ -109,22 +93,18 @@ class LiveParts:
     A part whose files do not answer does not delay the gateway: it stays in `pending` until it is built.
     """
 
-    def __init__(self, host: PartHost) -> None:
+    def __init__(self, host: Gateway) -> None:
         self.feeds: dict[str, Part] = {}
         self.dead: dict[str, str] = {}  # parts that could not start, and why
         self.pending: dict[str, Building] = {}
         self._host = host
         self._settings: dict[str, Any] = {}
         self._built: dict[str, Building] = {}  # parts that are not started yet
+        self._replaced: dict[str, Any] = {}  # settings of the parts that the reload in progress closed
 
-    async def build(self, wanted: Mapping[str, Any]) -> dict[str, Building]:
-        """Build the parts of a starting gateway. Raises ValueError if one cannot be opened."""
-        self._built = await self._build(wanted, self._host.plant, START_S)
-        return self._built
-
-    def take_up(self, built: Mapping[str, Building]) -> None:
-        """Start these parts; the plant they were built for is in effect now."""
-        self._built = {}
+    def take_up(self) -> None:
+        """Start the new parts: the plant they were built for is in effect now."""
+        built, self._built, self._replaced = self._built, {}, {}
         for name, building in built.items():
             self._settings[name] = building.settings
             self.dead.pop(name, None)
@@ -137,62 +117,60 @@ class LiveParts:
 
     async def close(self, seconds: float) -> None:
         """Close all parts together within `seconds`, after the last batch."""
-        await _discard(self._built)
+        await self._discard()
         await self._drop([*self._settings], seconds)
 
     # ---- reload ----
 
-    async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> Replacement:
+    async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> None:
         """Close the parts whose tables were changed or removed, and build the new parts.
 
         Raises ValueError if one cannot be opened; the previous parts run again then.
         """
-        before = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
-        await self._drop([*before], END_S)
+        self._replaced = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
+        await self._drop([*self._replaced], END_S)
         new = {name: settings for name, settings in wanted.items() if name not in self._settings}
         try:
-            return Replacement(await self._build(new, plant), before)
+            await self.build(new, plant)
         except Exception:
-            await self.take_back(Replacement({}, before))
+            await self.take_back()
             raise
 
-    async def take_back(self, replacement: Replacement) -> None:
+    async def take_back(self) -> None:
         """Discard the new parts and start the previous ones again."""
-        await _discard(replacement.built)
-        for name, settings in replacement.before.items():
+        replaced = self._replaced
+        await self._discard()
+        for name, settings in replaced.items():
             try:
-                self.take_up(await self._build({name: settings}, self._host.plant))
+                await self.build({name: settings}, self._host.plant)
+                self.take_up()
             except Exception as failure:  # such as a port that another program uses now
                 self.dead[name] = str(failure)
                 _log.error("%s did not start again: %s", name, failure)
 
-    # ---- one part ----
-
-    async def _build(
-        self, wanted: Mapping[str, Any], plant: Plant, seconds: float = BUILD_S
-    ) -> dict[str, Building]:
-        """Build parts concurrently, waiting up to `seconds`. Raises ValueError if one cannot be opened."""
+    async def build(self, wanted: Mapping[str, Any], plant: Plant) -> None:
+        """Build parts concurrently, waiting up to BUILD_S. Raises ValueError if one cannot be opened."""
         context, threads = self._host.part_context(plant), supervisor()
-        built = {
-            name: Building(
-                settings, plant, threads.thread(name, BUILD_S, partial(build, name, settings, context))
-            )
+        self._built = {
+            name: Building(settings, threads.thread(name, BUILD_S, partial(build, name, settings, context)))
             for name, settings in wanted.items()
         }
-        try:
-            if built:
-                await asyncio.wait([one.part for one in built.values()], timeout=seconds)
-        except asyncio.CancelledError:
-            await _discard(built)
-            raise
-        for name, building in built.items():
+        if self._built:
+            await asyncio.wait([one.part for one in self._built.values()], timeout=BUILD_S)
+        for name, building in self._built.items():
             failure = building.part.exception() if building.part.done() else None
             if failure is not None:
-                await _discard(built)
+                await self._discard()
                 if isinstance(failure, (ValueError, OSError)):
                     raise ValueError(f"[serve.{name}]: {failure}") from failure
                 raise failure
-        return built
+
+    async def _discard(self) -> None:
+        """Close parts that were not started, each when it is built; wait only for those built already."""
+        built, self._built = self._built, {}
+        await _close_when_built(built)
+
+    # ---- one part ----
 
     async def _start_when_built(self, name: str, building: Building) -> None:
         """Start a part when its files have answered, unless it was dropped before."""
@@ -203,7 +181,7 @@ class LiveParts:
         failure = building.part.exception()
         if failure is None:
             part: Any = building.part.result()
-            if building.plant is not self._host.plant and hasattr(part, "adopt"):
+            if hasattr(part, "adopt"):  # the plant may have been reloaded since
                 self._host.guarded(name, part.adopt, self._host.plant)
             self._start(name, part)
             return
@@ -226,23 +204,24 @@ class LiveParts:
         for name in names:
             del self._settings[name]
             self.dead.pop(name, None)
-        await _discard({name: self.pending.pop(name) for name in names if name in self.pending})
+        await _close_when_built({name: self.pending.pop(name) for name in names if name in self.pending})
         parts = {name: self.feeds.pop(name) for name in names if name in self.feeds}
         await supervisor().release(*names)
         await asyncio.gather(*(_close(name, part, seconds) for name, part in parts.items()))
 
 
-async def _discard(built: Mapping[str, Building]) -> None:
-    """Close parts that were not started, each when it is built; wait only for those built already."""
-    closing = [supervisor().start(f"{name} closing", _close_built(name, one)) for name, one in built.items()]
-    ready = [task for task, one in zip(closing, built.values(), strict=True) if one.part.done()]
-    await asyncio.gather(*ready)
+async def _close_when_built(built: Mapping[str, Building]) -> None:
+    """Close each of these parts when it is built; wait only for those built already."""
 
+    async def close(name: str, part: asyncio.Future[Part]) -> None:
+        await asyncio.wait([part])
+        if part.exception() is None:
+            await _close(name, part.result(), END_S)
 
-async def _close_built(name: str, building: Building) -> None:
-    await asyncio.wait([building.part])
-    if building.part.exception() is None:
-        await _close(name, building.part.result(), END_S)
+    closing = {
+        name: supervisor().start(f"{name} closing", close(name, one.part)) for name, one in built.items()
+    }
+    await asyncio.gather(*(closing[name] for name, one in built.items() if one.part.done()))
 
 
 async def _close(name: str, part: Part, seconds: float) -> None:

@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Batch, Plant, PlantError, Poller
+from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.parts import PARTS
 from multidrop.gateway.settings import AUDIT_S, check_writable
 from multidrop.supervisor import Hung, supervisor
@@ -122,18 +123,18 @@ class Reload:
         plant, settings, planned = await self._read_within(self._read)
         if gateway.audit:  # the adoption opens this log
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
-        replaced = await gateway.parts.replace(settings.parts, plant)
+        await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)
         self._changed = _changed_drives(gateway.plant, plant)
         self.coming = plant
         try:
             unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
-            gateway.parts.take_up(replaced.built)
+            gateway.parts.take_up()
         except Exception:
             if poller.plant.lines != gateway.plant.lines:  # some lines were adopted: use these
                 self._take_up(poller, gateway.settings, None)
-            await gateway.parts.take_back(replaced)
+            await gateway.parts.take_back()
             raise
         finally:
             self.coming = None
@@ -152,7 +153,7 @@ class Reload:
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
         lines = {line.name for line in gateway.plant.lines} - {line.name for line in plant.lines}
         for name in {*gateway.hub.drives} - there | lines:
-            gateway.forget(name)
+            gateway.alarms.forget(name, utc_ms())
         gateway.plant = plant
         gateway.revision += 1
         gateway.seen_frames.note_reload()
@@ -200,9 +201,9 @@ class Reload:
             _log.exception("a reload failed")
         mistakes = failure.mistakes if isinstance(failure, PlantError) else (_sentence(failure),)
         for mistake in mistakes:
-            _log.error("the plant goes on as before: %s", mistake)
+            _log.error("the previous plant stays in use: %s", mistake)
         self.mistakes = tuple(mistakes)
-        return Reloaded(False, "the plant goes on as before: the file has mistakes", self.mistakes)
+        return Reloaded(False, "the previous plant stays in use: the file has mistakes", self.mistakes)
 
 
 def _changed_drives(before: Plant, coming: Plant) -> frozenset[str]:

@@ -133,8 +133,8 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
         place.wrong('look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
-    is_safe = behind_proxy or (tokens and tls)
-    if not is_loopback(host) and not is_safe and "listen" in given and not _has_begun(given):
+    is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()  # each is checked elsewhere
+    if not is_loopback(host) and not is_safe and "listen" in given:
         place.wrong(
             f'listen = "{given["listen"]}" is open to other machines: that needs tokens, certificate and '
             "key, or behind_proxy = true; or listen on 127.0.0.1"
@@ -153,11 +153,6 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     return ServeSettings(
         host, port, names, tls, digest, behind_proxy, tuple(tokens), may, audit, alarms, folders.state, parts
     )
-
-
-def _has_begun(given: Mapping[str, Any]) -> bool:
-    """Return True if all keys of a network listener are given; mistakes in them are reported elsewhere."""
-    return {"tokens", "certificate", "key"} <= given.keys()
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -180,21 +175,17 @@ def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SS
     paths = {key: folders.find(given[key]) for key in ("certificate", "key") if key in given}
     if len(paths) == 1:
         place.wrong(f"{next(iter(paths))} alone is not enough: give certificate and key")
-    for key, path in paths.items():
-        place.attempt(_check_readable, f"{key} {path}", path)
-    if len(paths) < 2 or not all(map(_can_be_read, paths.values())):
+    found = [place.attempt(_check_readable, f"{key} {path}", path) for key, path in paths.items()]
+    if found != [True, True]:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
         context.load_cert_chain(paths["certificate"], paths["key"], password="")
     except (ssl.SSLError, ValueError) as failure:
-        mismatch = getattr(failure, "reason", "") == "KEY_VALUES_MISMATCH"
-        why = (
-            "do not belong together"
-            if mismatch
-            else "must be a certificate and a key in PEM, without password"
-        )
+        is_mismatch = getattr(failure, "reason", "") == "KEY_VALUES_MISMATCH"
+        wrong = "must be a certificate and a key in PEM, without password"
+        why = "do not belong together" if is_mismatch else wrong
         place.wrong(f"certificate {paths['certificate']} and key {paths['key']} {why}")
         return None
     return context
@@ -268,14 +259,6 @@ def _key_of(name: str, default: object) -> Key:
 
 
 # ---- files ----
-
-
-def _can_be_read(path: Path) -> bool:
-    try:
-        with path.open("rb"):
-            return True
-    except OSError:
-        return False
 
 
 def _check_readable(what: str, path: Path) -> bool:

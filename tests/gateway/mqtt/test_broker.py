@@ -147,9 +147,6 @@ class Silent:
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None: ...
 
-    def pass_over(self) -> int:
-        return 0
-
 
 class Loop:
     """An event loop that runs its scheduled calls when the test says so."""

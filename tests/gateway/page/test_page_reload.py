@@ -32,7 +32,7 @@ def told(page: Any, title: str) -> None:
 
 def test_reload_by_keyboard_lists_all_mistakes(opened: Opener, gateway: FakeGateway) -> None:
     mistakes = [f"plant.toml: [[line]] {n}: port is missing" for n in range(30)]
-    text = "the plant goes on as before: the file has mistakes"
+    text = "the previous plant stays in use: the file has mistakes"
     gateway.reloaded = {"done": False, "text": text, "mistakes": mistakes, "restart": []}
     page = opened()
     page.locator("#more").focus()

@@ -30,7 +30,7 @@ from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 for module, name in (  # longer timeouts for a busy machine, whose disks do not hang
-    *((parts, "START_S"), (parts, "BUILD_S"), (reload, "READ_S")),
+    *((parts, "BUILD_S"), (reload, "READ_S")),
     *((settings_module, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
 ):
     setattr(module, name, PATIENCE)

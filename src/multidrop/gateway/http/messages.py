@@ -106,3 +106,9 @@ def number_in(text: str, key: str) -> int:
         return plain_whole(text)
     except ValueError:
         raise Denied(400, f"{key} = {text[:40]!r} is not a whole number") from None
+
+
+def span_in(query: Mapping[str, str]) -> tuple[int, int]:
+    """Return the times `from` and `to` of a query, UTC in ms."""
+    begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
+    return begin, end

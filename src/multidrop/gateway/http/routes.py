@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import parse_qs
 
 from starlette.applications import Starlette
@@ -32,6 +32,7 @@ from multidrop.gateway.http.messages import (
     drives_to_stop,
     frame_in,
     number_in,
+    span_in,
     text_in,
 )
 from multidrop.gateway.http.page_files import PageFiles
@@ -70,6 +71,7 @@ NEEDED: Mapping[str, Needed] = {
     "/api/forget": Needed("POST", None),
 }
 
+R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 _PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
 _GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
@@ -144,20 +146,29 @@ def _answer(result: CommandResult) -> Response:
     )
 
 
-async def _answer_one(work: Coroutine[Any, Any, CommandResult]) -> Response:
-    return _answer(await work)
+def _answer_all(results: Mapping[str, CommandResult]) -> Response:
+    return JsonResponse({name: _fields(one) for name, one in results.items()})
 
 
-async def _answer_all(work: Coroutine[Any, Any, Mapping[str, CommandResult]]) -> Response:
-    return JsonResponse({name: _fields(one) for name, one in (await work).items()})
+def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
+    return JsonResponse({name: {"done": done, "text": text} for name, (done, text) in results.items()})
 
 
-async def _answer_fleet(work: Coroutine[Any, Any, Mapping[str, tuple[bool, str]]]) -> Response:
-    return JsonResponse({name: {"done": done, "text": text} for name, (done, text) in (await work).items()})
+async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Response]) -> Response:
+    """Return the answer to a stop, which continues even if its client disconnects.
 
+    If the stop takes longer than HEAD_S, the answer starts before its end. A client that gets no head knows
+    that its stop was not accepted.
+    """
+    task = supervisor().start("stop", work)
+    await asyncio.wait({task}, timeout=HEAD_S)
+    if task.done():
+        return respond(task.result())
 
-async def _body_of(task: asyncio.Task[Response]) -> AsyncIterator[bytes]:
-    yield bytes((await asyncio.shield(task)).body)
+    async def body() -> AsyncIterator[bytes]:
+        yield bytes(respond(await asyncio.shield(task)).body)
+
+    return StreamingResponse(body(), media_type="application/json", headers=UNBUFFERED)
 
 
 class _Pages:
@@ -202,11 +213,9 @@ class _Pages:
         return JsonResponse(await supervisor().within("audit queries", AUDIT_S, work, most=MOST_QUERIES))
 
     async def alarms(self, request: Request) -> Response:
-        query = request.query_params
-        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
-        events = self._gateway.alarms
-        found = [alarm.as_json() for alarm in events.between(begin, end)]
-        return JsonResponse({"alarms": found, "since": events.since})
+        alarms = self._gateway.alarms
+        found = [alarm.as_json() for alarm in alarms.between(*span_in(request.query_params))]
+        return JsonResponse({"alarms": found, "since": alarms.since})
 
     async def acknowledge(self, request: Request) -> Response:
         """Acknowledge an alarm, with the caller's note."""
@@ -227,18 +236,16 @@ class _Pages:
         part = self._history()
         query = request.query_params
         points = number_in(query.get("points", "800"), "points")
-        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         try:
-            found = await part.series(query.getlist("series"), begin, end, points)
+            found = await part.series(query.getlist("series"), *span_in(query), points)
         except ValueError as mistake:
             return _error(400, str(mistake))
         return Response(found, media_type="application/json")
 
     async def export(self, request: Request) -> Response:
         part, query = self._history(), request.query_params
-        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         kind = query.get("format", "csv")
-        return await self._exports.respond(part, query.getlist("series"), begin, end, kind)
+        return await self._exports.respond(part, query.getlist("series"), *span_in(query), kind)
 
     def _history(self) -> Any:
         part = self._gateway.feeds.get("history")
@@ -250,8 +257,7 @@ class _Pages:
 
     async def stop(self, request: Request) -> Response:
         drives = await drives_to_stop(request)
-        stopping = self._gateway.commands.stop(drives, caller_of(request))
-        return await self._answer_stop(_answer_all(stopping))
+        return await _answer_stop(self._gateway.commands.stop(drives, caller_of(request)), _answer_all)
 
     async def stop_fleet(self, request: Request) -> Response:
         """Stop all drives of the fleet, with the commander's key of `[serve.fleet]`."""
@@ -260,19 +266,7 @@ class _Pages:
             raise Denied(404, "this gateway cannot stop the fleet; add commander to [serve.fleet]")
         caller = caller_of(request)
         _log.warning("stop of the whole fleet, asked for by %s", caller.by)
-        return await self._answer_stop(_answer_fleet(part.stop(caller.by)))
-
-    async def _answer_stop(self, work: Coroutine[Any, Any, Response]) -> Response:
-        """Return the answer to a stop, which continues even if its client disconnects.
-
-        If the stop takes longer than HEAD_S, the answer starts before its end. A client that gets no head
-        knows that its stop was not accepted.
-        """
-        task = supervisor().start("stop", work)
-        await asyncio.wait({task}, timeout=HEAD_S)
-        if task.done():
-            return task.result()
-        return StreamingResponse(_body_of(task), media_type="application/json", headers=UNBUFFERED)
+        return await _answer_stop(part.stop(caller.by), _answer_fleet)
 
     async def write(self, request: Request) -> Response:
         body = await body_of(request)
@@ -294,8 +288,8 @@ class _Pages:
             raise Denied(400, "options is not a JSON object")
         caller = caller_of(request)
         admit = self._admission(drive, (verb, repr(options), caller), body)
-        acting = _answer_one(self._gateway.commands.act(drive, verb, options, caller, admit))
-        return await (self._answer_stop(acting) if verb in STOPPING else acting)
+        acting = self._gateway.commands.act(drive, verb, options, caller, admit)
+        return await _answer_stop(acting, _answer) if verb in STOPPING else _answer(await acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
         """Return a function that checks a command against the frame its sender saw. Stops are not checked."""

@@ -17,8 +17,6 @@ from multidrop.supervisor import Hung, supervisor
 
 MOST_UNDER_WAY = 64  # unacknowledged messages: enough for the drives of two lines
 MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant has so many
-
-_log = logging.getLogger("multidrop.gateway.mqtt.part")
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # first and longest pause before reconnecting
 KEEP_ALIVE_S = 15
@@ -146,9 +144,6 @@ class Speaker(Protocol):
     def publish(self) -> None:
         """Send new values."""
 
-    def pass_over(self) -> int:
-        """Return how many messages `publish` would send now."""
-
     def leave(self) -> None:
         """Send the last messages before a disconnect."""
 
@@ -206,23 +201,20 @@ class Broker:
         self._client = None  # frees the sockets by which paho wakes its thread
 
     def publish(self) -> None:
-        """Let the speaker publish, or count its messages while there is no connection.
+        """Let the speaker publish; without a connection, its messages wait, and newer ones replace them.
 
         Raises RuntimeError if paho's thread has ended.
         """
         if self._thread is not None and not self._thread.is_alive():
             raise RuntimeError("the thread of its connection has ended")
         had_failed = self.failure
-        self._let(self._speaker.publish if self.is_connected else self._pass_over)
+        self._let(self._speaker.publish)
         if had_failed and not self.failure and self.is_connected:
             self.publish_all()
 
     def publish_all(self) -> None:
         """Let the speaker publish everything, as on a new connection."""
         self._let(self._speaker.connected)
-
-    def _pass_over(self) -> None:
-        self.outbox.dropped += self._speaker.pass_over()
 
     def _let(self, say: Callable[[], None]) -> None:
         """Let the speaker publish. If that fails, mark it as offline, but keep receiving commands.
@@ -266,6 +258,7 @@ class Broker:
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
         self.failure = ""  # forget the failure of the previous connection
+        self.outbox.forget()  # the first message of a connection must be the speaker's birth
         self.publish_all()
 
     def _acknowledge(self) -> None:

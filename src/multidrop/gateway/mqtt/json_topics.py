@@ -238,10 +238,6 @@ class JsonTopics:
                 self._available[drive] = available
                 self.outbox.put(self._kept(self._topic(drive, "available"), available))
 
-    def pass_over(self) -> int:
-        """Return how many messages `publish` would send."""
-        return len(list(self._hub.drives))
-
     def leave(self) -> None:
         """Publish the gateway and each drive as offline.
 

@@ -84,7 +84,7 @@ class Mqtt:
             ),
             counter(
                 "multidrop_mqtt_dropped",
-                "Messages replaced by newer ones before they were sent, made while there was no connection, "
+                "Messages replaced by newer ones before they were sent, as while there is no connection, "
                 "or not acknowledged when it broke.",
                 sum(outbox.dropped for outbox in outboxes),
             ),

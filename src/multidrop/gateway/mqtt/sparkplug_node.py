@@ -116,13 +116,6 @@ class SparkplugNode:
                 self._changed.setdefault(drive, {}).update(changed)
                 self._put(drive, "DDATA", self._data)
 
-    def pass_over(self) -> int:
-        """Return how many drives have changed values since the last call, without publishing them."""
-        values = {drive: self._values(drive) for drive in self._hub.drives}
-        changed = [drive for drive, found in values.items() if self._said.get(drive) != found]
-        self._said = values
-        return len(changed)
-
     def leave(self) -> None:
         """Send the node's death, because a regular disconnect does not send the will."""
         self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))

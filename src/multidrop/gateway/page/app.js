@@ -143,7 +143,7 @@ addEventListener("theme", redraw);
 addEventListener("timezone", redraw);
 addEventListener(
   "stranger",
-  () => find("#ask").open || askToken("This gateway wants a token to look, too."),
+  () => find("#ask").open || askToken("This gateway shows its values only with a token."),
 );
 addEventListener("written", () => drive.refresh());
 for (const changed of ["signed", "reloaded"])

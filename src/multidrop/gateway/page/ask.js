@@ -188,7 +188,8 @@ export async function send(path, body, { kind = DANGER, patience = patienceOf(ki
     return await sent();
   } catch (error) {
     if (error.status !== 401 && error.status !== 403) throw error;
-    const why = `${error.message} A token with this right is needed.`;
+    const reason = error.message.replace(/\.$/, "");
+    const why = `The gateway refused this: ${reason}. Enter a token with that right.`;
     if (!(await askToken(why, "Sign in and send", kind))) throw error;
     return await sent();
   }

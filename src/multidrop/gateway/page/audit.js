@@ -57,7 +57,7 @@ export function auditRows(list, isWhole, most = Infinity) {
     `Time, ${clock.zoneName()}`,
     isWhole && "Drive",
     "Write",
-    "Became",
+    "Result",
     "By",
     isWhole && "Sent",
   ].filter(Boolean);
@@ -103,7 +103,7 @@ function row(entry, isWhole) {
   const { time, drive, address, model, write, sent, frames, outcome, held, why, by, way, times, since } =
     entry;
   const isDone = DONE.test(outcome ?? ""),
-    became = [
+    result = [
       outcome ?? "unknown",
       held !== undefined && held !== null && `the drive holds ${held}`,
       frames > 1 && `${frames} frames`,
@@ -122,7 +122,7 @@ function row(entry, isWhole) {
       make("bdi", {}, String(write ?? "–")),
       times > 1 ? repeated(times, since) : null,
     ),
-    make("td", { class: isDone ? "words" : "words bad" }, isDone ? null : glyph("fault"), ` ${became}`),
+    make("td", { class: isDone ? "words" : "words bad" }, isDone ? null : glyph("fault"), ` ${result}`),
     make("td", { class: "words" }, by ? named(by) : (way ?? "–")),
     isWhole ? make("td", { class: "frame" }, String(sent ?? "–")) : null,
   );

@@ -15,7 +15,7 @@ const TABLES = {
   gateways: [
     "Gateways",
     [
-      ...["Gateway", "Host", "State", "Lines", "Lease left", "Spool", "Behind", "Lag", "Rows lost"],
+      ...["Gateway", "Host", "State", "Lines", "Lease left", "Spool", "Unsent", "Lag", "Rows lost"],
       ...["Session", "Since"],
     ],
   ],

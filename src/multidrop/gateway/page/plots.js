@@ -5,7 +5,7 @@ import { colour, make } from "./dom.js";
 import { number } from "./values.js";
 
 export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
-export const DASHES = [[], [6, 4], [2, 3], [10, 3, 2, 3]]; // a series has a shape too, not its colour alone
+export const DASHES = [[], [6, 4], [2, 3], [10, 3, 2, 3]];
 const RIGHT = 28; // px: half the width of a time label at the end
 const FONT = "11px system-ui, DejaVu Sans, sans-serif";
 
@@ -75,12 +75,15 @@ export function heldAt({ data }, column, time, holdMs) {
   return i >= 0 && (time - times[i]) * 1000 <= holdMs ? values[i] : null;
 }
 
+// Return the dashes of the series of this index. Neighbours differ in dashes and colour; the first 24 are unique.
+const dashes = index => DASHES[(index + Math.floor(index / 12)) % DASHES.length];
+
 // Return a visible line. `index` gives colour and dashes.
 export const line = (index, label) => ({
   label,
   stroke: colour(COLOURS[index % COLOURS.length]),
   width: 1.5,
-  dash: DASHES[Math.floor(index / COLOURS.length) % DASHES.length],
+  dash: dashes(index),
   points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
 
@@ -89,7 +92,7 @@ export function swatch(index) {
   const mark = make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }),
     pen = mark.getContext("2d");
   [pen.strokeStyle, pen.lineWidth] = [colour(COLOURS[index % COLOURS.length]), 3];
-  pen.setLineDash(DASHES[Math.floor(index / COLOURS.length) % DASHES.length]);
+  pen.setLineDash(dashes(index));
   pen.beginPath();
   pen.moveTo(0, 3);
   pen.lineTo(28, 3);

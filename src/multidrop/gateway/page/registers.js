@@ -1,4 +1,5 @@
-// All registers of the selected drive: value, unit, place in the manual, and a button to write.
+// All registers of the selected drive, polled ones first and commands last: value, unit, place in the manual,
+// and a button to write.
 
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
@@ -12,7 +13,9 @@ let name = null,
 // Make the table for a drive.
 export function build(spec) {
   name = spec.name;
-  rows = spec.registers.map(register => ({
+  const rank = ({ period_s: period, access }) => (period ? 0 : access === "command" ? 2 : 1);
+  const sorted = [...spec.registers].sort((a, b) => rank(a) - rank(b));
+  rows = sorted.map(register => ({
     register,
     value: makeValue(),
     age: make("td", { class: "age" }),

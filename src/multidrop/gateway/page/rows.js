@@ -9,10 +9,13 @@ export const COLUMNS = 8;
 const MANY = 0.01; // a share of misses from which they are a warning
 const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // a full bar's length
 
-// Return a line's row and its parts.
-export function makeHead(line) {
+// Return a line's row and its parts. A click on its name calls `unfold`, unless that is null.
+export function makeHead(line, unfold) {
+  const name = named(line.name, { class: "linename" });
   const parts = {
     line,
+    fold: unfold && make("button", { type: "button", class: "fold", onclick: unfold }, name),
+    count: make("span"),
     used: make("i"),
     planned: make("u"),
     share: make("span"),
@@ -29,7 +32,8 @@ export function makeHead(line) {
       make(
         "div",
         { class: "linehead" },
-        named(line.name, { class: "linename" }),
+        parts.fold ?? name,
+        parts.fold && parts.count,
         make("span", { class: "wide port" }, [line.port, line.speed].filter(Boolean).join(" · ")),
         make("span", { class: "wire" }, "wire ", parts.bar, parts.share),
         parts.rate,
@@ -173,5 +177,6 @@ export function drawHead(h) {
           : "none missed",
   );
   const asked = rate === null ? 0 : rate * 60; // in the last minute
+  setClass(h.missed, "lost", Boolean(lost));
   setClass(h.missed, "warn", Boolean(lost) || (misses > 1 && misses >= MANY * asked));
 }

@@ -5,6 +5,7 @@ import { now } from "./link.js";
 import { drawHead, drawRow, fullBar, makeHead, makeRow } from "./rows.js";
 import { spark } from "./spark.js";
 import { isLive, key, onPlant, state, store } from "./store.js";
+import { count } from "./values.js";
 
 const HEADS = [
   ["Drive", "name"],
@@ -24,11 +25,14 @@ const SHOWN = {
 };
 
 const scale = make("span", { class: "full" });
+const MANY = 60; // a plant with more drives shows of each line only drives with a problem, until it is opened
 let rows = [],
   heads = [],
   show = "all",
   query = "",
   chosen = null;
+const opened = new Set(), // names of lines
+  none = make("p", { class: "note", id: "none", role: "status" });
 
 // Build the table for the plant, and its filter.
 export function begin() {
@@ -67,39 +71,41 @@ function build() {
     {},
     make("caption", { class: "hidden" }, "Drives by line"),
     tableHead(HEADS),
-    store.plant.lines.map(line =>
-      make(
-        "tbody",
-        {},
-        keepHead(makeHead(line)),
-        line.drives.map(drive => keepRow(makeRow(drive))),
-      ),
-    ),
+    store.plant.lines.map(body),
   );
   find("th.frequency", table).prepend(scale, " ");
-  fill(find("#table"), table);
+  fill(find("#table"), table, none);
   fit();
   choose(chosen);
   drawRows();
   drawFilter();
 }
 
-function keepHead(head) {
+function body(line) {
+  const isFoldable = store.plant.lines.length > 1 && store.drives.size > MANY;
+  const head = makeHead(line, isFoldable ? () => unfold(line.name) : null);
+  head.rows = line.drives.map(makeRow);
   heads.push(head);
-  return head.row;
+  rows.push(...head.rows);
+  return make(
+    "tbody",
+    {},
+    head.row,
+    head.rows.map(r => r.row),
+  );
 }
 
-function keepRow(row) {
-  rows.push(row);
-  return row.row;
+function unfold(line) {
+  if (!opened.delete(line)) opened.add(line);
+  drawFilter();
 }
 
 // Let the heads of lines span the columns that this width shows.
 export function fit() {
-  const count = [...document.querySelectorAll("#table thead th")].filter(
+  const columns = [...document.querySelectorAll("#table thead th")].filter(
     th => getComputedStyle(th).display !== "none",
   ).length;
-  for (const th of document.querySelectorAll("#table tr.head th")) th.colSpan = Math.max(1, count);
+  for (const th of document.querySelectorAll("#table tr.head th")) th.colSpan = Math.max(1, columns);
 }
 
 // Mark the chosen drive; Tab leads to it.
@@ -112,6 +118,7 @@ export function choose(name) {
     else r.link.removeAttribute("aria-current");
     setClass(r.row, "chosen", r.name === name);
   }
+  drawFilter();
 }
 
 // Return the link of the drive that lies so many rows below the one that has the focus, or null.
@@ -150,9 +157,22 @@ export function drawSparks() {
   }
 }
 
+const isProblem = r => store.frame !== null && SHOWN.bad[1](state(r.name));
+
 function drawFilter() {
-  for (const r of rows)
-    r.row.hidden = !(SHOWN[show][1](state(r.name)) && (r.text + " " + r.word.textContent).includes(query));
+  const isFiltered = show !== "all" || query !== "";
+  for (const h of heads) {
+    const isOpen = !h.fold || isFiltered || opened.has(h.line.name);
+    for (const r of h.rows) {
+      const isMatch = SHOWN[show][1](state(r.name)) && `${r.text} ${r.word.textContent}`.includes(query);
+      r.row.hidden = !isMatch || !(isOpen || isProblem(r) || r.name === chosen);
+    }
+    h.row.hidden = isFiltered && h.rows.every(r => r.row.hidden);
+    h.fold?.setAttribute("aria-expanded", isOpen);
+    const running = h.rows.filter(r => state(r.name) === "runs").length;
+    put(h.count, isOpen ? "" : `${count(h.rows.length, "drive")}, ${running} running`);
+  }
+  put(none, isFiltered && rows.every(r => r.row.hidden) ? "No drive matches the filter." : "");
   for (const button of find("#chips").children) {
     const is = SHOWN[button.dataset.show][1];
     button.setAttribute("aria-pressed", button.dataset.show === show);

@@ -4,7 +4,7 @@ import * as clock from "./clock.js";
 import { make, setClass } from "./dom.js";
 
 export const STATES = {
-  runs: "runs",
+  runs: "running",
   stands: "stopped",
   fault: "fault",
   silent: "silent",
