@@ -46,7 +46,7 @@ def test_a_killed_gateway_is_told(opened: Opener, gateway: FakeGateway) -> None:
     until_met(page, lambda: page.locator(FRESH).count() == 0)
     shown = cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
     assert re.search(r"^\d+\.\d+Hz\d+(\.\d)? s old$", shown)
-    assert cell(page, "pump-1", "state").inner_text().strip() == "last: runs"
+    assert cell(page, "pump-1", "state").inner_text().strip() == "last: running"
     assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 

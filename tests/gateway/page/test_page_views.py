@@ -45,6 +45,36 @@ def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener) -> Non
     until_met(page, lambda: shown.count() == 31)
 
 
+def test_the_filter_hides_lines_without_matches(opened: Opener) -> None:
+    page = opened()
+    page.get_by_label("Filter drives").fill("labeller")
+    until_met(page, lambda: page.locator("tr.head:visible").count() == 1)
+    page.get_by_label("Filter drives").fill("no such drive")
+    until_met(page, lambda: page.locator("#none").inner_text() == "No drive matches the filter.")
+    assert page.locator("#table tbody tr:visible").count() == 0
+
+
+def test_lines_of_a_large_plant_are_folded_except_for_problems(opened: Opener, gateway: FakeGateway) -> None:
+    lines = [line_of_one(n, 50) for n in range(2)]
+    for n, line in enumerate(lines):
+        line["drives"] = [line["drives"][0] | {"name": f"fan-{n}-{i}"} for i in range(40)]
+    one = {"state": "runs", "fault": None, "seen": 0, "ages_ms": [0], "values": {}}
+    silent = one | {"state": "silent", "why": "no reply"}
+    gateway.plant_changes = {"lines": lines}
+    names = [drive["name"] for line in lines for drive in line["drives"]]
+    gateway.changes = {"drives": dict.fromkeys(names, one) | {"fan-1-7": silent}}
+    page = opened()
+    shown = page.locator("tr.drive:visible td.name")
+    chosen = page.locator("tr.chosen td.name").all_inner_texts()
+    until_met(page, lambda: {*shown.all_inner_texts()} == {*chosen, "fan-1-7"})
+    head = page.locator(".linehead").first
+    assert "40 drives, 40 running" in head.inner_text()
+    head.get_by_role("button").click()
+    until_met(page, lambda: shown.count() == 41)
+    page.get_by_label("Filter drives").fill("fan-1-3")
+    until_met(page, lambda: shown.count() == 11)
+
+
 def test_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
     """A drive that may be set to 320 Hz has no shorter bar than another one at the same frequency."""
     gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}

@@ -75,7 +75,8 @@ export function heldAt({ data }, column, time, holdMs) {
   return i >= 0 && (time - times[i]) * 1000 <= holdMs ? values[i] : null;
 }
 
-// Return the dashes of the series of this index. Neighbours differ in dashes and colour; the first 24 are unique.
+// Return the dashes of the series of this index: neighbours differ in dashes and colour, and the first 24
+// series are unique.
 const dashes = index => DASHES[(index + Math.floor(index / 12)) % DASHES.length];
 
 // Return a visible line. `index` gives colour and dashes.
