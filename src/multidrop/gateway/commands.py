@@ -328,7 +328,7 @@ class StopEnd(Protocol):
     """The result of a stop."""
 
     @property
-    def is_done(self) -> bool: ...
+    def ok(self) -> bool: ...
 
 
 T = TypeVar("T", bound=StopEnd)
@@ -378,7 +378,7 @@ async def stop_meant(
         else:
             await asyncio.sleep(LOOK_S)
     results = {name: end for stopping in begun for name, end in stopping.result().items()}
-    failed = [name for name, end in results.items() if not end.is_done]
+    failed = [name for name, end in results.items() if not end.ok]
     if failed and plant.lines != before:
         results |= await stop(plant, failed)
     return results if drives is None else {one: results[meant.get(one, one)] for one in (*meant, *others)}

@@ -77,14 +77,14 @@ export function heldAt({ data }, column, time, holdMs) {
 
 // Return the dashes of the series of this index: neighbours differ in dashes and colour, and the first 24
 // series are unique.
-const dashes = index => DASHES[(index + Math.floor(index / 12)) % DASHES.length];
+export const dashes = index => DASHES[(index + Math.floor(index / 12)) % DASHES.length];
 
-// Return a visible line. `index` gives colour and dashes.
-export const line = (index, label) => ({
+// Return a visible line. `index` gives its colour.
+export const line = (index, label, dash = []) => ({
   label,
   stroke: colour(COLOURS[index % COLOURS.length]),
   width: 1.5,
-  dash: dashes(index),
+  dash,
   points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
 

@@ -5,7 +5,7 @@ import { colour, fill, make, named } from "./dom.js";
 import { label } from "./history.js";
 import * as markers from "./markers.js";
 import * as picker from "./picker.js";
-import { COLOURS, heldAt, join, line, makePlot, summary, swatch, wide } from "./plots.js";
+import { COLOURS, dashes, heldAt, join, line, makePlot, summary, swatch, wide } from "./plots.js";
 import { holdsFor, store } from "./store.js";
 import { number, words } from "./values.js";
 
@@ -36,7 +36,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
       index = picker.index(name),
       k = series.length + 1;
     const bare = { stroke: "transparent", points: { show: false } };
-    series.push(bare, bare, line(index, name));
+    series.push(bare, bare, line(index, name, dashes(index)));
     bands.push({
       series: [k, k + 1],
       fill: colour(COLOURS[index % COLOURS.length])
