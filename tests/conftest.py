@@ -109,11 +109,11 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run an `async def` test on an event loop of its own."""
+    """Run an `async def` test on an event loop of its own, by `run_test` of its module if that has one."""
     if not iscoroutinefunction(pyfuncitem.obj):
         return None
     arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
-    asyncio.run(pyfuncitem.obj(**arguments))
+    getattr(pyfuncitem.module, "run_test", asyncio.run)(pyfuncitem.obj(**arguments))
     return True
 
 

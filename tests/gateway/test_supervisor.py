@@ -189,36 +189,29 @@ def test_task_that_is_kept_again_is_alive() -> None:
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-def test_errors_of_work_are_raised_and_the_loop_continues(failure: BaseException) -> None:
+async def test_errors_of_work_are_raised_and_the_loop_continues(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 
-    async def live() -> None:
-        with pytest.raises(ValueError if isinstance(failure, ValueError) else RuntimeError, match="no"):
-            await supervisor().within("work", 60, work)
-
-    asyncio.run(live())
+    with pytest.raises(ValueError if isinstance(failure, ValueError) else RuntimeError, match="no"):
+        await supervisor().within("work", 60, work)
 
 
-def test_work_that_hangs_is_given_up_reported_and_forgotten() -> None:
+async def test_work_that_hangs_is_given_up_reported_and_forgotten() -> None:
     go_on = threading.Event()
-
-    async def live() -> None:
-        threads = supervisor()
-        with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
-            await threads.within("history", 0.01, go_on.wait)
-        assert await threads.within("other", 60, lambda: 3) == 3
-        assert list(threads.hung) == ["history"]
-        with pytest.raises(Hung, match="history: 1 others are not done"):
-            await threads.within("history", 0.01, go_on.wait, most=1)
-        assert threads.under_way == ["history"]
-        assert await threads.within("history", 60, lambda: 4) == 4  # the disk answers again
-        assert threads.hung == {}
-        go_on.set()
-        while threads.under_way:
-            await asyncio.sleep(0)
-
-    asyncio.run(live())
+    threads = supervisor()
+    with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
+        await threads.within("history", 0.01, go_on.wait)
+    assert await threads.within("other", 60, lambda: 3) == 3
+    assert list(threads.hung) == ["history"]
+    with pytest.raises(Hung, match="history: 1 others are not done"):
+        await threads.within("history", 0.01, go_on.wait, most=1)
+    assert threads.under_way == ["history"]
+    assert await threads.within("history", 60, lambda: 4) == 4  # the disk answers again
+    assert threads.hung == {}
+    go_on.set()
+    while threads.under_way:
+        await asyncio.sleep(0)
 
 
 def test_work_raises_an_error_without_free_threads(monkeypatch: pytest.MonkeyPatch) -> None:

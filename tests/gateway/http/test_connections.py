@@ -248,25 +248,22 @@ def test_client_that_reads_no_answers_is_closed(
     assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
 
 
-def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> None:
+async def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> None:
     order: list[str] = []
 
     async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:
         await turns.wait(waiting)
         order.append(name)
 
-    async def live() -> None:
-        turns = Turns()
-        reads = [asyncio.create_task(take(turns, f"read {n}", turns.others)) for n in range(4)]
-        await asyncio.sleep(0)
-        assert order == ["read 0"]
-        stop = asyncio.create_task(take(turns, "stop", turns.stops))
-        reads[1].cancel()
-        await asyncio.gather(stop, *reads, return_exceptions=True)
-        assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn when it came
-        await take(turns, "later", turns.others)  # nobody else waits
-
-    asyncio.run(live())
+    turns = Turns()
+    reads = [asyncio.create_task(take(turns, f"read {n}", turns.others)) for n in range(4)]
+    await asyncio.sleep(0)
+    assert order == ["read 0"]
+    stop = asyncio.create_task(take(turns, "stop", turns.stops))
+    reads[1].cancel()
+    await asyncio.gather(stop, *reads, return_exceptions=True)
+    assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn when it came
+    await take(turns, "later", turns.others)  # nobody else waits
     assert order[-1] == "later"
 
 

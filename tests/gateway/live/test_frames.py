@@ -41,26 +41,23 @@ def frames(clock: Clock, made: list[int]) -> Frames:
     return Frames(make, clock)
 
 
-def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: list[int]) -> None:
-    async def watch() -> None:
-        first = await frames.after(-1)
-        assert first is not None
-        viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
-        await asyncio.sleep(0)
-        assert frames.viewers == 100
-        clock.now += 0.25
-        frames.note_news()
-        found = await asyncio.gather(*viewers)
-        assert {id(one) for one in found} == {id(found[0])}
-        assert found[0] is not None
-        assert json.loads(gzip.decompress(found[0].gzipped)) == told(found[0]) == {"n": 2, "since": 1}
-        assert frames.viewers == 0
-
-    asyncio.run(watch())
+async def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: list[int]) -> None:
+    first = await frames.after(-1)
+    assert first is not None
+    viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
+    await asyncio.sleep(0)
+    assert frames.viewers == 100
+    clock.now += 0.25
+    frames.note_news()
+    found = await asyncio.gather(*viewers)
+    assert {id(one) for one in found} == {id(found[0])}
+    assert found[0] is not None
+    assert json.loads(gzip.decompress(found[0].gzipped)) == told(found[0]) == {"n": 2, "since": 1}
+    assert frames.viewers == 0
     assert made == [1, 2]
 
 
-def test_changes_are_computed_once_per_known_frame(
+async def test_changes_are_computed_once_per_known_frame(
     frames: Frames, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compared: list[int] = []
@@ -70,55 +67,44 @@ def test_changes_are_computed_once_per_known_frame(
         return changes(before, now)
 
     monkeypatch.setattr(module, "changes", compare)
-
-    async def watch() -> None:
-        first = await frames.after(WHOLE)
-        assert first is not None
-        viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(5)]
-        await asyncio.sleep(0)
-        clock.now += 0.25
-        frames.note_news()
-        assert [told(frame) for frame in await asyncio.gather(*viewers)] == [{"n": 2, "since": 1}] * 5
-
-    asyncio.run(watch())
+    first = await frames.after(WHOLE)
+    assert first is not None
+    viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(5)]
+    await asyncio.sleep(0)
+    clock.now += 0.25
+    frames.note_news()
+    assert [told(frame) for frame in await asyncio.gather(*viewers)] == [{"n": 2, "since": 1}] * 5
     assert compared == [1]
 
 
-def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
-    async def watch() -> None:
-        seen = -1
-        for _ in range(1000):  # 10 s of news every 10 ms
-            clock.now += 0.01
-            viewer = asyncio.create_task(frames.after(seen))
-            await asyncio.sleep(0)
-            frames.note_news()
-            await asyncio.sleep(0)
-            if viewer.done() and (frame := viewer.result()):
-                seen = frame.n
-            else:
-                viewer.cancel()
-                await asyncio.gather(viewer, return_exceptions=True)
-
-    asyncio.run(watch())
+async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
+    seen = -1
+    for _ in range(1000):  # 10 s of news every 10 ms
+        clock.now += 0.01
+        viewer = asyncio.create_task(frames.after(seen))
+        await asyncio.sleep(0)
+        frames.note_news()
+        await asyncio.sleep(0)
+        if viewer.done() and (frame := viewer.result()):
+            seen = frame.n
+        else:
+            viewer.cancel()
+            await asyncio.gather(viewer, return_exceptions=True)
     assert 45 <= len(made) <= 51
 
 
-def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock) -> None:
+async def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock) -> None:
     """Nothing else has to happen for them to be seen."""
-
-    async def watch() -> None:
-        first = await frames.after(-1)
-        assert first is not None
-        frames.note_news()
-        viewer = asyncio.create_task(frames.after(first.n))
-        await asyncio.sleep(0)
-        assert not viewer.done()
-        clock.now += 0.25
-        second = await viewer
-        assert second is not None
-        assert second.n == 2
-
-    asyncio.run(watch())
+    first = await frames.after(-1)
+    assert first is not None
+    frames.note_news()
+    viewer = asyncio.create_task(frames.after(first.n))
+    await asyncio.sleep(0)
+    assert not viewer.done()
+    clock.now += 0.25
+    second = await viewer
+    assert second is not None
+    assert second.n == 2
 
 
 def test_nothing_is_made_for_nobody(frames: Frames, clock: Clock, made: list[int]) -> None:
@@ -128,22 +114,19 @@ def test_nothing_is_made_for_nobody(frames: Frames, clock: Clock, made: list[int
     assert made == []
 
 
-def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -> None:
-    async def watch() -> None:
-        first = await frames.after(-1)
-        assert first is not None
-        for _ in range(50):  # it does not ask meanwhile
-            clock.now += 0.25
-            frames.note_news()
-            await frames.after(-1)
-        late = await frames.after(first.n)
-        assert late is not None
-        assert late.n == 51
-        assert told(late) == {"n": 51, "revision": 1}
-        other = await frames.after(900)  # seen of an earlier process
-        assert other is late
-
-    asyncio.run(watch())
+async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -> None:
+    first = await frames.after(-1)
+    assert first is not None
+    for _ in range(50):  # it does not ask meanwhile
+        clock.now += 0.25
+        frames.note_news()
+        await frames.after(-1)
+    late = await frames.after(first.n)
+    assert late is not None
+    assert late.n == 51
+    assert told(late) == {"n": 51, "revision": 1}
+    other = await frames.after(900)  # seen of an earlier process
+    assert other is late
 
 
 def told(frame: Encoded | None) -> dict[str, Any]:
@@ -180,7 +163,7 @@ def test_changes_turn_the_old_frame_into_the_new_one(before: dict[str, Any], now
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_viewer_ends_with_the_newest_frame_however_late(
+async def test_viewer_ends_with_the_newest_frame_however_late(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
     """A second number says for how many frames a viewer stays away; there is another plant in the middle."""
@@ -191,64 +174,54 @@ def test_viewer_ends_with_the_newest_frame_however_late(
         whole[n] = {"n": n, "revision": 2 * at // len(pictures), **pictures[at][0]}
         return whole[n]
 
-    async def watch() -> None:
-        frames = Frames(make, clock, begin)
-        has: dict[int, dict[str, Any]] = {}  # of each viewer: it comes again after so many frames
-        for turn, _ in enumerate(pictures):
-            clock.now += 0.25
-            frames.note_news()
-            for every in {away + 1 for _, away in pictures}:
-                if turn % every:
-                    continue
-                mine = has.get(every)
-                news = told(await frames.after(WHOLE if mine is None else mine["n"]))
-                since = news.pop("since", None)
-                if since is None:
-                    has[every] = news
-                else:
-                    assert mine is not None
-                    assert since == mine["n"] > news["n"] - REMEMBERED
-                    has[every] = merged(mine, news)
-                assert has[every] == whole[max(whole)]
-
-    asyncio.run(watch())
+    frames = Frames(make, clock, begin)
+    has: dict[int, dict[str, Any]] = {}  # of each viewer: it comes again after so many frames
+    for turn, _ in enumerate(pictures):
+        clock.now += 0.25
+        frames.note_news()
+        for every in {away + 1 for _, away in pictures}:
+            if turn % every:
+                continue
+            mine = has.get(every)
+            news = told(await frames.after(WHOLE if mine is None else mine["n"]))
+            since = news.pop("since", None)
+            if since is None:
+                has[every] = news
+            else:
+                assert mine is not None
+                assert since == mine["n"] > news["n"] - REMEMBERED
+                has[every] = merged(mine, news)
+            assert has[every] == whole[max(whole)]
 
 
-def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.01)
     monkeypatch.setattr(module, "MOST_VIEWERS", 2)
-
-    async def watch() -> None:
-        first = await frames.after(-1)
-        assert first is not None
-        assert await frames.after(first.n) is None
-        monkeypatch.setattr(module, "WAIT_S", 1000.0)
-        waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(3)]
-        await asyncio.sleep(0)
-        assert [one.done() for one in waiting] == [False, False, True]
-        with pytest.raises(OverflowError, match="2 viewers wait already"):
-            await waiting.pop()
-        frames.close()
-        assert await asyncio.gather(*waiting) == [None, None]
-        assert await frames.after(first.n) is None
-
-    asyncio.run(watch())
+    first = await frames.after(-1)
+    assert first is not None
+    assert await frames.after(first.n) is None
+    monkeypatch.setattr(module, "WAIT_S", 1000.0)
+    waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(3)]
+    await asyncio.sleep(0)
+    assert [one.done() for one in waiting] == [False, False, True]
+    with pytest.raises(OverflowError, match="2 viewers wait already"):
+        await waiting.pop()
+    frames.close()
+    assert await asyncio.gather(*waiting) == [None, None]
+    assert await frames.after(first.n) is None
 
 
-def test_a_viewer_too_many_is_told_so(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_viewer_too_many_is_told_so(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_VIEWERS", 0)
     sent: list[Any] = []
 
     async def send(message: Any) -> None:
         sent.append(message)
 
-    async def watch() -> None:
-        first = await frames.after(WHOLE)
-        assert first is not None
-        scope = {"type": "http", "query_string": f"after={first.n}".encode(), "headers": []}
-        await FrameRoute(frames)(scope, None, send)  # type: ignore[arg-type]
-
-    asyncio.run(watch())
+    first = await frames.after(WHOLE)
+    assert first is not None
+    scope = {"type": "http", "query_string": f"after={first.n}".encode(), "headers": []}
+    await FrameRoute(frames)(scope, None, send)  # type: ignore[arg-type]
     assert [one.get("status") for one in sent] == [503, None]
     assert json.loads(sent[1]["body"]) == {"error": "0 viewers wait already"}
 

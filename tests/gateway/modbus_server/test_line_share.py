@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from controlled_loop import run_controlled
+from controlled_loop import run_controlled as run_test  # noqa: F401 (the event loop of all tests here)
 from examples import usually
 
 from multidrop.gateway.modbus_server.line_share import (
@@ -58,125 +58,98 @@ async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seconds", usually(0.03, 0.005, 0.7))
-def test_a_flood_has_a_fifth_of_the_line_s_time_and_all_of_it(seconds: float) -> None:
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        begun = loop.time()
-        share, line = LineShare(), PacedLine(seconds)
-        await flood(share, line, 60.0)
-        passed = loop.time() - begun
-        used = seconds * len(line.begun)
-        assert used <= SHARE * passed + BURST_S + seconds
-        assert used >= SHARE * 60.0 - BURST_S - 2 * seconds
-        assert line.most == 1
-        assert share.used_s == pytest.approx(used)
-
-    run_controlled(main())
+async def test_a_flood_has_a_fifth_of_the_line_s_time_and_all_of_it(seconds: float) -> None:
+    loop = asyncio.get_running_loop()
+    begun = loop.time()
+    share, line = LineShare(), PacedLine(seconds)
+    await flood(share, line, 60.0)
+    passed = loop.time() - begun
+    used = seconds * len(line.begun)
+    assert used <= SHARE * passed + BURST_S + seconds
+    assert used >= SHARE * 60.0 - BURST_S - 2 * seconds
+    assert line.most == 1
+    assert share.used_s == pytest.approx(used)
 
 
 @pytest.mark.long
-def test_no_second_begins_with_more_than_its_share_and_what_was_saved() -> None:
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.01)
-        await flood(share, line, 30.0)
-        first = line.begun[0]
-        for second in range(28):
-            window = [at for at in line.begun if second <= at - first < second + 1]
-            assert len(window) * 0.01 <= SHARE + BURST_S + 0.01 + 1e-6
-
-    run_controlled(main())
+async def test_no_second_begins_with_more_than_its_share_and_what_was_saved() -> None:
+    share, line = LineShare(), PacedLine(0.01)
+    await flood(share, line, 30.0)
+    first = line.begun[0]
+    for second in range(28):
+        window = [at for at in line.begun if second <= at - first < second + 1]
+        assert len(window) * 0.01 <= SHARE + BURST_S + 0.01 + 1e-6
 
 
-def test_the_ninth_that_waits_is_refused_at_once() -> None:
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.5)
-        asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is under way
-        await asyncio.sleep(0)
-        with pytest.raises(PassingBusy, match="8 requests wait"):
-            share.ask("one", line.ask)
-        results = await asyncio.gather(*asked, return_exceptions=True)
-        assert results[0] == [1]
-        assert all(isinstance(result, PassingBusy) for result in results[1:])  # the share is used up
-
-    run_controlled(main())
+async def test_the_ninth_that_waits_is_refused_at_once() -> None:
+    share, line = LineShare(), PacedLine(0.5)
+    asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is under way
+    await asyncio.sleep(0)
+    with pytest.raises(PassingBusy, match="8 requests wait"):
+        share.ask("one", line.ask)
+    results = await asyncio.gather(*asked, return_exceptions=True)
+    assert results[0] == [1]
+    assert all(isinstance(result, PassingBusy) for result in results[1:])  # the share is used up
 
 
-def test_a_request_that_waited_a_second_is_never_asked() -> None:
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        share, line = LineShare(), PacedLine(1.5)
-        first, second = share.ask("one", line.ask), share.ask("two", line.ask)
-        begun = loop.time()
-        with pytest.raises(PassingBusy, match="within 1 s"):
-            await second
-        assert loop.time() - begun == pytest.approx(EXPIRY_S)
-        assert await first == [1]
-        await asyncio.sleep(60)
-        assert len(line.begun) == 1
-
-    run_controlled(main())
+async def test_a_request_that_waited_a_second_is_never_asked() -> None:
+    loop = asyncio.get_running_loop()
+    share, line = LineShare(), PacedLine(1.5)
+    first, second = share.ask("one", line.ask), share.ask("two", line.ask)
+    begun = loop.time()
+    with pytest.raises(PassingBusy, match="within 1 s"):
+        await second
+    assert loop.time() - begun == pytest.approx(EXPIRY_S)
+    assert await first == [1]
+    await asyncio.sleep(60)
+    assert len(line.begun) == 1
 
 
-def test_work_gets_the_seconds_that_are_left() -> None:
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.15)
-        first, second = share.ask("one", line.ask), share.ask("one", line.ask)
-        await asyncio.gather(first, second)
-        assert line.left == [pytest.approx(1.0), pytest.approx(0.85)]
-
-    run_controlled(main())
+async def test_work_gets_the_seconds_that_are_left() -> None:
+    share, line = LineShare(), PacedLine(0.15)
+    first, second = share.ask("one", line.ask), share.ask("one", line.ask)
+    await asyncio.gather(first, second)
+    assert line.left == [pytest.approx(1.0), pytest.approx(0.85)]
 
 
-def test_a_greedy_client_makes_place_for_one_that_asks_for_less() -> None:
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.01)
-        greedy = [share.ask("greedy", line.ask) for _ in range(1 + MOST_WAITING)]
-        await asyncio.sleep(0)
-        modest = share.ask("modest", line.ask)
-        results = await asyncio.gather(*greedy, return_exceptions=True)
-        assert [isinstance(result, PassingBusy) for result in results] == [False] * MOST_WAITING + [True]
-        assert await modest
-
-    run_controlled(main())
+async def test_a_greedy_client_makes_place_for_one_that_asks_for_less() -> None:
+    share, line = LineShare(), PacedLine(0.01)
+    greedy = [share.ask("greedy", line.ask) for _ in range(1 + MOST_WAITING)]
+    await asyncio.sleep(0)
+    modest = share.ask("modest", line.ask)
+    results = await asyncio.gather(*greedy, return_exceptions=True)
+    assert [isinstance(result, PassingBusy) for result in results] == [False] * MOST_WAITING + [True]
+    assert await modest
 
 
-def test_a_client_that_is_gone_waits_no_more_and_what_is_under_way_ends_first() -> None:
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.1)
-        gone = [share.ask("gone", line.ask) for _ in range(3)]
-        stays = share.ask("stays", line.ask)
-        await asyncio.sleep(0.05)
-        for asked in gone:
-            asked.cancel()
-        assert await stays == [2]
-        assert line.most == 1
-        assert line.begun[1] - line.begun[0] >= 0.1
-
-    run_controlled(main())
+async def test_a_client_that_is_gone_waits_no_more_and_what_is_under_way_ends_first() -> None:
+    share, line = LineShare(), PacedLine(0.1)
+    gone = [share.ask("gone", line.ask) for _ in range(3)]
+    stays = share.ask("stays", line.ask)
+    await asyncio.sleep(0.05)
+    for asked in gone:
+        asked.cancel()
+    assert await stays == [2]
+    assert line.most == 1
+    assert line.begun[1] - line.begun[0] >= 0.1
 
 
-def test_a_failure_is_the_asker_s_and_the_next_has_its_turn() -> None:
+async def test_a_failure_is_the_asker_s_and_the_next_has_its_turn() -> None:
     async def fails(left: float) -> list[int]:
         raise TimeoutError("no reply")
 
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.01)
-        first, second = share.ask("one", fails), share.ask("one", line.ask)
-        with pytest.raises(TimeoutError):
-            await first
-        assert await second == [1]
-
-    run_controlled(main())
+    share, line = LineShare(), PacedLine(0.01)
+    first, second = share.ask("one", fails), share.ask("one", line.ask)
+    with pytest.raises(TimeoutError):
+        await first
+    assert await second == [1]
 
 
-def test_closing_refuses_what_waits() -> None:
-    async def main() -> None:
-        share, line = LineShare(), PacedLine(0.1)
-        share.ask("one", line.ask)
-        waits = share.ask("one", line.ask)
-        await asyncio.sleep(0.01)
-        share.close()
-        with pytest.raises(PassingBusy, match="the gateway is shutting down"):
-            await waits
-
-    run_controlled(main())
+async def test_closing_refuses_what_waits() -> None:
+    share, line = LineShare(), PacedLine(0.1)
+    share.ask("one", line.ask)
+    waits = share.ask("one", line.ask)
+    await asyncio.sleep(0.01)
+    share.close()
+    with pytest.raises(PassingBusy, match="the gateway is shutting down"):
+        await waits

@@ -11,7 +11,8 @@ from collections.abc import Awaitable, Callable, Iterator
 from typing import cast
 
 import pytest
-from controlled_loop import ControlledLoop, run_controlled
+from controlled_loop import ControlledLoop
+from controlled_loop import run_controlled as run_test
 from modbus_gateway import DONE, PATIENCE, FakeLine, Gateway, RawClient, RawReply, plant_of, request, serving
 
 from multidrop import Drive, reading
@@ -82,48 +83,39 @@ def transactions(written: bytes) -> list[int]:
     return found
 
 
-def test_answers_come_under_their_own_ids_in_the_order_in_which_they_are_done() -> None:
-    async def main() -> None:
-        async def slow(found: MbapRequest) -> bytes:
-            await asyncio.sleep(found.transaction)
-            return found.reply(bytes([found.transaction]))
+async def test_answers_come_under_their_own_ids_in_the_order_in_which_they_are_done() -> None:
+    async def slow(found: MbapRequest) -> bytes:
+        await asyncio.sleep(found.transaction)
+        return found.reply(bytes([found.transaction]))
 
-        client, transport = connected(port_of(lambda found, _: slow(found)))
-        client.data_received(b"".join(request(number, 1, 3, 0, 1) for number in (3, 1, 2)))
-        await asyncio.sleep(5)
-        assert transactions(transport.written) == [1, 2, 3]
-        assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
-
-    run_controlled(main())
+    client, transport = connected(port_of(lambda found, _: slow(found)))
+    client.data_received(b"".join(request(number, 1, 3, 0, 1) for number in (3, 1, 2)))
+    await asyncio.sleep(5)
+    assert transactions(transport.written) == [1, 2, 3]
+    assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
 
 
-def test_a_failure_of_ours_is_answered_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
-    async def main() -> None:
-        async def fails(found: MbapRequest) -> bytes:
-            raise RuntimeError("a mistake of ours")
+async def test_a_failure_of_ours_is_answered_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
+    async def fails(found: MbapRequest) -> bytes:
+        raise RuntimeError("a mistake of ours")
 
-        client, transport = connected(port_of(lambda found, _: fails(found)))
-        client.data_received(request(9, 1, 3, 0, 1))
-        await asyncio.sleep(1)
-        assert transport.written == bytes.fromhex("00 09 00 00 00 03 01 83 04")
-
-    run_controlled(main())
+    client, transport = connected(port_of(lambda found, _: fails(found)))
+    client.data_received(request(9, 1, 3, 0, 1))
+    await asyncio.sleep(1)
+    assert transport.written == bytes.fromhex("00 09 00 00 00 03 01 83 04")
     assert "a mistake of ours" in caplog.text
 
 
-def test_a_client_s_flood_lets_others_have_their_turn() -> None:
-    async def main() -> None:
-        port = port_of()
-        flood, flooded = connected(port)
-        other, answered = connected(port)
-        flood.data_received(b"".join(request(number, 1, 3, 0, 1) for number in range(1000)))
-        assert len(transactions(flooded.written)) == modbus_clients.SLICE
-        other.data_received(request(1, 1, 3, 0, 1))
-        assert transactions(answered.written) == [1]
-        await asyncio.sleep(1)
-        assert transactions(flooded.written) == list(range(1000))
-
-    run_controlled(main())
+async def test_a_client_s_flood_lets_others_have_their_turn() -> None:
+    port = port_of()
+    flood, flooded = connected(port)
+    other, answered = connected(port)
+    flood.data_received(b"".join(request(number, 1, 3, 0, 1) for number in range(1000)))
+    assert len(transactions(flooded.written)) == modbus_clients.SLICE
+    other.data_received(request(1, 1, 3, 0, 1))
+    assert transactions(answered.written) == [1]
+    await asyncio.sleep(1)
+    assert transactions(flooded.written) == list(range(1000))
 
 
 def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
@@ -132,73 +124,60 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
     return found.reply(b"")
 
 
-def test_many_clients_share_the_time_that_one_of_them_had() -> None:
+async def test_many_clients_share_the_time_that_one_of_them_had() -> None:
     """A stop through any interface waits until each client had its turn."""
-
-    async def main() -> None:
-        share = modbus_clients.RoundShare()
-        clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
-        ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
-        block = b"".join(request(number, 1, 3, 0, 1) for number in range(100))
-        clients = [connected(port) for port in ports for _ in range(30)]
-        for client, _ in clients:
-            client.data_received(block)
-        begun = clock.now
-        for client, _ in clients:  # a round
+    share = modbus_clients.RoundShare()
+    clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
+    ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
+    block = b"".join(request(number, 1, 3, 0, 1) for number in range(100))
+    clients = [connected(port) for port in ports for _ in range(30)]
+    for client, _ in clients:
+        client.data_received(block)
+    begun = clock.now
+    for client, _ in clients:  # a round
+        client._drain()
+    assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
+    for client, transport in clients:
+        while client._waiting:
             client._drain()
-        assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
-        for client, transport in clients:
-            while client._waiting:
-                client._drain()
-            assert transactions(transport.written) == list(range(100))
-        assert share.slice_s == modbus_clients.SLICE_S
-
-    run_controlled(main())
-
-
-def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
-    async def main() -> None:
-        client, transport = connected(port_of(slowly))
-        client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
-        assert len(transactions(transport.written)) < 10
-        await asyncio.sleep(1)
         assert transactions(transport.written) == list(range(100))
-
-    run_controlled(main())
-
-
-def test_garbage_closes_its_client_after_the_answers_before_it() -> None:
-    async def main() -> None:
-        port = port_of()
-        client, transport = connected(port)
-        _, other = connected(port)
-        client.data_received(request(1, 1, 3, 0, 1) + b"GET / HTTP/1.1\r\n" + request(2, 1, 3, 0, 1))
-        assert transactions(transport.written) == [1]
-        assert (transport.ended, other.ended) == ("closed", "")
-
-    run_controlled(main())
+    assert share.slice_s == modbus_clients.SLICE_S
 
 
-def test_a_client_that_takes_no_answers_is_cut_after_a_while() -> None:
-    async def main() -> None:
-        port = port_of()
-        client, transport = connected(port)
-        client.pause_writing()
-        await asyncio.sleep(modbus_clients.STALLED_S - 0.1)
-        port.sweep()
-        assert not transport.ended
-        await asyncio.sleep(0.2)
-        port.sweep()
-        assert transport.ended == "aborted"
+async def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
+    client, transport = connected(port_of(slowly))
+    client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
+    assert len(transactions(transport.written)) < 10
+    await asyncio.sleep(1)
+    assert transactions(transport.written) == list(range(100))
 
-        client, transport = connected(port)
-        client.pause_writing()
-        client.resume_writing()
-        await asyncio.sleep(modbus_clients.STALLED_S + 1)
-        port.sweep()
-        assert not transport.ended
 
-    run_controlled(main())
+async def test_garbage_closes_its_client_after_the_answers_before_it() -> None:
+    port = port_of()
+    client, transport = connected(port)
+    _, other = connected(port)
+    client.data_received(request(1, 1, 3, 0, 1) + b"GET / HTTP/1.1\r\n" + request(2, 1, 3, 0, 1))
+    assert transactions(transport.written) == [1]
+    assert (transport.ended, other.ended) == ("closed", "")
+
+
+async def test_a_client_that_takes_no_answers_is_cut_after_a_while() -> None:
+    port = port_of()
+    client, transport = connected(port)
+    client.pause_writing()
+    await asyncio.sleep(modbus_clients.STALLED_S - 0.1)
+    port.sweep()
+    assert not transport.ended
+    await asyncio.sleep(0.2)
+    port.sweep()
+    assert transport.ended == "aborted"
+
+    client, transport = connected(port)
+    client.pause_writing()
+    client.resume_writing()
+    await asyncio.sleep(modbus_clients.STALLED_S + 1)
+    port.sweep()
+    assert not transport.ended
 
 
 def reads(first: int, end: int) -> bytes:
@@ -213,38 +192,32 @@ def writes(first: int, end: int) -> bytes:
 
 
 @pytest.mark.parametrize("is_stalled", [False, True])
-def test_writes_are_begun_as_they_come_and_in_their_order(is_stalled: bool) -> None:
-    async def main() -> None:
-        begun: list[int] = []
+async def test_writes_are_begun_as_they_come_and_in_their_order(is_stalled: bool) -> None:
+    begun: list[int] = []
 
-        def noted(found: MbapRequest, _: ModbusClient) -> bytes:
-            begun.append(found.transaction)
-            return found.reply(b"")
+    def noted(found: MbapRequest, _: ModbusClient) -> bytes:
+        begun.append(found.transaction)
+        return found.reply(b"")
 
-        client, transport = connected(port_of(noted))
-        if is_stalled:
-            client.pause_writing()
-        client.data_received(reads(0, 500) + writes(500, 502))
-        assert begun[:2] == [500, 501]
-        assert len(begun) == (2 if is_stalled else 2 + modbus_clients.SLICE)
-        client.resume_writing()
-        await asyncio.sleep(1)
-        assert begun == transactions(transport.written) == [500, 501, *range(500)]
-
-    run_controlled(main())
+    client, transport = connected(port_of(noted))
+    if is_stalled:
+        client.pause_writing()
+    client.data_received(reads(0, 500) + writes(500, 502))
+    assert begun[:2] == [500, 501]
+    assert len(begun) == (2 if is_stalled else 2 + modbus_clients.SLICE)
+    client.resume_writing()
+    await asyncio.sleep(1)
+    assert begun == transactions(transport.written) == [500, 501, *range(500)]
 
 
-def test_what_came_is_looked_at_for_a_while_before_others_have_their_turn() -> None:
-    async def main() -> None:
-        client, transport = connected(port_of(slowly))
-        client.data_received(writes(0, 100))
-        assert len(transactions(transport.written)) < 10
-        assert not transport.is_reading
-        await asyncio.sleep(1)
-        assert transactions(transport.written) == list(range(100))
-        assert transport.is_reading
-
-    run_controlled(main())
+async def test_what_came_is_looked_at_for_a_while_before_others_have_their_turn() -> None:
+    client, transport = connected(port_of(slowly))
+    client.data_received(writes(0, 100))
+    assert len(transactions(transport.written)) < 10
+    assert not transport.is_reading
+    await asyncio.sleep(1)
+    assert transactions(transport.written) == list(range(100))
+    assert transport.is_reading
 
 
 def test_client_that_reads_no_answers_is_still_read_within_bounds(
@@ -277,106 +250,87 @@ def test_client_that_reads_no_answers_is_still_read_within_bounds(
         client.data_received(reads(7, 8))
         assert transactions(transport.written)[-1] == 7
 
-    run_controlled(main())
+    run_test(main())
     assert caplog.text.count("does not read its answers") == 1
 
 
-def test_a_client_that_asks_for_more_than_can_wait_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_client_that_asks_for_more_than_can_wait_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
+    client, transport = connected(port_of())
+    client.data_received(reads(0, 1002))
+    await asyncio.sleep(1)
+    busy, rest = transport.written[:18], transport.written[18:]
+    assert busy == bytes.fromhex("03 E8 00 00 00 03 01 83 06 03 E9 00 00 00 03 01 83 06")
+    assert transactions(rest) == list(range(1000))
 
-    async def main() -> None:
-        client, transport = connected(port_of())
-        client.data_received(reads(0, 1002))
+
+async def test_an_idle_client_is_let_go_and_one_that_waits_for_an_answer_is_not() -> None:
+    never = asyncio.get_running_loop().create_future()
+    port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
+    connections = [connected(port) for _ in range(3)]
+    connections[1][0].data_received(request(9, 1, 3, 0, 1))
+    await asyncio.sleep(modbus_clients.IDLE_S - 1)
+    connections[2][0].data_received(request(1, 1, 3, 0, 1))
+    await asyncio.sleep(2)
+    port.sweep()
+    assert [transport.ended for _, transport in connections] == ["closed", "", ""]
+    never.cancel()
+
+
+async def test_a_client_too_many_takes_the_place_of_the_one_that_is_idle_longest() -> None:
+    port = port_of()
+    found = []
+    for _ in range(modbus_clients.MOST_CLIENTS):
+        found.append(connected(port)[1])
+        await asyncio.sleep(0.1)
+    refused = connected(port)[1]
+    assert refused.ended == "aborted"  # nobody is idle for 10 s
+    await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
+    assert not connected(port)[1].ended
+    assert [transport.ended for transport in found[:2]] == ["aborted", ""]
+    assert len(port.clients) == modbus_clients.MOST_CLIENTS
+    assert port.refused == 1
+
+
+async def test_who_is_not_named_is_refused() -> None:
+    port = port_of()
+    assert connected(port, "10.0.0.1")[1].ended == "aborted"
+    assert not port.clients
+
+
+async def test_what_is_under_way_for_a_client_that_is_gone_is_cancelled_once_it_began() -> None:
+    happened = []
+
+    async def slow(found: MbapRequest) -> bytes:
+        happened.append("begun")
+        try:
+            await asyncio.sleep(10)
+        except asyncio.CancelledError:
+            happened.append("cancelled")
+            raise
+        return b""
+
+    port = port_of(lambda found, _: slow(found))
+    client, transport = connected(port)
+    client.data_received(request(1, 1, 3, 0, 1))
+    client.connection_lost(None)
+    await asyncio.sleep(1)
+    assert happened == ["begun", "cancelled"]
+    assert (transport.written, port.clients) == (b"", set())
+
+
+async def test_a_client_that_sends_no_more_still_gets_its_answers() -> None:
+    async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(1)
-        busy, rest = transport.written[:18], transport.written[18:]
-        assert busy == bytes.fromhex("03 E8 00 00 00 03 01 83 06 03 E9 00 00 00 03 01 83 06")
-        assert transactions(rest) == list(range(1000))
+        return found.reply(b"")
 
-    run_controlled(main())
-
-
-def test_an_idle_client_is_let_go_and_one_that_waits_for_an_answer_is_not() -> None:
-    async def main() -> None:
-        never = asyncio.get_running_loop().create_future()
-        port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
-        connections = [connected(port) for _ in range(3)]
-        connections[1][0].data_received(request(9, 1, 3, 0, 1))
-        await asyncio.sleep(modbus_clients.IDLE_S - 1)
-        connections[2][0].data_received(request(1, 1, 3, 0, 1))
-        await asyncio.sleep(2)
-        port.sweep()
-        assert [transport.ended for _, transport in connections] == ["closed", "", ""]
-        never.cancel()
-
-    run_controlled(main())
-
-
-def test_a_client_too_many_takes_the_place_of_the_one_that_is_idle_longest() -> None:
-    async def main() -> None:
-        port = port_of()
-        found = []
-        for _ in range(modbus_clients.MOST_CLIENTS):
-            found.append(connected(port)[1])
-            await asyncio.sleep(0.1)
-        refused = connected(port)[1]
-        assert refused.ended == "aborted"  # nobody is idle for 10 s
-        await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
-        assert not connected(port)[1].ended
-        assert [transport.ended for transport in found[:2]] == ["aborted", ""]
-        assert len(port.clients) == modbus_clients.MOST_CLIENTS
-        assert port.refused == 1
-
-    run_controlled(main())
-
-
-def test_who_is_not_named_is_refused() -> None:
-    async def main() -> None:
-        port = port_of()
-        assert connected(port, "10.0.0.1")[1].ended == "aborted"
-        assert not port.clients
-
-    run_controlled(main())
-
-
-def test_what_is_under_way_for_a_client_that_is_gone_is_cancelled_once_it_began() -> None:
-    async def main() -> None:
-        happened = []
-
-        async def slow(found: MbapRequest) -> bytes:
-            happened.append("begun")
-            try:
-                await asyncio.sleep(10)
-            except asyncio.CancelledError:
-                happened.append("cancelled")
-                raise
-            return b""
-
-        port = port_of(lambda found, _: slow(found))
-        client, transport = connected(port)
-        client.data_received(request(1, 1, 3, 0, 1))
-        client.connection_lost(None)
-        await asyncio.sleep(1)
-        assert happened == ["begun", "cancelled"]
-        assert (transport.written, port.clients) == (b"", set())
-
-    run_controlled(main())
-
-
-def test_a_client_that_sends_no_more_still_gets_its_answers() -> None:
-    async def main() -> None:
-        async def slow(found: MbapRequest) -> bytes:
-            await asyncio.sleep(1)
-            return found.reply(b"")
-
-        client, transport = connected(port_of(lambda found, _: slow(found)))
-        client.data_received(request(5, 1, 3, 0, 1))
-        assert client.eof_received() is True
-        await asyncio.sleep(2)
-        assert transactions(transport.written) == [5]
-        assert transport.ended == "closed"
-        assert connected(port_of())[0].eof_received() is False
-
-    run_controlled(main())
+    client, transport = connected(port_of(lambda found, _: slow(found)))
+    client.data_received(request(5, 1, 3, 0, 1))
+    assert client.eof_received() is True
+    await asyncio.sleep(2)
+    assert transactions(transport.written) == [5]
+    assert transport.ended == "closed"
+    assert connected(port_of())[0].eof_received() is False
 
 
 # ---- over real sockets ----

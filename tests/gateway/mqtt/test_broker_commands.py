@@ -37,28 +37,24 @@ class HeldCommands:
         return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
 
 
-def test_a_broker_s_writes_are_bounded_and_no_stop_is() -> None:
+async def test_a_broker_s_writes_are_bounded_and_no_stop_is() -> None:
     told: list[tuple[str, str]] = []
-
-    async def receive() -> None:
-        commands: Any = HeldCommands()
-        orders = BrokerCommands(
-            commands, CALLER, lambda: NOW_MS, lambda drive, what, end: told.append((what, end.text))
-        )
-        for value in range(MOST_UNDER_WAY + 2):
-            orders.write("pump-1", "setpoint", value, NOW_MS)
-        await asyncio.sleep(0)  # they begin
-        assert commands.begun == [*range(MOST_UNDER_WAY)]
-        refused = f"not sent: {MOST_UNDER_WAY} others are under way"
-        assert told == [(f"setpoint = {MOST_UNDER_WAY + at}", refused) for at in range(2)]
-        for _ in range(3):
-            orders.stop(["pump-1"])
-        await asyncio.sleep(0)
-        assert commands.stopped == [["pump-1"]] * 3
-        commands.go_on.set()
-        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
-        orders.write("pump-1", "setpoint", 99.0, NOW_MS)
-        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
-        assert commands.begun[-1] == 99.0
-
-    asyncio.run(receive())
+    commands: Any = HeldCommands()
+    orders = BrokerCommands(
+        commands, CALLER, lambda: NOW_MS, lambda drive, what, end: told.append((what, end.text))
+    )
+    for value in range(MOST_UNDER_WAY + 2):
+        orders.write("pump-1", "setpoint", value, NOW_MS)
+    await asyncio.sleep(0)  # they begin
+    assert commands.begun == [*range(MOST_UNDER_WAY)]
+    refused = f"not sent: {MOST_UNDER_WAY} others are under way"
+    assert told == [(f"setpoint = {MOST_UNDER_WAY + at}", refused) for at in range(2)]
+    for _ in range(3):
+        orders.stop(["pump-1"])
+    await asyncio.sleep(0)
+    assert commands.stopped == [["pump-1"]] * 3
+    commands.go_on.set()
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    orders.write("pump-1", "setpoint", 99.0, NOW_MS)
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    assert commands.begun[-1] == 99.0

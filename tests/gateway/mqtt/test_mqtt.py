@@ -377,20 +377,16 @@ def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
         ("L\u00fcfter", "Lu\u0308fter", ["L\u00fcfter"]),
     ],
 )
-def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
+async def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
     tmp_path: Path, topic: str, named: str, stopped: list[str]
 ) -> None:
     known = inside(tmp_path, InvtCHE(2, name="L\u00fcfter"))
-
-    async def receive() -> None:
-        topics = JsonTopics(MqttSettings("mqtt://localhost", commands=True), known, now_ms)
-        topics.outbox = SimpleNamespace(put=lambda publication: None)
-        order = json.dumps({"verb": "coast", "drive": named}).encode()
-        topics.received(f"multidrop/{topic}/act", order, is_retained=False)
-        while len(known.commands.noted) < len(stopped):
-            await asyncio.sleep(0)
-
-    asyncio.run(receive())
+    topics = JsonTopics(MqttSettings("mqtt://localhost", commands=True), known, now_ms)
+    topics.outbox = SimpleNamespace(put=lambda publication: None)
+    order = json.dumps({"verb": "coast", "drive": named}).encode()
+    topics.received(f"multidrop/{topic}/act", order, is_retained=False)
+    while len(known.commands.noted) < len(stopped):
+        await asyncio.sleep(0)
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
@@ -523,28 +519,24 @@ def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
+async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
     """It may send what nobody asked it for."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
     part: Any = build(MqttSettings(sparkplug="works", node="line"), known)
     stop = {"verb": "stop", "time": now_ms()}
-
-    async def receive() -> None:
-        for topic, payload in (
-            ("multidrop/stop", b"stop"),
-            ("multidrop/pump-1/stop", b"stop"),
-            ("multidrop/pump-1/act", json.dumps(stop).encode()),
-            ("multidrop/pump-1/set/setpoint", write_of(12.5, now_ms())),
-            ("multidrop", b"stop"),
-            ("elsewhere", b""),
-        ):
-            part._speakers[0].received(topic, payload, is_retained=is_retained)
-        for topic in ("spBv1.0/works/DCMD/line/pump-1", "spBv1.0", "multidrop/stop"):
-            part._speakers[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
-        await asyncio.sleep(0)
-
-    asyncio.run(receive())
+    for topic, payload in (
+        ("multidrop/stop", b"stop"),
+        ("multidrop/pump-1/stop", b"stop"),
+        ("multidrop/pump-1/act", json.dumps(stop).encode()),
+        ("multidrop/pump-1/set/setpoint", write_of(12.5, now_ms())),
+        ("multidrop", b"stop"),
+        ("elsewhere", b""),
+    ):
+        part._speakers[0].received(topic, payload, is_retained=is_retained)
+    for topic in ("spBv1.0/works/DCMD/line/pump-1", "spBv1.0", "multidrop/stop"):
+        part._speakers[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
+    await asyncio.sleep(0)
     assert known.commands.noted == []
 
 

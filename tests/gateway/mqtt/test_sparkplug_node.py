@@ -227,36 +227,30 @@ def test_commands_of_a_host(broker: Broker, host: Host, node: tuple[Any, Running
 @pytest.mark.parametrize(
     ("name", "noted"), [(b"Device Control/Stop", [("stop", ["pump-1"])]), (b"setpoint", [])]
 )
-def test_stop_in_an_invalid_payload_is_sent(
+async def test_stop_in_an_invalid_payload_is_sent(
     tmp_path: Path, damage: bytes, name: bytes, noted: list[object]
 ) -> None:
     """A group, a name that is no UTF-8, and a metric that was cut off, behind a boolean metric."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 7)
     metric = b"\x0a" + bytes([len(name)]) + name + b"\x70\x01"
-
-    async def receive() -> None:
-        payload = b"\x12" + bytes([len(metric)]) + metric + damage
-        node.received(ROOT.format("DCMD") + "/pump-1", payload, is_retained=False)
-        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
-
-    asyncio.run(receive())
+    payload = b"\x12" + bytes([len(metric)]) + metric + damage
+    node.received(ROOT.format("DCMD") + "/pump-1", payload, is_retained=False)
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
     assert known.commands.noted == noted
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-def test_retained_write_is_refused_and_retained_stop_is_sent(tmp_path: Path, *, is_retained: bool) -> None:
+async def test_retained_write_is_refused_and_retained_stop_is_sent(
+    tmp_path: Path, *, is_retained: bool
+) -> None:
     """It comes at every connection, and it may be fresh when it comes first."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
     given = [Metric(DataType.DOUBLE, 25.0, 1_000, "setpoint"), Metric(DataType.BOOLEAN, 1, 1_000, STOP)]
-
-    async def receive() -> None:
-        topic = ROOT.format("DCMD") + "/pump-1"
-        node.received(topic, payload(1_000, given, None), is_retained=is_retained)
-        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
-
-    asyncio.run(receive())
+    topic = ROOT.format("DCMD") + "/pump-1"
+    node.received(topic, payload(1_000, given, None), is_retained=is_retained)
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
     written = [] if is_retained else [("write", "pump-1", "setpoint", 25.0)]
     assert known.commands.noted == [*written, ("stop", ["pump-1"])]
 
