@@ -12,16 +12,13 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from multidrop import Batch, Plant
 from multidrop.extras import install_command
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
-
-if TYPE_CHECKING:
-    from multidrop.gateway.gateway import Gateway
 
 BUILD_S = 3.0  # how long a start or a reload waits for parts whose files do not answer
 END_S = 3.0  # time limit for closing a part
@@ -70,6 +67,16 @@ class Part(Protocol):
         """Finish; called after the last batch."""
 
 
+class PartHost(Protocol):
+    """The methods of the gateway that LiveParts uses."""
+
+    plant: Plant
+
+    def part_context(self, plant: Plant) -> PartContext: ...
+    def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None: ...
+    def count_failure(self, name: str) -> None: ...
+
+
 def build(name: str, settings: object, context: PartContext) -> Part:
     """Return the part of this table. If a library is missing, raises ValueError that names the extra."""
     try:
@@ -93,7 +100,7 @@ class LiveParts:
     A part whose files do not answer does not delay the gateway: it stays in `pending` until it is built.
     """
 
-    def __init__(self, host: Gateway) -> None:
+    def __init__(self, host: PartHost) -> None:
         self.feeds: dict[str, Part] = {}
         self.dead: dict[str, str] = {}  # parts that could not start, and why
         self.pending: dict[str, Building] = {}
