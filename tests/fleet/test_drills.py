@@ -1,5 +1,6 @@
 """Drills with real processes, judged by the lines' records: no overlap, and short silences.
 
+Processes are killed or suspended; in namespaces, cables are cut and whole machines die.
 `python -m bench.questions.fleet_drills --rounds 40` does more.
 """
 
@@ -8,9 +9,19 @@ from __future__ import annotations
 import signal
 import subprocess
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
-from fleet_drills import DEEDS, PATIENCE_S, FleetDrill, drilled
+from fleet_drills import (
+    DEEDS,
+    PATIENCE_S,
+    FleetDrill,
+    MachineDrill,
+    cut,
+    drilled,
+    drilled_in_network,
+    drilled_on_machines,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -39,7 +50,6 @@ def test_a_suspended_gateway_is_killed_and_its_lines_are_taken_over(drill: Fleet
     assert drill.hall.overlaps() == 0
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # of a service; of a closed terminal
 def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill, number: int) -> None:
     drill.settle()
@@ -51,9 +61,79 @@ def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill, number: i
     assert drill.hall.overlaps() == 0
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("deed", DONE)
 def test_no_deed_makes_two_masters(drill: FleetDrill, deed: str) -> None:
     drill.settle()
     drill.judge(lambda: DEEDS[deed](drill))
     assert drill.hall.overlaps() == 0
+
+
+# ---- cut cables, with each gateway and node in its own namespace ----
+
+CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody")
+
+
+@pytest.fixture(scope="module")
+def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
+    with drilled_in_network(tmp_path_factory.mktemp("cuts")) as found:
+        yield found
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_no_cut_makes_two_masters(cut_drill: FleetDrill, name: str) -> None:
+    cut_drill.settle()
+    cut_drill.judge(lambda: cut(cut_drill, name))
+    assert cut_drill.hall.overlaps() == 0
+
+
+def test_a_gateway_that_reaches_the_nodes_and_not_the_lines_hands_them_over(cut_drill: FleetDrill) -> None:
+    cut_drill.settle()
+    place, host = cut_drill.places["gw-a"], cut_drill.hall.host
+
+    def gateway() -> dict[str, Any]:
+        found: dict[str, Any] = cut_drill.status()["gateways"]["gw-a"]
+        return found
+
+    session = gateway()["session"]
+    cut_drill.hall.reset()
+    place.cut_to_here(host)
+    try:
+        cut_drill.wait(lambda: gateway()["says"]["lost"] != [], "status tells of lost ports")
+        assert cut_drill.run("status").returncode == 1
+        cut_drill.wait(lambda: cut_drill.hall.are_polled(1.0) and not gateway()["lines"], "handed over")
+        found = cut_drill.run("status")
+        assert "cannot be opened from here; another gateway polls it" in found.stdout
+        assert found.returncode == 0
+        assert gateway()["session"] == session
+    finally:
+        place.heal_to_here(host)
+        cut_drill.gateways["gw-a"].kill()  # one that is started tries all lines at once
+        cut_drill.gateways["gw-a"].wait()
+    assert cut_drill.hall.overlaps() == 0
+
+
+# ---- machines with a gateway and a node each ----
+
+
+@pytest.fixture(scope="module")
+def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineDrill]:
+    with drilled_on_machines(tmp_path_factory.mktemp("machines")) as found:
+        yield found
+
+
+def test_no_line_waits_for_an_election_where_a_gateway_dies_with_the_node_on_its_machine(
+    machine_drill: MachineDrill,
+) -> None:
+    """All its lines' records have leaders on other machines: `settle` waits for that."""
+    machine_drill.settle()
+    before = machine_drill.status()["lines"]
+    machine_drill.judge(machine_drill.kill_machine)
+    assert machine_drill.hall.overlaps() == 0
+    moved = [line for line, one in machine_drill.status()["lines"].items() if one != before[line]]
+    assert moved
+
+
+def test_no_cut_of_a_whole_machine_makes_two_masters(machine_drill: MachineDrill) -> None:
+    machine_drill.settle()
+    machine_drill.judge(machine_drill.cut_machine)
+    assert machine_drill.hall.overlaps() == 0

@@ -141,15 +141,22 @@ def test_any_bytes_have_an_answer(data: bytes) -> None:
     assert said(data + b"\r\n\r\n")[0] in (400, 403, 404, 405)
 
 
-@table("address", ["0.0.0.0:9464", "192.0.2.1:9464", "plant.example:9464", "[::]:9464"])
-def test_no_address_that_others_reach(address: str) -> None:
-    with pytest.raises(ValueError, match="is open to other machines, without tokens or TLS"):
-        listen(address)
+OPEN_TO_OTHERS = "is open to other machines, without tokens or TLS"
+INVALID = r"is not an address and port; write --metrics 127\.0\.0\.1:9464"
 
 
-@table("address", ["9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999"])
-def test_invalid_addresses_are_rejected(address: str) -> None:
-    with pytest.raises(ValueError, match=r"is not an address and port; write --metrics 127\.0\.0\.1:9464"):
+@table(
+    ("address", "sentence"),
+    [
+        *(
+            (one, OPEN_TO_OTHERS)
+            for one in ("0.0.0.0:9464", "192.0.2.1:9464", "plant.example:9464", "[::]:9464")
+        ),
+        *((one, INVALID) for one in ("9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999")),
+    ],
+)
+def test_addresses_that_are_invalid_or_open_to_others_are_rejected(address: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
         listen(address)
 
 

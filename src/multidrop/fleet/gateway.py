@@ -23,7 +23,7 @@ from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines.fleet_lines import FleetLines
 from multidrop.fleet.lines.line_keeper import SILENT_S
-from multidrop.fleet.lines.moves import TOLD
+from multidrop.fleet.lines.moves import MOST_REPORTED
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.samples_stream import close, connect
@@ -84,7 +84,6 @@ class FleetGateway:
         self.member = Member(
             *(name, self.paths, commanded, self.mastership),
             lock=self.lock,
-            port_loss=self.lines.port_loss,
         )
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()
@@ -201,9 +200,9 @@ class FleetGateway:
             "troubles": dict(sorted({**member.keeper.troubles, **failing, **lost}.items())),
             "lost": sorted(lost),
             "failing": sorted(failing),
-            "unopened": sorted(member.unopened.named()),
+            "unopened": sorted(member.keeper.unopened.named()),
             "trouble": member.trouble,
-            "last_moves": [move.as_json() for move in member.records.moves.newest(TOLD)],
+            "last_moves": [move.as_json() for move in member.records.moves.newest(MOST_REPORTED)],
             "spool": {
                 "bytes": spool.stored,
                 "rows": spool.written,

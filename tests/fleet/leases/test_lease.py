@@ -529,7 +529,7 @@ async def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
     """Else all gateways would end each other when servers that were away come back."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
-    observer.begin_anew()
+    observer.restart_waits()
     await look(observer)
     await observer.end_the_dead()
     assert not observer.is_over("a", 1)
@@ -547,7 +547,7 @@ async def test_an_ended_session_stays_ended_after_a_cut() -> None:
     assert await observer.end_the_dead()
     await observer.end_the_dead()
     trial.clock.pass_s(60)
-    observer.begin_anew()
+    observer.restart_waits()
     await look(observer)
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
@@ -568,7 +568,7 @@ async def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
     for bucket in trial.buckets:
         bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
     await look(observer)  # its last renewal that was seen is long past
-    observer.begin_anew()
+    observer.restart_waits()
     await observer.end_the_dead()
     assert not observer.is_over("a", 1)
     trial.clock.pass_s(USUAL.lease / SECOND)

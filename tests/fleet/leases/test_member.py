@@ -188,7 +188,7 @@ class Ports:
         self.is_cut = False
         self._take = member.keeper.lines.take
         member.keeper.lines.take = self.take  # type: ignore[method-assign]
-        member.keeper._port_loss = self.loss
+        member.keeper.lines.port_loss = self.loss  # type: ignore[method-assign]
 
     def loss(self, line: str) -> PortLoss | None:
         return PortLoss(f"{line}: No route to host", None) if self.is_cut else None

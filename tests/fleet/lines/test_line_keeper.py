@@ -543,6 +543,6 @@ async def test_a_lost_port_is_reported_before_a_long_reopening_fails(
     trial = await claimed()
     await until(lambda: "hall" in trial.keeper.polled)
     await until(lambda: not trial.keeper._at_work)
-    trial.keeper._port_loss = lambda line: loss
+    trial.lines.port_loss = lambda line: loss  # type: ignore[method-assign]
     trial.keeper._look_at_ports()
     assert trial.keeper.lost.get("hall") == reported

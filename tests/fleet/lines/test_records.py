@@ -41,7 +41,7 @@ class Trial:
 
     def note(self, *_: object) -> None:
         """Process each record as share records do."""
-        self.follower.look_anew()
+        self.follower.recompute()
 
     def looked(self) -> list[str]:
         """Look once, and return the lines that changed."""
@@ -86,7 +86,7 @@ def test_of_a_line_that_we_have_by_other_records_nothing_is_asked() -> None:
     trial.looked()
     assert trial.asks()
     trial.had.add("line")
-    trial.follower.look_anew()
+    trial.follower.recompute()
     assert not trial.asks()
 
 
@@ -238,7 +238,7 @@ async def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> No
     some = [record._replace(value=NOBODY) for record in stored[:10]]
     again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
     assert refused == {"line-20"}
-    follower = ShareFollower(bucket, lambda *_: follower.look_anew(), is_mine, lambda line: False)
+    follower = ShareFollower(bucket, lambda *_: follower.recompute(), is_mine, lambda line: False)
     follower.want([*lines[:1100], "never had"])
     changed = await asyncio.wait_for(follower.look(), 60)
     newest = {record.key: record for record in (*stored[:1100], *again)}

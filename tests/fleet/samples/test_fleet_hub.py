@@ -79,6 +79,12 @@ async def say(
     assert await publish(client, f"samples.{source}", data, headers)
 
 
+async def say_all(client: Client, first: int, end: int) -> None:
+    """Publish the messages `first` to `end` - 1, of five exchanges each."""
+    for number in range(first, end):
+        await say(client, number, message(number * 5))
+
+
 class Memory:
     """A sink that stores commits, and fails on request before or after storing one."""
 
@@ -156,8 +162,7 @@ def test_a_server_that_is_behind_ends_no_reading_of_all(
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
 async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
     async with client_of(running) as client:
-        for number in range(1, 31):
-            await say(client, number, message(number * 5))
+        await say_all(client, 1, 31)
         sink = Memory(fates)
         state = await read_all(client, sink, 30)
     assert exchanges_in(sorted(sink.rows())) == list(range(5, 155))
@@ -169,8 +174,7 @@ async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: 
 async def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
     async with client_of(running) as client:
-        for number in range(1, 12):
-            await say(client, number, message(number * 5))
+        await say_all(client, 1, 12)
         sink = Memory()
         hub = SampleHub(client, sink)
         await hub.run(once=True)
@@ -233,8 +237,7 @@ async def test_messages_that_the_stream_removed_are_reported(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with client_of(running) as client:
-        for number in range(1, 6):
-            await say(client, number, message(number * 5))
+        await say_all(client, 1, 6)
         await samples_stream._ask(client, "STREAM.PURGE.samples", {"seq": 4})
         state = await read_all(client, Memory(), 5)
         assert (state.alarms, state.missing) == (2, 3)
@@ -269,11 +272,9 @@ def kept_in_files(client: Client, folder: Path, place: int) -> Any:
 async def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
     duckdb = require_module("duckdb")
     async with client_of(running) as client:
-        for number in range(1, 6):
-            await say(client, number, message(number * 5))
+        await say_all(client, 1, 6)
         assert (await kept_in_files(client, tmp_path, 5)).rows == 250
-        for number in range(6, 9):
-            await say(client, number, message(number * 5))
+        await say_all(client, 6, 9)
         assert (await kept_in_files(client, tmp_path, 8)).rows == 150
     files = sorted((tmp_path / "rows").glob("*.parquet"))
     ranges = [tuple(map(int, file.name.split(".")[0].split("-"))) for file in files]
@@ -372,8 +373,7 @@ extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, driv
 @pytest.mark.long
 async def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
     async with client_of(running) as client:
-        for number in range(1, 6):
-            await say(client, number, message(number * 5))
+        await say_all(client, 1, 6)
         sink = PostgresSink(empty.where)
         state = await read_all(client, sink, 5)
         assert (state.rows, state.alarms) == (250, 0)

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from nats.aio.client import Client
-from nats_clusters import Cluster, cluster, free_ports, old_server_program
+from nats_clusters import Cluster, cluster, old_server_program
 from sample_streams import client_of
 from spooled import exchanges_in, numbered, rows_of
 
@@ -85,12 +85,17 @@ def filled(folder: Path, messages: int) -> Spool:
     return spool
 
 
+async def store(spool: Spool, first: int) -> None:
+    """Append five exchanges to the spool, and wait until they are a message on the disk."""
+    spool.append(numbered(first, 5))
+    assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+
+
 async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
     spool = filled(tmp_path / "spool", 7)
     async with client_of(running) as client, forwarding(spool, client) as forwarder:
         await until(lambda: forwarder.last == 7)
-        spool.append(numbered(35, 5))
-        assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+        await store(spool, 35)
         await until(lambda: forwarder.last == 8)
         assert (forwarder.sent, forwarder.last, forwarder.trouble) == (8, 8, None)
         assert spool.state().acknowledged == 8
@@ -167,8 +172,7 @@ async def test_answers_of_servers_among_a_logs_messages_are_passed_over(
         await until(lambda: forwarder.last == 2)
         for number, headers in enumerate(answers, 3):
             assert await publish(client, subject, b"{}", headers)
-            spool.append(numbered(number * 5, 5))
-            assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+            await store(spool, number * 5)
             await until(lambda number=number: forwarder.last == number)
         assert (forwarder.sent, spool.state().acknowledged) == (4, 4)
         sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
@@ -209,8 +213,7 @@ async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
 async def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_path: Path) -> None:
     filled(tmp_path / "spool", 5).close()
     spool = Spool(tmp_path / "spool", "gateway-1", most=1)
-    spool.append(numbered(25, 5))
-    assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+    await store(spool, 25)
     await until(lambda: spool.state().oldest == 6)
     async with client_of(running) as client, forwarding(spool, client) as forwarder:
         await until(lambda: forwarder.last == 6)
@@ -232,8 +235,7 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
         for number in (100, 200):  # first as long as the stream, and then longer
             async with forwarding(spool, client) as forwarder:
                 await until(lambda forwarder=forwarder: forwarder.trouble)
-            spool.append(numbered(number, 5))
-            assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+            await store(spool, number)
         async with forwarding(spool, client) as forwarder:
             await until(lambda: forwarder.trouble)
         assert [one.sequence for one in await stored(client)] == [1, 2]
@@ -276,14 +278,6 @@ async def test_the_largest_message_comes_back(running: Cluster) -> None:
 
 
 # ---- mistakes ----
-
-
-@pytest.mark.slow
-def test_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
-    (port,) = free_ports(1)
-    with pytest.raises(StreamError, match=f"no NATS server answers at nats://127.0.0.1:{port}: "):
-        asyncio.run(connect([f"nats://127.0.0.1:{port}"]))
 
 
 def test_a_server_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

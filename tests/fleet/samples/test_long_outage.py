@@ -90,26 +90,3 @@ def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: i
     with History(tmp_path / "hub") as history:
         rows = sorted(tuple(row) for batch in history.read() for row in batch)
     assert exchanges_in(rows) == list(range(state.missing * EXCHANGES, MESSAGES * EXCHANGES))
-
-
-@pytest.mark.long
-def test_a_spool_full_of_forwarded_messages_survives_a_missing_hub(tmp_path: Path, most: int) -> None:
-    """The stream has it, so removal from the spool loses no rows."""
-    with cluster(tmp_path / "nats", 1) as servers:
-
-        async def live() -> tuple[HubState, SpoolState]:
-            client = await connect(servers.urls)
-            await create_stream(client, replicas=1)
-            await client.close()
-            for first in (0, 8, 16):  # fewer than the spool holds, so that each time all of it is forwarded
-                spool = Spool(tmp_path / "spool", "gateway-1", most=most)
-                for number in range(first, first + 8):
-                    spool.append(numbered(number * EXCHANGES, EXCHANGES))
-                    assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-                await forwarded(spool, servers)
-                spool.close()
-            return await kept(tmp_path / "hub", servers), spool.state()
-
-        state, spooled = asyncio.run(live())
-    assert spooled.oldest > 10
-    assert (state.rows, state.alarms, spooled.lost) == (24 * EXCHANGES * 10, 0, 0)

@@ -42,18 +42,22 @@ def spool(folder: Path) -> Iterator[Spool]:
     opened.close()
 
 
+def store(spool: Spool, first: int, exchanges: int) -> None:
+    """Append exchanges, and wait until they are on the disk."""
+    spool.append(numbered(first, exchanges))
+    assert spool.sync(30.0)
+
+
 def filled(folder: Path, messages: int, exchanges: int = 5) -> None:
     """Store messages of so many exchanges each."""
     spool = Spool(folder, GATEWAY)
     for number in range(messages):
-        spool.append(numbered(number * exchanges, exchanges))
-        assert spool.sync(30.0)
+        store(spool, number * exchanges, exchanges)
     spool.close()
 
 
 def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None:
-    spool.append(numbered(0, 30))
-    assert spool.sync(30.0)
+    store(spool, 0, 30)
     assert exchanges_in(rows_in(folder)) == list(range(30))
     state = spool.state()
     assert (state.written, state.lost, state.waiting, state.oldest, state.newest) == (300, 0, 0, 1, 1)
@@ -227,12 +231,10 @@ def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
     size = next(folder.glob("*.arrows")).stat().st_size
     spool = Spool(folder, GATEWAY, most=size * 5)
     for number in range(1, 4):
-        spool.append(numbered(number * 5, 5))
-        assert spool.sync(30.0)
+        store(spool, number * 5, 5)
     spool.acknowledge(3)
     for number in range(4, 12):
-        spool.append(numbered(number * 5, 5))
-        assert spool.sync(30.0)
+        store(spool, number * 5, 5)
     until(lambda: spool.state().stored <= size * 5)
     spool.close()
     state = spool.state()
@@ -247,8 +249,7 @@ def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
 def test_early_removals_are_counted_when_the_stream_answers(folder: Path) -> None:
     filled(folder, 6)
     spool = Spool(folder, GATEWAY, most=1)  # the newest stays
-    spool.append(numbered(30, 5))
-    assert spool.sync(30.0)
+    store(spool, 30, 5)
     until(lambda: spool.state().oldest == 7)
     assert spool.state().lost == 0
     spool.acknowledge(2)
@@ -278,8 +279,7 @@ def test_a_full_disk_is_logged_and_delays_no_poller(
         assert "File too large" in str(state.trouble)
     assert spool.sync(30.0)
     until(lambda: spool.state().trouble is None)
-    spool.append(numbered(600, 10))
-    assert spool.sync(30.0)
+    store(spool, 600, 10)
     spool.close()
     assert exchanges_in(rows_in(folder)) == [*range(100), *range(600, 610)]
     assert not list(folder.glob(".*.tmp"))

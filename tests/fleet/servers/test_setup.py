@@ -87,19 +87,6 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
         assert asyncio.run(have_leaders(two)) is has
 
 
-def test_no_server_is_one_sentence() -> None:
-    [port] = free_ports(1)
-    with pytest.raises(FleetError, match=f"no NATS server answers at nats://127.0.0.1:{port}") as failure:
-        asyncio.run(_init([f"nats://127.0.0.1:{port}"]))
-    assert "\n" not in str(failure.value)
-
-
-def test_an_old_server_is_refused(tmp_path: Path) -> None:
-    sentence = r"is 2\.\d+; a fleet needs 2\.12 or newer"
-    with cluster(tmp_path, 1, old_server_program()) as old, pytest.raises(FleetError, match=sentence):
-        asyncio.run(_init(old.urls))
-
-
 @pytest.mark.slow
 def test_a_cluster_that_grants_a_key_twice_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -8,6 +8,7 @@ from typing import Any
 
 from multidrop.fleet.errors import Conflict, Unsure
 from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
 
 
@@ -162,6 +163,9 @@ class RecordingLines:
     async def let_go(self, line: str) -> None:
         self.mastership.events.append("let go")
         self.taken.discard(line)
+
+    def port_loss(self, line: str) -> PortLoss | None:
+        return None
 
 
 class Hall:

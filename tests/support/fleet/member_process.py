@@ -31,6 +31,9 @@ class NoLines:
     async def let_go(self, line: str) -> None:
         pass
 
+    def port_loss(self, line: str) -> None:
+        return None
+
 
 class NoMastership:
     """A mastership that raises the engine's errors and sends nothing."""

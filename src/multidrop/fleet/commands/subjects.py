@@ -23,6 +23,7 @@ from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer, Offered, encode
 from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.supervisor import supervisor
@@ -118,6 +119,9 @@ class CommandedLines:
         except BaseException:
             await self.let_go(line)
             raise
+
+    def port_loss(self, line: str) -> PortLoss | None:
+        return self._lines.port_loss(line)
 
     async def let_go(self, line: str) -> None:
         """Accept no more commands, stop polling the line, and close it.

@@ -27,12 +27,11 @@ from multidrop.fleet.leases.lease import Lease, MayPoll
 from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
-from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, PortLoss, TakenLine, no_loss
+from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.lines.ownership import decide, owner_of
 from multidrop.fleet.lines.records import ShareRecords
 from multidrop.fleet.lines.releases import WAIT_S, Releases
 from multidrop.fleet.lines.shares import Sharers, Shares
-from multidrop.fleet.lines.unopened_lines import UnopenedLines
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import LeaseBucket, Record
 from multidrop.fleet.servers.connections import ServerPath
@@ -72,10 +71,7 @@ class WeakSession:
                 self.is_too_weak = await have_leaders(self._path()) and await lease.could_be_whole()
 
 
-FIRST_RULES = 1  # version of the rules of a gateway whose record names none
-
-
-class OtherRules:
+class IncompatibleGateways:
     """Detects gateways with incompatible ownership rules; while one is alive, no line is claimed.
 
     So no line has two masters while a fleet is updated: new gateways wait until the old ones are stopped.
@@ -91,7 +87,7 @@ class OtherRules:
 
         A gateway that no longer renews its lease does not count, even if its session was not ended yet.
         """
-        others = {name for name, value in present.items() if value.get("rules", FIRST_RULES) != RULES}
+        others = {name for name, value in present.items() if value.get("rules") != RULES}
         found = frozenset(others - {self._me} - self._observer.dead(others).keys())
         if found != self.gateways:
             self.gateways = found
@@ -137,7 +133,6 @@ class Member:
         *,
         lock: LifeLock | None = None,
         terms: Terms = USUAL,
-        port_loss: Callable[[str], PortLoss | None] = no_loss,
     ) -> None:
         self.name = names.checked_name("gateway", name)
         self.paths = paths
@@ -149,10 +144,7 @@ class Member:
         ]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
         self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
-        self.unopened = UnopenedLines(lambda: self.lease.clock())
-        self.keeper = LineKeeper(
-            lines, self.lease, self.records, self._mark_dirty, unopened=self.unopened, port_loss=port_loss
-        )
+        self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self._shares = Shares()
         self._share: set[str] = set()  # the lines that should be ours
         self._releases = Releases(self.best, self._mark_dirty)
@@ -161,7 +153,7 @@ class Member:
         self._woken = asyncio.Event()
         self._was_valid = False
         self._weak = WeakSession(self.lease, self.records.observer, self.best)
-        self._other_rules = OtherRules(name, self.records.observer)
+        self._incompatible = IncompatibleGateways(name, self.records.observer)
         self._stepped: tuple[Any, ...] = ()
         self._over = asyncio.Event()
 
@@ -179,7 +171,7 @@ class Member:
     def trouble(self) -> str:
         """Return why the lease is missing or at risk; "" if it is fine."""
         weak = "another gateway ended one of its three lease records; a new lease starts soon"
-        return self._other_rules.trouble or self.lease.trouble or (weak if self.lease.is_weak else "")
+        return self._incompatible.trouble or self.lease.trouble or (weak if self.lease.is_weak else "")
 
     @property
     def polled(self) -> Mapping[str, TakenLine]:
@@ -219,7 +211,7 @@ class Member:
         return {
             "draining": self.is_draining,
             "lines": len(self.polled),
-            "unopened": sorted(self.unopened.named()),
+            "unopened": sorted(self.keeper.unopened.named()),
             "at_ms": time.time_ns() // 1_000_000,  # UTC, only for display
             "margin_ms": max(0, round(1000 * self.lease.left_s)),
         }
@@ -277,7 +269,7 @@ class Member:
                 await self._prepare()
                 await self.lease.begin()
                 self._settled_at = self.lease.clock() + int(SETTLE_S * SECOND)
-                self._shares.begin_anew()
+                self._shares.reset()
                 self._is_dirty = True
                 _log.info("%s: the lease began (session %d)", self.name, self.lease.session)
             elif self.lease.is_over or self._weak.is_too_weak:
@@ -298,7 +290,7 @@ class Member:
         """
         while True:
             self._see(self.records.observer.sessions())
-            if self.records.is_complete and not self._other_rules.gateways:
+            if self.records.is_complete and not self._incompatible.gateways:
                 break
             await asyncio.sleep(STEP_S)
 
@@ -332,7 +324,7 @@ class Member:
             self._was_valid = False
         elif not self._was_valid:
             self._was_valid = True
-            observer.begin_anew()
+            observer.restart_waits()
         elif self.lease.left_s > SOUND_S and await observer.end_the_dead(present):
             present = observer.sessions()
         await self._share_out(present)
@@ -346,10 +338,10 @@ class Member:
 
     def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
         """Return the other gateways that take lines, and note when that set last changed."""
-        self._other_rules.look(present)
-        self.keeper.may_claim = not self._other_rules.gateways
+        self._incompatible.look(present)
+        self.keeper.may_claim = not self._incompatible.gateways
         others = {name for name, value in present.items() if not value["draining"]}
-        others -= {self.name} | self._other_rules.gateways
+        others -= {self.name} | self._incompatible.gateways
         self._shares.see(frozenset(others), self.lease.clock())
         return others
 
@@ -362,7 +354,7 @@ class Member:
         sharers = Sharers(tuple(sorted(sharing)), lines, self._unopened(present, sharing, lines))
         if await self._shares.make(sharers, self.lease.clock(), is_settled=self._is_settled):
             self._share = self._shares.of(self.name)
-            self.unopened.home = frozenset(
+            self.keeper.unopened.home = frozenset(
                 line for line, name in self._shares.home.items() if name == self.name
             )
             self.records.want(self._share)
@@ -373,11 +365,10 @@ class Member:
     ) -> tuple[tuple[str, frozenset[str]], ...]:
         """Return the lines that each gateway could not open.
 
-        Gateways of versions that do not report such lines are left out: they would not take lines handed over
-        to them.
+        A gateway whose record has no list of them is left out.
         """
         unopened = {name: value.get("unopened") for name, value in present.items()}
-        unopened[self.name] = list(self.unopened.named())
+        unopened[self.name] = list(self.keeper.unopened.named())
         known = {name: said for name in sorted(sharing) if isinstance(said := unopened.get(name), list)}
         if not any(known.values()):
             return ()
@@ -386,7 +377,7 @@ class Member:
             name: there.intersection(one for one in said if isinstance(one, str))
             for name, said in known.items()
         }
-        self.unopened.hopeless = there.intersection(*found.values())
+        self.keeper.unopened.hopeless = there.intersection(*found.values())
         return tuple(found.items())
 
     def _claim_and_release(self) -> None:

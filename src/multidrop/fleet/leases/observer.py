@@ -44,7 +44,7 @@ class Observer:
         self._over: dict[str, int] = {}  # newest session that is certainly over, by gateway
         self._clock = clock
 
-    def begin_anew(self) -> None:
+    def restart_waits(self) -> None:
         """Restart all waiting times, because this gateway saw no renewals while it was cut off.
 
         A session that was over already stays over, because it cannot be renewed.

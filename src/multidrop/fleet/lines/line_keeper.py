@@ -40,6 +40,9 @@ class Lines(Protocol):
     async def let_go(self, line: str) -> None:
         """Stop polling the line and close it: no request is sent on it afterwards."""
 
+    def port_loss(self, line: str) -> PortLoss | None:
+        """Return how the port of a polled line is lost; None if it is open."""
+
 
 class PortLoss(NamedTuple):
     """A polled line's lost port: why it could not be reopened, and how old the newest reply is (ns).
@@ -49,11 +52,6 @@ class PortLoss(NamedTuple):
 
     why: str | None
     silent_ns: int | None
-
-
-def no_loss(line: str) -> PortLoss | None:
-    """Return None: the port is open."""
-    return None
 
 
 class TakenLine(NamedTuple):
@@ -66,8 +64,7 @@ class TakenLine(NamedTuple):
 class LineKeeper:
     """The lines that one gateway polls, and the task in progress on each.
 
-    `on_change` is called when the next step is due. `port_loss` returns how the port of a polled line is
-    lost, or None if it is open.
+    `on_change` is called when the next step is due.
     """
 
     def __init__(
@@ -76,22 +73,18 @@ class LineKeeper:
         lease: Lease,
         records: ShareRecords,
         on_change: Callable[[], object],
-        *,
-        unopened: UnopenedLines | None = None,
-        port_loss: Callable[[str], PortLoss | None] = no_loss,
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # why lines could not be opened
         self.lost: dict[str, str] = {}  # why lines are not polled: their ports are lost
+        self.unopened = UnopenedLines(lambda: lease.clock())
         self.releasing: set[str] = set()  # our lines that must be released
         self.may_claim = True  # False while a gateway of an incompatible version is alive
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
-        self._unopened = unopened or UnopenedLines(lambda: lease.clock())
-        self._port_loss = port_loss
         self._is_leaving = False
         self._at_work: dict[str, asyncio.Task[None]] = {}  # opening, closing or claim in progress, by line
         self._tasks: set[asyncio.Task[None]] = set()
@@ -179,24 +172,24 @@ class LineKeeper:
     def _look_at_ports(self) -> None:
         """Note which ports of polled lines are lost, because other gateways should take such lines later."""
         for line in self.polled.keys() - self._at_work.keys():
-            if loss := self._port_loss(line):
+            if loss := self.lines.port_loss(line):
                 why = loss.why or ("it is being reopened" if (loss.silent_ns or 0) > REPORTED_NS else "")
                 if why and line not in self.lost:
                     _log.warning("line %s is not polled: its port is lost: %s", line, why)
                 if why:
                     self.lost[line] = why
-                self._unopened.lost(line, loss.silent_ns)
+                self.unopened.lost(line, loss.silent_ns)
             else:
                 self._opened(line)
 
     def _opened(self, line: str) -> None:
         if self.lost.pop(line, None):
             _log.warning("line %s is polled again", line)
-        self._unopened.opened(line)
+        self.unopened.opened(line)
 
     def _not_ours(self, line: str) -> None:
         self.lost.pop(line, None)
-        self._unopened.gone(line)
+        self.unopened.gone(line)
 
     async def let_all_go(self) -> None:
         """Close all lines, whatever is in progress. Raises the error of a line that could not be closed."""
@@ -246,7 +239,7 @@ class LineKeeper:
                 reported, self.troubles[line] = self.troubles.get(line), why
                 if isinstance(failure, OSError):
                     self.lost[line] = str(failure)
-                    self._unopened.failed(line)
+                    self.unopened.failed(line)
                 self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
                 asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
                 if reported != why:
@@ -257,7 +250,7 @@ class LineKeeper:
                     _log.warning("line %s is open now", line)
                     self._forget_trouble(line)
                 self.lost.pop(line, None)
-                self._unopened.opened(line)
+                self.unopened.opened(line)
                 self.polled[line] = TakenLine(record.revision, self._lease.clock())
 
     def _forget_trouble(self, line: str) -> None:

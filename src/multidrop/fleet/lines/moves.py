@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from multidrop.fleet.lines.ownership import NOBODY
 
 MOST = 100
-TOLD = 20  # number of moves in a gateway's answer about its state
+MOST_REPORTED = 20  # number of moves in a gateway's answer about its state
 
 
 class Move(NamedTuple):

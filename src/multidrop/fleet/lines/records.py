@@ -175,7 +175,7 @@ class ShareFollower(Follower):
         self._doubted |= dict.fromkeys(lines, time.monotonic())
         self._is_urgent.set()
 
-    def look_anew(self) -> None:
+    def recompute(self) -> None:
         """Recompute which lines may change, because a record in this or another bucket has changed."""
         self._asked = None
 
@@ -237,7 +237,7 @@ class ShareRecords(FleetRecords):
     def _note_owner(self, bucket: str, before: Record | None, record: Record) -> None:
         super()._note_owner(bucket, before, record)
         for share in self._shares.values():
-            share.look_anew()
+            share.recompute()
 
     def want(self, lines: Iterable[str]) -> None:
         """Follow the masters of exactly these lines from now on."""

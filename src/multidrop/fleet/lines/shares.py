@@ -103,7 +103,7 @@ class Shares:
         self._others: frozenset[str] = frozenset()
         self._seen_at = 0
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Force a new assignment: a new session started."""
         self._made = None
 

@@ -10,21 +10,21 @@ from fleets import HandClock, MemoryBucket, RecordingMastership
 
 from multidrop.fleet.leases import rules as lease_rules
 from multidrop.fleet.leases.lease import Lease
-from multidrop.fleet.leases.member import OtherRules
+from multidrop.fleet.leases.member import IncompatibleGateways
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, USUAL
 
 SENTENCE = "incompatible version of multidrop in this fleet: no line is taken until {} is stopped"
 
 
-class Story:
+class Trial:
     """A gateway called "me" that watches others, whose sessions are in memory."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock = HandClock()
         self.buckets: list[Any] = [MemoryBucket(f"lease_{path}") for path in range(3)]
         self.observer = Observer("me", self.buckets, USUAL, self.clock)
-        self.other_rules = OtherRules("me", self.observer)
+        self.incompatible = IncompatibleGateways("me", self.observer)
         self._monkeypatch = monkeypatch
 
     def begin(self, name: str, rules: int) -> Lease:
@@ -40,43 +40,43 @@ class Story:
         """Return the sentence after a read of all paths."""
         for path in range(3):
             asyncio.run(self.observer.look(path))
-        self.other_rules.look(self.observer.sessions())
-        return self.other_rules.trouble
+        self.incompatible.look(self.observer.sessions())
+        return self.incompatible.trouble
 
 
 @pytest.fixture
-def story(monkeypatch: pytest.MonkeyPatch) -> Story:
-    return Story(monkeypatch)
+def trial(monkeypatch: pytest.MonkeyPatch) -> Trial:
+    return Trial(monkeypatch)
 
 
-def test_an_incompatible_gateway_is_named_until_it_ends(story: Story) -> None:
-    story.begin("alike", RULES)
-    older, newer = story.begin("older", RULES - 1), story.begin("newer", RULES + 1)
-    assert story.trouble == SENTENCE.format("newer, older")
+def test_an_incompatible_gateway_is_named_until_it_ends(trial: Trial) -> None:
+    trial.begin("alike", RULES)
+    older, newer = trial.begin("older", RULES - 1), trial.begin("newer", RULES + 1)
+    assert trial.trouble == SENTENCE.format("newer, older")
     asyncio.run(newer.end())
-    assert story.trouble == SENTENCE.format("older")
+    assert trial.trouble == SENTENCE.format("older")
     asyncio.run(older.end())
-    assert story.trouble == ""
+    assert trial.trouble == ""
 
 
-def test_a_record_without_a_version_is_incompatible(story: Story) -> None:
-    story.begin("first", RULES)
-    for bucket in story.buckets:
+def test_a_record_without_a_version_is_incompatible(trial: Trial) -> None:
+    trial.begin("first", RULES)
+    for bucket in trial.buckets:
         bucket.store(
             "first", {key: one for key, one in bucket.records["first"].value.items() if key != "rules"}
         )
-    assert story.trouble == SENTENCE.format("first")
+    assert trial.trouble == SENTENCE.format("first")
 
 
-def test_a_killed_gateway_is_waited_for_at_most_its_lease(story: Story) -> None:
-    story.begin("older", RULES - 1)
-    assert story.trouble
-    story.clock.now += USUAL.lease - 1
-    assert story.trouble
-    story.clock.now += 1
-    assert story.trouble == ""
+def test_a_killed_gateway_is_waited_for_at_most_its_lease(trial: Trial) -> None:
+    trial.begin("older", RULES - 1)
+    assert trial.trouble
+    trial.clock.now += USUAL.lease - 1
+    assert trial.trouble
+    trial.clock.now += 1
+    assert trial.trouble == ""
 
 
-def test_our_own_earlier_session_is_not_an_incompatible_gateway(story: Story) -> None:
-    story.begin("me", RULES - 1)
-    assert story.trouble == ""
+def test_our_own_earlier_session_is_not_an_incompatible_gateway(trial: Trial) -> None:
+    trial.begin("me", RULES - 1)
+    assert trial.trouble == ""
