@@ -1,4 +1,4 @@
-"""A cluster of three real NATS servers for each module, with a fleet's buckets."""
+"""Real NATS servers for each module, with or without a fleet's buckets; tests may be coroutines."""
 
 from __future__ import annotations
 
@@ -47,16 +47,33 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Return one server without a fleet."""
+    from nats_clusters import cluster
+
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
 def fleet(nats: Cluster) -> Cluster:
     """Return three servers after `fleet init`."""
+    asyncio.run(_init(nats))
+    return nats
+
+
+@pytest.fixture(scope="module")
+def one(running: Cluster) -> Cluster:
+    """Return one server after `fleet init`."""
+    asyncio.run(_init(running))
+    return running
+
+
+async def _init(servers: Cluster) -> None:
     from multidrop.fleet.servers.connections import paths_of
     from multidrop.fleet.servers.setup import set_up
 
-    async def main() -> None:
-        paths = paths_of(nats.urls)
-        await set_up(paths)
-        for path in paths:
-            await path.close()
-
-    asyncio.run(main())
-    return nats
+    paths = paths_of(servers.urls)
+    await set_up(paths)
+    for path in paths:
+        await path.close()

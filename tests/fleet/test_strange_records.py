@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fleets import Hall, RecordingMastership
 from nats.aio.msg import Msg
-from nats_clusters import Cluster, cluster
+from nats_clusters import Cluster, connected_path
 from tables import table
 
 from multidrop.fleet.errors import FleetError
@@ -30,7 +28,7 @@ from multidrop.fleet.servers.buckets import (
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.plant_store import store
 from multidrop.fleet.servers.record_shapes import LARGE, SMALL, parsed
-from multidrop.fleet.servers.setup import open_all, set_up
+from multidrop.fleet.servers.setup import open_all
 
 LEASE = {
     **{
@@ -115,31 +113,10 @@ def test_a_valid_record_may_have_further_fields(bucket: str, key: str, value: di
     assert parsed(bucket, key, b"") == (None, "")  # removed
 
 
-@pytest.fixture(scope="module")
-def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Return one server with a fleet's buckets."""
-    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
-        asyncio.run(_with_path(running, _set_up))
-        yield running
-
-
-async def _set_up(path: ServerPath) -> None:
-    await set_up([path])
-
-
-async def _with_path(running: Cluster, work: Callable[[ServerPath], Any]) -> None:
-    path = paths_of(running.urls)[0]
-    await path.open()
-    try:
-        await asyncio.wait_for(work(path), PATIENCE_S)
-    finally:
-        await path.close()
-
-
-def test_an_invalid_record_is_logged_once_and_others_are_read(
+async def test_an_invalid_record_is_logged_once_and_others_are_read(
     one: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def work(path: ServerPath) -> None:
+    async with connected_path(one) as path:
         bucket = Bucket("own_2", lambda: path)
         await path.request("$KV.own_2.bad", b"{}")
         stored = await bucket.put("good", OWNER, 0)
@@ -149,14 +126,12 @@ def test_an_invalid_record_is_logged_once_and_others_are_read(
         assert (await bucket.get("bad")).value is None
         assert (await bucket.get("good")).revision == stored
 
-    with caplog.at_level(logging.WARNING):
-        asyncio.run(_with_path(one, work))
     told = [record.getMessage() for record in caplog.records]
     assert told == ["ignored the record bad of the bucket own_2: it has no 'gateway'"]
 
 
-def test_the_servers_take_no_huge_record_and_no_header_that_removes_others(one: Cluster) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_the_servers_take_no_huge_record_and_no_header_that_removes_others(one: Cluster) -> None:
+    async with connected_path(one) as path:
         bucket = Bucket("own_2", lambda: path)
         await bucket.put("stays", OWNER, 0)
         for data, headers in ((b" " * (SMALL + 1), None), (b"{}", {"Nats-Rollup": "all"})):
@@ -164,11 +139,9 @@ def test_the_servers_take_no_huge_record_and_no_header_that_removes_others(one: 
             assert "error" in answer
         assert (await bucket.get("stays")).value == OWNER
 
-    asyncio.run(_with_path(one, work))
 
-
-def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) -> None:
+    async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
         assert (await rogue.get("gw-1")).value == LEASE  # no other user has written it
@@ -177,11 +150,9 @@ def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) ->
         assert (await own.get("gw-1")).value == ended
         assert [record.value for record in await own.changes(revision)] == [ended]
 
-    asyncio.run(_with_path(one, work))
-
 
 @pytest.mark.long
-def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each bucket has one of each kind before the gateway starts, and gets more while it works."""
     monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
 
@@ -191,7 +162,7 @@ def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.Mo
                 key = f"gw-{number}.rogue" if bucket in names.LEASES else f"line-{number}"
                 await path.request(f"$KV.{bucket}.{key}{suffix}", data[:SMALL])
 
-    async def work(path: ServerPath) -> None:
+    async with connected_path(one) as path:
         paths = paths_of(one.urls)
         await open_all(paths)
         await strew(path, "-before")
@@ -218,14 +189,11 @@ def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.Mo
         for other in paths:
             await other.close()
 
-    asyncio.run(_with_path(one, work))
-
 
 @pytest.mark.long
-def test_a_session_that_another_ends_too_early_is_believed_when_it_must_be_over(one: Cluster) -> None:
+async def test_a_session_that_another_ends_too_early_is_believed_when_it_must_be_over(one: Cluster) -> None:
     """Its gateway hangs, and its engine polls on for as long as the lease holds: it cannot know."""
-
-    async def work(path: ServerPath) -> None:
+    async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         hall, members, tasks = Hall(), {}, {}
         for name in ("gw-p", "gw-q"):
@@ -253,8 +221,6 @@ def test_a_session_that_another_ends_too_early_is_believed_when_it_must_be_over(
             for opened in member.paths:
                 await opened.close()
 
-    asyncio.run(_with_path(one, work))
-
 
 async def _do_nothing() -> None:
     pass
@@ -280,8 +246,9 @@ STATE = {"state": "working", "lines": 1, "margin_s": 2.0, "trouble": "", "troubl
         ),
     ],
 )
-def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes, mistake: str) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes, mistake: str) -> None:
+    async with connected_path(one) as path:
+
         async def lie(message: Msg) -> None:
             await message.respond(answer)
 
@@ -289,13 +256,9 @@ def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes, mista
         with pytest.raises(FleetError, match=f"the answer of liar is not a gateway's state: {mistake}"):
             await ask_gateway(path, "liar", "state")
 
-    asyncio.run(_with_path(one, work))
-
 
 @pytest.mark.slow
-def test_a_refusal_of_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_a_refusal_of_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
+    async with connected_path(one) as path:
         with pytest.raises(ServerError, match="NATS refuses: "):
             await Bucket("nothing", lambda: path).get("gw-1")
-
-    asyncio.run(_with_path(one, work))

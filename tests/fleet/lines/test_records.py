@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from fleets import MemoryBucket
-from nats_clusters import Cluster, cluster
+from nats_clusters import Cluster, connected_path
 
 from multidrop.fleet.errors import Unsure
 from multidrop.fleet.leases.rules import USUAL
@@ -20,8 +19,6 @@ from multidrop.fleet.servers import (
     names,
 )
 from multidrop.fleet.servers.buckets import Bucket, Record
-from multidrop.fleet.servers.connections import paths_of
-from multidrop.fleet.servers.setup import set_up
 
 ME, OTHER, NOBODY = (owner_value(who, 1, 0) for who in (("a", 2), ("b", 1), ("", 0)))
 
@@ -221,28 +218,19 @@ def test_lines_that_were_read_before_a_failure_are_known(monkeypatch: pytest.Mon
     assert records.lines() == ("line-1", "line-2")
 
 
-@pytest.fixture(scope="module")
-def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
-        yield running
-
-
 @pytest.mark.long
 async def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
-    path = paths_of(one.urls)[0]
-    await path.open()
-    await set_up([path])
-    bucket = Bucket("own_0", lambda: path)
-    lines = [f"line-{at}" for at in range(1200)]
-    stored, _ = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
-    some = [record._replace(value=NOBODY) for record in stored[:10]]
-    again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
-    assert refused == {"line-20"}
-    follower = ShareFollower(bucket, lambda *_: follower.recompute(), is_mine, lambda line: False)
-    follower.want([*lines[:1100], "never had"])
-    changed = await asyncio.wait_for(follower.look(), 60)
-    newest = {record.key: record for record in (*stored[:1100], *again)}
-    assert follower.records == {**newest, "never had": Record("never had", 0, None)}
-    assert len(changed) == 1101
-    assert len(await follower.look()) == 0
-    await path.close()
+    async with connected_path(one) as path:
+        bucket = Bucket("own_0", lambda: path)
+        lines = [f"line-{at}" for at in range(1200)]
+        stored, _ = await bucket.put_all([Record(line, 0, OTHER) for line in lines])
+        some = [record._replace(value=NOBODY) for record in stored[:10]]
+        again, refused = await bucket.put_all([*some, Record("line-20", 0, NOBODY)])
+        assert refused == {"line-20"}
+        follower = ShareFollower(bucket, lambda *_: follower.recompute(), is_mine, lambda line: False)
+        follower.want([*lines[:1100], "never had"])
+        changed = await asyncio.wait_for(follower.look(), 60)
+        newest = {record.key: record for record in (*stored[:1100], *again)}
+        assert follower.records == {**newest, "never had": Record("never had", 0, None)}
+        assert len(changed) == 1101
+        assert len(await follower.look()) == 0

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from nats.aio.client import Client
-from nats_clusters import Cluster, cluster
+from nats_clusters import Cluster
 from peers import require_module
 from postgres_clusters import Postgres, postgres
 from sample_streams import client_of
@@ -39,12 +39,6 @@ from multidrop.fleet.servers.batch_client import BatchClient
 
 LOG = "00112233aabbccdd"
 PATIENCE_S = 60.0
-
-
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    with cluster(tmp_path_factory.mktemp("nats"), 1) as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

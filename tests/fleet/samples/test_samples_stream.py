@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Iterator
 from email.parser import BytesParser
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from nats.aio.client import Client
-from nats_clusters import Cluster, cluster
+from nats_clusters import Cluster
 from sample_streams import client_of
 
 from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
@@ -31,12 +30,6 @@ HOSTILE = {
     "a name with a space": "Nats-Sequence : 5\r\n",
     "no ASCII": "\xff\xfe: 1\r\n",
 }
-
-
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    with cluster(tmp_path_factory.mktemp("nats"), 1) as servers:
-        yield servers
 
 
 async def _as_mail(self: Client, headers: bytes | None) -> dict[str, str] | None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import pytest
 from nats.aio.client import Client
-from nats_clusters import Cluster, cluster
+from nats_clusters import Cluster, connected_path
 from tables import table
 
 from multidrop.fleet.errors import Unsure
@@ -26,20 +25,11 @@ from multidrop.fleet.servers.batch_client import (
 )
 from multidrop.fleet.servers.buckets import Bucket, Record
 from multidrop.fleet.servers.connections import ServerPath, connect, paths_of
-from multidrop.fleet.servers.setup import set_up
 
 OWNER = {"gateway": "gw-9", "session": 1, "votes": 1, "turn": 1, "since": 0}
 SERVERS = (
     b"Nats-Stream: KV_own_0\r\nNats-Subject: $KV.own_0.a\r\nNats-Sequence: 7\r\nNats-Last-Sequence: 0\r\n\r\n"
 )
-
-
-@pytest.fixture(scope="module")
-def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Return one server with a fleet's buckets."""
-    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
-        _with_path(running, lambda path: set_up([path]))
-        yield running
 
 
 @pytest.fixture(params=["taken at once", "nats-py's own way", "another nats-py"])
@@ -73,18 +63,6 @@ async def test_answers_are_taken_at_once(one: Cluster, monkeypatch: pytest.Monke
     client = await connect(one.urls[0], {})
     assert None not in await client.replies([Request("$JS.API.INFO", b"")], 30.0)
     await client.close()
-
-
-def _with_path(running: Cluster, work: Callable[[ServerPath], Awaitable[None]]) -> None:
-    async def main() -> None:
-        path = paths_of(running.urls)[0]
-        await path.open()
-        try:
-            await asyncio.wait_for(work(path), 60)
-        finally:
-            await path.close()
-
-    asyncio.run(main())
 
 
 def _rested(path: ServerPath) -> None:
@@ -121,8 +99,8 @@ def test_other_headers_are_of_no_stored_message(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
-def test_a_record_like_an_end_marker_hides_no_later_one(one: Cluster, way: str) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_a_record_like_an_end_marker_hides_no_later_one(one: Cluster, way: str) -> None:
+    async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
         client = await connect(one.urls[0], {})
@@ -139,11 +117,9 @@ def test_a_record_like_an_end_marker_hides_no_later_one(one: Cluster, way: str) 
         keys = [record.key for record in found if record.key.startswith(way)]
         assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
 
-    _with_path(one, work)
 
-
-def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluster, way: str) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluster, way: str) -> None:
+    async with connected_path(one) as path:
         bucket = Bucket("own_1", lambda: path)
         a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"
         known = await bucket.put(b, OWNER, 0)
@@ -157,8 +133,6 @@ def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluste
         assert found[b] == Record(b, known, OWNER)
         again = await bucket.put_all([record._replace(value=OWNER) for record in stored])
         assert [record.key for record in again.stored] == [a, c]
-
-    _with_path(one, work)
 
 
 @pytest.mark.slow
@@ -184,12 +158,11 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
 
 
 @pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
-def test_what_a_server_that_is_cut_off_got_is_asked_again(
+async def test_what_a_server_that_is_cut_off_got_is_asked_again(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
 ) -> None:
     monkeypatch.setattr(direct_gets, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
-
-    async def work(path: ServerPath) -> None:
+    async with connected_path(one) as path:
         path.others = []
         _rested(path)
         other = await connect(one.urls[0], {})
@@ -213,8 +186,6 @@ def test_what_a_server_that_is_cut_off_got_is_asked_again(
                 await path.collect("moody", b"")
         assert len(asked) > deaf_to or not is_told
         await other.close()
-
-    _with_path(one, work)
 
 
 async def test_reads_of_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
@@ -271,8 +242,8 @@ async def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
     await client.close()
 
 
-def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
-    async def work(path: ServerPath) -> None:
+async def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
+    async with connected_path(one) as path:
         former = path._client
         assert former
         assert former._reading_task
@@ -283,8 +254,6 @@ def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
         await path.look_after()
         assert path.is_open
         assert path._client is not former
-
-    _with_path(one, work)
 
 
 @pytest.mark.usefixtures("way")

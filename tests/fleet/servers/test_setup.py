@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from nats_clusters import Cluster, cluster, free_ports, old_server_program, server_program
+from nats_clusters import Cluster, cluster, connected_path, free_ports, old_server_program, server_program
 from tables import table
 
 from multidrop.fleet.errors import FleetError, Unsure
@@ -268,10 +268,8 @@ def test_a_wrong_clock_is_logged(
 
 
 async def _check(fleet: Cluster) -> None:
-    path = paths_of(fleet.urls)[0]
-    await path.open()
-    await setup.check_buckets(path)
-    await path.close()
+    async with connected_path(fleet) as path:
+        await setup.check_buckets(path)
 
 
 @pytest.mark.long
@@ -299,14 +297,9 @@ def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_silent_home_server_delays_releases_for_a_minute_at_most(tmp_path: Path) -> None:
+async def test_a_silent_home_server_delays_releases_for_a_minute_at_most(tmp_path: Path) -> None:
     with cluster(tmp_path, 2) as two:
         two.nodes[0].pause()
 
-        async def main() -> None:
-            path = paths_of(two.urls)[0]
-            await path.open()
+        async with connected_path(two) as path:
             assert path.server_name == "n2"
-            await path.close()
-
-        asyncio.run(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import shutil
@@ -10,8 +11,8 @@ import socket
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ from typing import Any, TypeVar
 from namespaces import Namespace
 from peers import require_program
 
+from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.files import PINGS
 
 PATIENCE_S = 60.0
@@ -236,3 +238,15 @@ def started_cluster(make: Callable[[int], C]) -> Iterator[C]:
         yield running
     finally:
         running.close()
+
+
+@asynccontextmanager
+async def connected_path(servers: Cluster) -> AsyncIterator[ServerPath]:
+    """Connect the first path to these servers."""
+    path = paths_of(servers.urls)[0]
+    await path.open()
+    try:
+        async with asyncio.timeout(2 * PATIENCE_S):
+            yield path
+    finally:
+        await path.close()

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.errors import Error, NoRespondersError
 
-from multidrop.fleet.errors import failure_to_connect
+from multidrop.fleet.errors import TooOld, Unsure, failure_to_connect
 from multidrop.fleet.servers.batch_client import (
     STATUS,
     BatchClient,
@@ -27,8 +27,8 @@ from multidrop.fleet.servers.batch_client import (
     last_header,
     stored_message,
 )
-from multidrop.fleet.servers.connections import OLDEST
-from multidrop.printable import masked
+from multidrop.fleet.servers.buckets import parsed_answer
+from multidrop.fleet.servers.connections import check_version
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
@@ -89,7 +89,7 @@ def end_if_cancelled() -> None:
 
 
 async def connect(servers: list[str], **options: Any) -> BatchClient:
-    """Return a connection that reconnects by itself. Raises StreamError."""
+    """Return a connection that reconnects by itself. Raises StreamError or TooOld."""
     client = BatchClient()
     try:
         async with asyncio.timeout(ANSWER_S):
@@ -105,14 +105,11 @@ async def connect(servers: list[str], **options: Any) -> BatchClient:
         last = client.last_error or failure
         await close(client)
         raise StreamError(str(failure_to_connect(", ".join(servers), last))) from failure
-    version = client.connected_server_version
-    if (version.major, version.minor) < OLDEST:
+    try:
+        check_version(client, ", ".join(servers))
+    except TooOld:
         await close(client)
-        raise StreamError(
-            f"the NATS server at {masked(', '.join(servers))} is "
-            f"{version.major}.{version.minor}.{version.patch}: a fleet needs "
-            f"{'.'.join(map(str, OLDEST))} or newer"
-        )
+        raise
     return client
 
 
@@ -185,7 +182,7 @@ async def publish(client: Client, subject: str, data: bytes, headers: dict[str, 
         raise StreamError(f"no stream takes {subject}: it is missing, or has no leader now") from failure
     except (Error, OSError, TimeoutError) as failure:
         raise silent(client, failure) from failure
-    found = _parsed(answer.data)
+    found = _table(answer.data)
     if error := found.get("error"):
         if error.get("err_code") == WRONG_SEQUENCE:
             return None
@@ -207,7 +204,7 @@ async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int
         raise StreamError("the NATS servers run without JetStream, or have no quorum now") from failure
     except (Error, OSError, TimeoutError) as failure:
         raise silent(client, failure) from failure
-    found = _parsed(answer.data)
+    found = _table(answer.data)
     error = found.get("error")
     if not error:
         return found
@@ -218,14 +215,11 @@ async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int
     raise StreamError(f"NATS refuses {subject}: {error.get('description')}")
 
 
-def _parsed(data: bytes) -> dict[str, Any]:
+def _table(data: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(data)
-    except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or not isinstance(found.get("error") or {}, dict):
-        raise StreamError("the answer of NATS is not JSON")
-    return found
+        return parsed_answer(data)
+    except Unsure as failure:
+        raise StreamError(str(failure)) from None
 
 
 @contextmanager

@@ -78,7 +78,7 @@ async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = N
     is invalid.
     """
     message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
-    said = _table(message.data)
+    said = parsed_answer(message.data)
     error = said.get("error")
     if error and error.get("err_code") == _UNAVAILABLE:
         raise Unsure(f"{path.url} says: {error.get('description')}")
@@ -87,7 +87,7 @@ async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = N
     return said
 
 
-def _table(data: bytes) -> dict[str, Any]:
+def parsed_answer(data: bytes) -> dict[str, Any]:
     """Parse an answer that must be a JSON object. Raises Unsure for anything else: the outcome is unknown."""
     with suppress(ValueError, RecursionError):
         found = json.loads(data)
@@ -130,7 +130,7 @@ class Bucket:
         Raises Conflict if it has another revision, Unsure if the outcome is unknown.
         """
         message = await self.path().request(*self._put(Record(key, revision, value)))
-        said = _table(message.data)
+        said = parsed_answer(message.data)
         error = said.get("error")
         if not error:
             return _revision(said)
@@ -147,7 +147,7 @@ class Bucket:
         written = WriteAnswers([], set())
         for record, answer in zip(records, answers, strict=True):
             with suppress(Unsure):
-                said = _table(answer or b"")
+                said = parsed_answer(answer or b"")
                 if not said.get("error"):
                     written.stored.append(record._replace(revision=_revision(said)))
                 elif said["error"].get("err_code") in _WRONG_REVISION:

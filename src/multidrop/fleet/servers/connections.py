@@ -67,11 +67,11 @@ class ServerPath:
         return str(self._client._server_info.get("server_name", "")) if self._client else ""
 
     @property
-    def version(self) -> tuple[int, int]:
+    def version(self) -> str:
         """Return the version of the present server."""
         assert self._client is not None
         found = self._client.connected_server_version
-        return found.major, found.minor
+        return f"{found.major}.{found.minor}"
 
     async def open(self) -> None:
         """Connect to the first server that answers. Raises FleetError if none does."""
@@ -251,14 +251,22 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
     except (NatsError, OSError, TimeoutError, ValueError) as failure:
         _cut(client)
         raise failure_to_connect(url, refusals[-1] if refusals else failure) from None
+    try:
+        check_version(client, url)
+    except TooOld:
+        await _close(client)
+        raise
+    return client
+
+
+def check_version(client: BatchClient, url: str) -> None:
+    """Raise TooOld if the server of this connection is older than OLDEST."""
     found = client.connected_server_version
     if (found.major, found.minor) < OLDEST:
-        await _close(client)
         raise TooOld(
             f"the NATS server at {masked(url)} is {found.major}.{found.minor}; a fleet needs "
             f"{'.'.join(map(str, OLDEST))} or newer: older ones may give one lease to two gateways"
         )
-    return client
 
 
 async def _close(client: BatchClient) -> None:

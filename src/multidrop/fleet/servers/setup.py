@@ -49,7 +49,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     # Right after a bucket's creation no server returns its records.
     await _retried(paths[0], partial(Bucket(names.PLANT, lambda: paths[0]).changes, 0))
     await bring_leaders_home(paths[0], await led_clusters(paths[0]))
-    servers = {path.server_name: ".".join(map(str, path.version)) for path in paths}
+    servers = {path.server_name: path.version for path in paths}
     return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
 
 
