@@ -140,7 +140,7 @@ def test_a_task_that_is_killed_is_logged_and_ends_the_gateway(
     assert f"{name} has ended, and does not come back: it was cancelled" in caplog.text
 
 
-def test_what_a_task_raised_is_logged_with_its_cause(
+def test_the_exception_of_a_task_is_logged_with_its_cause(
     gateway: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def kill(made: FleetGateway) -> None:
@@ -173,7 +173,7 @@ def test_a_poller_that_fails_ends_the_gateway(gateway: Any) -> None:
         gateway(kill)
 
 
-def test_subjects_that_cannot_be_heard_end_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_subscription_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stop would not be heard."""
 
     async def kill(made: FleetGateway) -> None:
@@ -184,7 +184,7 @@ def test_subjects_that_cannot_be_heard_end_the_gateway(gateway: Any, monkeypatch
         gateway(kill)
 
 
-async def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_path: Path) -> None:
+async def test_a_commander_reports_the_end_of_its_connection(fleet: Cluster, tmp_path: Path) -> None:
     """The page then reconnects."""
     async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
         commands._keeping[1].cancel()
@@ -195,7 +195,7 @@ async def test_a_commander_whose_connection_ends_says_so(fleet: Cluster, tmp_pat
 # ---- failures that end no gateway ----
 
 
-async def test_a_forwarder_that_fails_is_logged_and_tries_again(
+async def test_a_failing_forwarder_is_logged_and_retries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.0)

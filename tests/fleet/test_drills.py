@@ -51,7 +51,7 @@ def test_a_suspended_gateway_is_killed_and_its_lines_are_taken_over(drill: Fleet
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # of a service; of a closed terminal
-def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill, number: int) -> None:
+def test_a_drained_gateway_releases_all_its_lines(drill: FleetDrill, number: int) -> None:
     drill.settle()
     drill.hall.reset()
     drill.wait(lambda: "gw-b has 0 lines left" in drill.run("drain", "gw-b").stdout, "gw-b has no lines")
@@ -62,7 +62,7 @@ def test_a_drained_gateway_gives_all_its_lines_away(drill: FleetDrill, number: i
 
 
 @pytest.mark.parametrize("deed", DONE)
-def test_no_deed_makes_two_masters(drill: FleetDrill, deed: str) -> None:
+def test_no_drill_makes_two_masters(drill: FleetDrill, deed: str) -> None:
     drill.settle()
     drill.judge(lambda: DEEDS[deed](drill))
     assert drill.hall.overlaps() == 0
@@ -86,7 +86,7 @@ def test_no_cut_makes_two_masters(cut_drill: FleetDrill, name: str) -> None:
     assert cut_drill.hall.overlaps() == 0
 
 
-def test_a_gateway_that_reaches_the_nodes_and_not_the_lines_hands_them_over(cut_drill: FleetDrill) -> None:
+def test_a_gateway_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill) -> None:
     cut_drill.settle()
     place, host = cut_drill.places["gw-a"], cut_drill.hall.host
 

@@ -68,13 +68,13 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ["write", "pump-1", "frequency", "20", "--yes"],
     ),
 )
-def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
+def test_no_server_is_one_sentence(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
     assert f"no NATS server answers at {nobody}: Connection refused" in said
 
 
 @pytest.mark.parametrize("words", [["stop", "pump-1"], ["write", "pump-1", "frequency", "20", "--yes"]])
-def test_a_user_without_a_home(
+def test_a_user_without_a_home_can_stop(
     run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     """A command could not be noted, as in a container, and is not sent; a stop is."""
@@ -90,14 +90,14 @@ def test_a_user_without_a_home(
     assert f"no NATS server answers at {nobody}: Connection refused" in err
 
 
-def test_servers_without_a_fleet(run: Run, tmp_path: Path) -> None:
+def test_servers_without_a_fleet_are_one_sentence(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "one", 1) as one:
         for words in (["status"], ["serve", "gw-1"]):
             said = one_sentence(run("fleet", *words, "--nats", one.urls[0]))
             assert "has no bucket lease_0: run `multidrop fleet init` first" in said
 
 
-def test_an_old_server(run: Run, tmp_path: Path) -> None:
+def test_an_old_server_is_refused(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "old", 1, old_server_program()) as old:
         for words in (["init"], ["serve", "gw-1"], ["status"]):
             assert "a fleet needs 2.12 or newer" in one_sentence(run("fleet", *words, "--nats", old.urls[0]))
@@ -140,7 +140,7 @@ LISTS = {
 
 
 @pytest.mark.parametrize("lists", LISTS)
-def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str) -> None:
+def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_path: Path, lists: str) -> None:
     path = plant(tmp_path)
     text = path.read_text()
     path.write_text(f"{lists}\n{text}" if "=" in lists.splitlines()[0] else f"{text}\n{lists}\n")
@@ -175,17 +175,17 @@ def test_a_list_with_a_mistake(run: Run, nobody: str, tmp_path: Path, lists: str
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
-def test_a_mistaken_call(run: Run, words: list[str], sentence: str) -> None:
+def test_mistaken_calls_are_one_sentence(run: Run, words: list[str], sentence: str) -> None:
     assert sentence in one_sentence(run("fleet", *words))
 
 
-def test_no_name_keeps_a_stop_back(run: Run, nobody: str) -> None:
+def test_an_invalid_name_does_not_block_a_stop(run: Run, nobody: str) -> None:
     _, _, said = run("fleet", "stop", "pump-1", "--by", "\x1b[31m" + "x" * 300, "--nats", nobody)
     assert "the stop was NOT sent: no NATS server answers" in said
 
 
 @pytest.mark.parametrize("action", ["stop", "coast"])
-def test_no_unknown_option_keeps_a_stop_back(run: Run, nobody: str, action: str) -> None:
+def test_an_unknown_option_does_not_block_a_stop(run: Run, nobody: str, action: str) -> None:
     status, _, said = run("fleet", action, "pump-1", "--lnie=hall", "--nats", nobody)
     assert status != 0
     assert said.startswith(f"multidrop: {action}: ignored unknown options: --lnie=hall\n")
@@ -193,7 +193,7 @@ def test_no_unknown_option_keeps_a_stop_back(run: Run, nobody: str, action: str)
 
 
 @pytest.mark.parametrize("library", ["nats", "pyarrow"])
-def test_a_missing_extra(run: Run, monkeypatch: pytest.MonkeyPatch, library: str) -> None:
+def test_a_missing_extra_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPatch, library: str) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == library else found(name))
     said = one_sentence(run("fleet", "status"))
@@ -233,7 +233,7 @@ def test_init_creates_and_shows_the_fleet(run: Run, nats: Cluster, tmp_path: Pat
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 
 
-def test_an_interruption_says_what_it_leaves_open(
+def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from multidrop.cli.fleet import commands

@@ -122,7 +122,7 @@ def started() -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_the_demo() -> None:
+def test_the_demo_shows_a_takeover() -> None:
     with started() as (demo, folder):
         assert demo.stdout is not None
         said = demo.stdout.read()
@@ -143,7 +143,7 @@ def test_the_demo() -> None:
 @pytest.mark.parametrize(
     ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)]
 )
-def test_nothing_is_left_however_it_ends(number: signal.Signals, status: int) -> None:
+def test_the_demo_removes_processes_and_files_however_it_ends(number: signal.Signals, status: int) -> None:
     with started() as (demo, folder):
         demo.send_signal(number)
         assert demo.wait(60) == status

@@ -89,13 +89,13 @@ async def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
     await gateway._close()
 
 
-async def test_a_margin_is_never_less_than_none(tmp_path: Path) -> None:
+async def test_a_margin_is_never_negative(tmp_path: Path) -> None:
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     assert gateway.state()["margin_s"] == 0.0
     await gateway._close()
 
 
-async def test_the_kernels_timer_is_called_off_once_the_lines_are_closed(
+async def test_the_kernels_timer_is_cancelled_after_the_lines_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A process whose member failed may go on: the kernel would kill it."""
@@ -118,7 +118,7 @@ async def test_the_kernels_timer_is_called_off_once_the_lines_are_closed(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_it_ends_in_good_order_though_all_servers_are_gone(tmp_path: Path) -> None:
+def test_a_gateway_without_servers_ends_in_order(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "multidrop", "fleet"]
     with cluster(tmp_path / "nats", 1) as one, closing(SerialHall(1)) as hall:
         environment = {**os.environ, "MULTIDROP_NATS": one.urls[0], "XDG_STATE_HOME": str(tmp_path)}

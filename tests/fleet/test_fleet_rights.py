@@ -196,7 +196,7 @@ def test_names_that_rights_cannot_be_given_to(names: list[str], sentence: str) -
         rights_of(names)
 
 
-def test_secrets_are_in_no_file_for_all_and_for_no_other_eyes(as_written: SecuredCluster) -> None:
+def test_secrets_are_readable_only_by_their_owner(as_written: SecuredCluster) -> None:
     keys = as_written.folder / "keys"
     assert {path.name for path in keys.iterdir()} == {*(f"{user}.key" for user in USERS), "routes"}
     assert [oct(path.stat().st_mode & 0o777) for path in (keys, *keys.iterdir())] == ["0o700", *["0o600"] * 7]
@@ -206,7 +206,7 @@ def test_secrets_are_in_no_file_for_all_and_for_no_other_eyes(as_written: Secure
         assert path.read_text().strip() not in public
 
 
-def test_a_gateway_that_comes_changes_no_key(tmp_path: Path) -> None:
+def test_adding_a_gateway_changes_no_key(tmp_path: Path) -> None:
     from multidrop.fleet.servers.files import write_files
 
     urls = ["nats://a:4222", "nats://b:4222"]
@@ -282,7 +282,7 @@ def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[st
     assert not (tmp_path / "nats").exists()
 
 
-def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> None:
+def test_only_a_denial_of_this_request_means_not_sent() -> None:
     """Rights may be granted to an open connection: an older denial does not explain a later silence."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
@@ -298,7 +298,7 @@ def test_a_denial_of_this_very_request_alone_says_that_it_reached_nobody() -> No
 
 
 @pytest.mark.slow
-def test_a_creds_file_of_nats_is_taken_as_it_is(tmp_path: Path) -> None:
+def test_a_creds_file_is_passed_to_nats(tmp_path: Path) -> None:
     path = tmp_path / "gw-1.creds"
     path.write_text("-----BEGIN NATS USER JWT-----\ney\n------END NATS USER JWT------\n")
     assert connect_options(["nats://a"], path) == {"user_credentials": str(path)}

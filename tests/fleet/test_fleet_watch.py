@@ -56,7 +56,7 @@ def drawn(told: dict[str, Any], width: int = 120, height: int = 40) -> str:
     return "\n".join(one.plain for one in lines)
 
 
-def test_what_is_shown() -> None:
+def test_the_screen_shows_gateways_lines_and_moves() -> None:
     text = drawn(told())
     assert re.search(r"gw-1 +pc-1 +3 +1970-01-01 00:00:00 +working +6 +1\.9 s +81 kB +2 +1\.5 s +0\n", text)
     assert re.search(r"gw-2 +pc-1 .*no answer +6 +- +- +- +- +-\n", text)
@@ -93,7 +93,7 @@ def test_notes_are_shown_whole_or_not() -> None:
     assert [row[0] for row in shown if re.match(r"\d words", row)] == ["1", "2"]
 
 
-def test_a_narrow_terminal_has_the_columns_that_matter_whole() -> None:
+def test_a_narrow_terminal_drops_less_important_columns() -> None:
     head = [drawn(told(), width).splitlines()[2] for width in (200, 80, 72, 64, 56, 48, 40)]
     assert [re.sub(" +", " ", one) for one in head] == [
         "GATEWAY HOST SESSION SINCE STATE LINES LEASE SPOOL UNSENT LAG LOST",
@@ -116,7 +116,7 @@ def test_a_narrow_terminal_shows_masters_and_new_masters() -> None:
     assert "LINE    MASTER" in drawn(told(), 30).splitlines()
 
 
-def test_what_does_not_fit_is_wrapped_or_seen_to_be_cut() -> None:
+def test_long_text_is_wrapped_or_marked_as_cut() -> None:
     found = told(12.0, "no server is reached at nats://a:4222") | {"notes": ["a note of some words " * 3]}
     shown = drawn(found, 40).splitlines()
     assert shown[1] == "this is 12 s old: no server is reached~"
@@ -194,7 +194,7 @@ def test_an_old_view_is_dim_and_shows_its_age() -> None:
     assert {str(one.style) for one in picture(told(), (120, 40), "") if one.plain.startswith("gw-1")} == {""}
 
 
-def test_a_name_commands_no_terminal() -> None:
+def test_a_name_cannot_control_the_terminal() -> None:
     found = told()
     found["gateways"]["gw-1"]["host"] = "\x1b[2J"
     assert "\x1b" not in drawn(found)
@@ -213,7 +213,7 @@ def test_moves_with_an_unseen_start() -> None:
     ("number", "text"),
     [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (81234, "81 kB"), (5e9, "5.0 GB"), (3e15, "3000 TB")],
 )
-def test_sizes(number: float, text: str) -> None:
+def test_sizes_have_two_digits_and_a_unit(number: float, text: str) -> None:
     assert size(number) == text
 
 
@@ -254,14 +254,14 @@ async def test_a_watch_ends_with_the_task_of_its_connection() -> None:
         await fleet_watch.follow(watch, lambda told: None, asyncio.Event())
 
 
-def test_without_a_terminal_it_says_what_works(run: Run) -> None:
+def test_without_a_terminal_watch_suggests_json(run: Run) -> None:
     status, out, err = run("fleet", "watch")
     assert (status, out) == (2, "")
     assert "`multidrop fleet watch` needs a terminal; with --json it works without one" in err
 
 
 @pytest.mark.long
-def test_a_line_a_second_until_it_is_interrupted(fleet: Cluster) -> None:
+def test_watch_prints_one_line_a_second_until_interrupted(fleet: Cluster) -> None:
     command = [sys.executable, "-m", "multidrop", "fleet", "watch", "--json"]
     environment = {**os.environ, "MULTIDROP_NATS": ",".join(fleet.urls)}
     with BoundProcess(
@@ -288,5 +288,5 @@ def test_on_a_terminal_it_draws_until_it_is_interrupted(fleet: Cluster) -> None:
         assert b"Traceback" not in terminal.written
 
 
-def test_a_time_that_no_calendar_has() -> None:
+def test_an_impossible_time_is_a_question_mark() -> None:
     assert moment(10**30) == "?"

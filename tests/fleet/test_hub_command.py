@@ -54,7 +54,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.mark.slow
-def test_all_that_is_there_is_kept_once(
+def test_once_stores_every_present_row_once(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     require_module("duckdb")
@@ -131,7 +131,7 @@ def test_a_hub_whose_compaction_ends_fails(
     assert said.endswith("multidrop: compaction has ended: ZeroDivisionError: a mistake\n")
 
 
-def test_a_connection_whose_end_does_not_come_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_a_stuck_connection_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stuck:
         async def close(self) -> None:
             await asyncio.sleep(PATIENCE_S)
@@ -147,7 +147,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_no_server(
+def test_no_server_is_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(samples_stream, "ANSWER_S", 0.5)
@@ -158,7 +158,7 @@ def test_no_server(
     assert told.count("\n") == 1
 
 
-def test_servers_of_the_environment(
+def test_servers_come_from_the_environment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ports = free_ports(2)
@@ -174,7 +174,7 @@ def test_servers_of_the_environment(
     )
 
 
-def test_a_folder_of_something_else(
+def test_a_foreign_folder_is_one_sentence(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "report.txt").write_text("mine")
@@ -184,7 +184,7 @@ def test_a_folder_of_something_else(
     )
 
 
-def test_no_sink_and_two(capsys: pytest.CaptureFixture[str]) -> None:
+def test_exactly_one_sink_is_required(capsys: pytest.CaptureFixture[str]) -> None:
     status, told = refused(capsys, "nats://127.0.0.1:4222")
     assert status == 2
     assert "one of the arguments --parquet --postgres is required" in told
@@ -193,14 +193,14 @@ def test_no_sink_and_two(capsys: pytest.CaptureFixture[str]) -> None:
     assert "not allowed with argument" in told
 
 
-def test_credentials_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_credentials_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nobody.creds"
     told = refused(capsys, "nats://x", "--parquet", str(tmp_path / "hub"), "--credentials", str(path))
     assert told == (2, f"multidrop: {path}: No such file or directory\n")
     assert not (tmp_path / "hub").exists()
 
 
-def test_no_stream(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_stream_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         status, told = refused(capsys, one.urls[0], "--parquet", str(tmp_path / "hub"), "--once")
     assert status == 1

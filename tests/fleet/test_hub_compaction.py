@@ -91,7 +91,7 @@ class Broken(Exception):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_broken_off_before_each_step(
+def test_interrupted_before_each_step_no_row_is_lost(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After any number of files that were written or removed, and as often as it takes."""
@@ -152,7 +152,7 @@ def test_a_reader_of_merged_files_fails_or_has_every_row_once(sink: ParquetSink,
 
 
 @pytest.mark.long
-def test_files_are_no_larger_than_may_be(
+def test_merged_files_keep_the_size_limit(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(sink, range(FILES))
@@ -164,7 +164,7 @@ def test_files_are_no_larger_than_may_be(
 
 
 @pytest.mark.long
-async def test_a_hub_has_it_done_beside_its_reading(sink: ParquetSink, tmp_path: Path) -> None:
+async def test_a_hub_compacts_while_it_reads(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     task = asyncio.create_task(compact_for_ever(tmp_path, every=0.01))
     async with asyncio.timeout(60.0):

@@ -57,7 +57,7 @@ def test_lines_without_a_port_are_scraped() -> None:
     assert (found["lost_lines"], found["unopened_lines"]) == (1, 2)
 
 
-def test_what_a_gateway_says_is_scraped() -> None:
+def test_the_state_of_a_gateway_is_scraped() -> None:
     found = samples(STATE)
     assert found['gateway_info{gateway="gw-1",version="1.0"}'] == 1
     assert found['gateway_state{multidrop_fleet_gateway_state="working"}'] == 1
@@ -77,14 +77,14 @@ def test_unknown_figures_have_no_sample() -> None:
     assert found["lines"] == 4
 
 
-def test_promtool_finds_nothing_to_say() -> None:
+def test_promtool_accepts_the_metrics() -> None:
     program = require_program("promtool")
     text = expose_metrics(families_of(STATE, "1.0"), "*/*")[1]
     checked = subprocess.run([program, "check", "metrics"], input=text.encode(), capture_output=True)
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
 
 
-def test_a_reader_of_openmetrics_takes_it() -> None:
+def test_an_openmetrics_parser_accepts_the_metrics() -> None:
     parser = require_module("prometheus_client.openmetrics.parser")
     text = expose_metrics(families_of(STATE, "1.0"), OPEN)[1]
     found = {one.name: one.type for one in parser.text_string_to_metric_families(text)}
@@ -108,7 +108,7 @@ def said(head: bytes) -> tuple[int, str, str]:
     return int(head_text.split()[1]), fields["content-type"], body
 
 
-def test_both_forms_are_given() -> None:
+def test_both_metrics_formats_are_served() -> None:
     status, kind, text = said(asked())
     assert (status, kind) == (200, "text/plain; version=0.0.4; charset=utf-8")
     assert "multidrop_fleet_lines 4.0\n" in text
@@ -132,7 +132,7 @@ def test_both_forms_are_given() -> None:
         (asked("GET /metrics?x=1 HTTP/1.0"), 200),
     ],
 )
-def test_nothing_else_is_there(head: bytes, status: int) -> None:
+def test_only_metrics_are_served(head: bytes, status: int) -> None:
     assert said(head)[0] == status
 
 
@@ -160,7 +160,7 @@ def test_addresses_that_are_invalid_or_open_to_others_are_rejected(address: str,
         listen(address)
 
 
-def test_a_port_that_is_taken() -> None:
+def test_a_port_in_use_is_one_sentence() -> None:
     with closing(listen("127.0.0.1:0")) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=f"--metrics 127.0.0.1:{port} is not available: "):

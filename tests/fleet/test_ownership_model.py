@@ -235,7 +235,7 @@ def read(session: Session, bucket: int, record: Stored) -> Session:
 
 @pytest.mark.long
 @table("sessions, most, least", [("ab", 4, 50_000), ("abc", 2, 10_000)])
-def test_no_two_have_the_line_and_it_is_never_lost_in_any_interleaving(
+def test_no_line_has_two_masters_or_gets_lost_in_any_interleaving(
     sessions: str, most: int, least: int
 ) -> None:
     """Two sessions with five records, and three with three, were searched by hand: 553,000 states."""
@@ -255,6 +255,6 @@ MUTATIONS = {
 
 
 @table("mutation", MUTATIONS)
-def test_the_model_finds(mutation: str) -> None:
+def test_each_mutation_has_two_masters_or_a_lost_line(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search()
     assert wrong is not None

@@ -42,7 +42,7 @@ def test_each_mistake_is_reported(tmp_path: Path, table: str, sentence: str) -> 
     assert sentence in str(raised.value)
 
 
-def test_its_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`serve --check` works without it, and `serve` says what to install."""
     for name in [name for name in sys.modules if name.split(".")[0] == "nats"]:
         monkeypatch.setitem(sys.modules, name, None)
@@ -57,7 +57,7 @@ def test_its_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("dying", ["path", "watch"])
-def test_it_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch, dying: str) -> None:
+def test_the_part_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch, dying: str) -> None:
     """The gateway then says so; else the page would show an old fleet for ever."""
 
     async def go_on() -> None:
@@ -84,7 +84,7 @@ class Looks(FleetView):
             raise self.failure
 
 
-def test_it_is_not_well_once_the_newest_look_is_old() -> None:
+def test_an_old_view_is_unhealthy() -> None:
     now = [0.0]
     view = Looks(ServerPath([]))
     watch = FleetWatch(view, lambda: now[0])

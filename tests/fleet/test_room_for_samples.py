@@ -64,7 +64,7 @@ def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_servers_that_have_less_room_are_one_sentence(run: Run, tmp_path: Path, number: int) -> None:
+def test_servers_with_too_little_room_are_one_sentence(run: Run, tmp_path: Path, number: int) -> None:
     with cluster(tmp_path / "nats", number) as small:
         status, out, err = run("fleet", "init", "--nats", ",".join(small.urls))
     assert (status, out, err.count("\n")) == (1, "", 1)
@@ -89,7 +89,7 @@ def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> N
         assert "the stream of samples" not in run("fleet", "init", "--nats", one.urls[0])[2]
 
 
-def test_a_size_that_is_none(run: Run) -> None:
+def test_an_invalid_size_is_rejected(run: Run) -> None:
     status, out, err = run("fleet", "init", "--keep", "much")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert "invalid size 'much'" in err

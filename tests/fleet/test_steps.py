@@ -46,12 +46,12 @@ def steps(wake: Callable[[Member], object]) -> list[float]:
     return run_controlled(main())
 
 
-def test_steps_are_taken_again_and_again() -> None:
+def test_steps_are_taken_periodically() -> None:
     assert steps(lambda member: None) == pytest.approx([0.0, 0.05, 0.1])
 
 
 @pytest.mark.parametrize("times", [1, 100])
-def test_a_step_is_taken_at_once_where_records_have_changed(times: int) -> None:
+def test_changed_records_cause_a_step_at_once(times: int) -> None:
     def wake(member: Member) -> None:
         for _ in range(times):
             member.records._on_change()
@@ -71,7 +71,7 @@ def test_steps_are_never_taken_without_a_pause() -> None:
 
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
-def test_a_gateway_with_an_expiring_lease_ends_no_other(left_s: float, ends: bool) -> None:
+def test_a_gateway_with_an_expiring_lease_ends_no_other_session(left_s: float, ends: bool) -> None:
     """The servers fail all alike then; who was ended could not go on when they are back."""
 
     async def main() -> bool:

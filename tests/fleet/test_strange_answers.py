@@ -103,7 +103,7 @@ def test_an_invalid_answer_about_a_stream_is_reported(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*STRANGE, *PARTS])
-def test_a_stream_of_samples_that_answers_nonsense_is_tried_again(name: str) -> None:
+def test_an_invalid_answer_of_the_stream_is_a_stream_error(name: str) -> None:
     """Forwarder and hub try again after a StreamError, and end by any other."""
     client: Any = Liar({**STRANGE, **PARTS}[name])
     with pytest.raises(StreamError, match="the answer of NATS "):

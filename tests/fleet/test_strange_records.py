@@ -130,7 +130,7 @@ async def test_an_invalid_record_is_logged_once_and_others_are_read(
     assert told == ["ignored the record bad of the bucket own_2: it has no 'gateway'"]
 
 
-async def test_the_servers_take_no_huge_record_and_no_header_that_removes_others(one: Cluster) -> None:
+async def test_servers_reject_huge_records_and_rollup_headers(one: Cluster) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_2", lambda: path)
         await bucket.put("stays", OWNER, 0)
@@ -140,7 +140,7 @@ async def test_the_servers_take_no_huge_record_and_no_header_that_removes_others
         assert (await bucket.get("stays")).value == OWNER
 
 
-async def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) -> None:
+async def test_a_record_written_by_another_gateway_is_an_end(one: Cluster) -> None:
     async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
@@ -191,7 +191,7 @@ async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.long
-async def test_a_session_that_another_ends_too_early_is_believed_when_it_must_be_over(one: Cluster) -> None:
+async def test_an_early_end_by_another_counts_once_the_lease_has_expired(one: Cluster) -> None:
     """Its gateway hangs, and its engine polls on for as long as the lease holds: it cannot know."""
     async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})

@@ -45,7 +45,7 @@ async def test_an_ended_session_stays_ended() -> None:
     assert str(found) == "the disk is full"
 
 
-async def test_a_command_s_end_waits_for_no_path_that_was_deaf_once(tmp_path: Path) -> None:
+async def test_closing_a_commander_ends_a_path_that_ignored_a_cancellation(tmp_path: Path) -> None:
     fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
     fleet._keeping = [await _begun(1)]  # type: ignore[list-item]
     await asyncio.wait_for(fleet.close(), PATIENCE_S)

@@ -117,7 +117,7 @@ def tell(fleet: Cluster, tmp_path: Path, gateways: list[OnNats]) -> Callable[[St
     return lambda story: asyncio.run(main(story))
 
 
-def test_a_command_comes_on_three_paths_and_is_one_frame(tell: Callable[[Story], None]) -> None:
+def test_a_command_received_on_three_paths_is_sent_once(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         answer = await fleet.asker.write("pump", "frequency", 20.0)
@@ -181,7 +181,7 @@ async def _lost(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("deed", [_moved, _moved_back, _died, _lost])
-def test_a_line_that_moves_between_offer_and_do(
+def test_a_line_moved_after_the_offer_sends_nothing(
     tell: Callable[[Story], None], deed: Callable[[Fleet], Awaitable[None]]
 ) -> None:
     async def story(fleet: Fleet) -> None:
@@ -194,7 +194,7 @@ def test_a_line_that_moves_between_offer_and_do(
     tell(story)
 
 
-def test_a_doubled_do_on_all_paths_at_once(tell: Callable[[Story], None]) -> None:
+def test_a_confirmation_duplicated_on_all_paths_is_carried_out_once(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()
@@ -212,7 +212,7 @@ def test_a_doubled_do_on_all_paths_at_once(tell: Callable[[Story], None]) -> Non
     tell(story)
 
 
-def test_an_offer_is_of_no_use_to_another_gateway(tell: Callable[[Story], None]) -> None:
+def test_another_gateway_rejects_an_offer(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()

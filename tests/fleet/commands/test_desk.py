@@ -54,7 +54,7 @@ def setpoints(desk: Desks) -> list[int]:
     return [raw for name, raw in desk.writes if name == SETPOINT]
 
 
-def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks, tmp_path: Path) -> None:
+def test_a_command_is_offered_then_done_and_logged_before_and_after(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []  # an offer sends nothing
     answer = asyncio.run(desk.do(token))
@@ -68,7 +68,7 @@ def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks, 
     assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
-def test_a_doubled_do_is_carried_out_once_and_gets_the_same_answer(desk: Desks) -> None:
+def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Desks) -> None:
     token = desk.offered()
 
     async def twice() -> list[CommandAnswer]:
@@ -88,7 +88,7 @@ def test_copies_of_a_request_are_one_offer(desk: Desks) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
-def test_a_late_do_is_not_sent(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
+def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
     token = desk.offered()
     desk.clock.pass_s(seconds)
     answer = asyncio.run(desk.do(token))
@@ -191,14 +191,14 @@ def test_a_command_is_not_sent_after_a_change_in_between(desk: Desks, deed: str,
     assert desk.writes == []
 
 
-def test_a_stop_of_another_drive_ends_nothing(desk: Desks) -> None:
+def test_a_stop_of_another_drive_keeps_the_offer(desk: Desks) -> None:
     token = desk.offered()
     desk.desk.offers.void(LINE, ["fan"], "a stop was called")
     desk.desk.offers.void("hall-2", None, "a stop was called")
     assert asyncio.run(desk.do(token)).outcome is DONE
 
 
-def test_a_restarted_master_knows_no_token_of_before(desk: Desks, tmp_path: Path) -> None:
+def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered()
     with desks(tmp_path) as after:
         assert asyncio.run(after.do(token)).outcome is UNKNOWN
@@ -216,7 +216,7 @@ def test_only_the_master_answers(desk: Desks) -> None:
     assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
 
 
-def test_a_stop_waits_for_no_guard_and_a_command_does(desk: Desks) -> None:
+def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
     """In its first second a new master lets nothing else pass, and the motor must stop in it too."""
     desk.is_guarded = True
     assert desk.ask(register=SETPOINT, value=20.0) is None
@@ -237,7 +237,7 @@ def test_asking_for_the_result_withdraws_the_offer(desk: Desks) -> None:
     assert desk.writes == []
 
 
-def test_without_a_list_a_stop_alone_is_done(tmp_path: Path) -> None:
+def test_without_a_list_only_stops_are_carried_out(tmp_path: Path) -> None:
     with desks(tmp_path, {}) as desk:
         for what in ({"register": SETPOINT, "value": 20.0}, {"verb": "start"}, {"verb": "emergency_stop"}):
             answer = desk.ask(**what)
@@ -300,7 +300,7 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_gateway_that_loses_the_line_leaves_the_answer_to_the_next(
+def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
 ) -> None:
     """A copy may have reached that one. Where we have the line again, the asker's next copy stops it."""
@@ -340,7 +340,7 @@ def full_disk(record: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_a_full_disk_keeps_a_command_back_and_no_stop(desk: Desks) -> None:
+def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     token = desk.offered()
     desk.log.before = full_disk
     answer = asyncio.run(desk.do(token))
@@ -353,7 +353,7 @@ def test_a_full_disk_keeps_a_command_back_and_no_stop(desk: Desks) -> None:
 
 
 @pytest.mark.slow
-def test_many_at_once_are_bounded(desk: Desks) -> None:
+def test_concurrent_writes_on_a_line_are_limited(desk: Desks) -> None:
     async def main() -> list[CommandAnswer]:
         tokens = [desk.offered(20.0 + number) for number in range(MOST_WRITES + 3)]
         return await asyncio.gather(*(desk.do(token) for token in tokens))
@@ -412,7 +412,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("data", HOSTILE, ids=range(len(HOSTILE)))
-def test_hostile_words_are_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
+def test_hostile_commands_are_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
     answer = desk.desk.offer(LINE, data)
     assert isinstance(answer, CommandAnswer)
     assert answer.outcome is REFUSED
@@ -459,7 +459,7 @@ ODD_STOPS = [  # messages that any asker may send, or a network may spoil
 
 
 @pytest.mark.parametrize("data", every_third(ODD_STOPS))
-def test_a_stop_is_sent_whatever_is_wrong_with_its_words(
+def test_a_malformed_stop_is_carried_out(
     desk: Desks,
     data: bytes,
     caplog: pytest.LogCaptureFixture,
@@ -500,7 +500,7 @@ def test_a_stop_with_another_id_is_another_stop(
     assert len(desk.writes) == before + 1
 
 
-def test_a_stop_of_an_unknown_drive_says_so_and_stops_the_others(desk: Desks) -> None:
+def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
     answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
     assert answer is not None
     assert answer.outcome is REFUSED
@@ -527,7 +527,7 @@ def test_an_asker_rejects_invalid_answers(data: bytes) -> None:
 
 
 @pytest.mark.slow
-def test_of_many_stops_of_a_silent_drive_one_is_repeated(
+def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Each is sent after its call, and all have the answer of the one that is repeated."""
@@ -571,7 +571,7 @@ def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:
         assert answer.text.startswith("mill is ")
 
 
-def test_an_offer_forgets_nothing_of_the_setpoint_in_force() -> None:
+def test_an_offer_keeps_the_known_setpoint() -> None:
     """It is not sent yet, and perhaps never: a start would be refused, or not see a power cycle."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     drive.commanded = 40.0

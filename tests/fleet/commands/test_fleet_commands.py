@@ -141,7 +141,7 @@ WRITES: dict[
 
 
 @pytest.mark.parametrize("case", WRITES)
-def test_a_command_is_sent_once_and_its_outcome_is_as_certain_as_it_is(tmp_path: Path, case: str) -> None:
+def test_a_command_is_sent_once_and_its_outcome_is_true(tmp_path: Path, case: str) -> None:
     path, outcome, sent = WRITES[case]
     told = asked(tmp_path, path, write)
     assert told.outcome is outcome
@@ -192,7 +192,7 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
 
 
 @pytest.mark.parametrize("case", STOPS)
-def test_a_stop_is_sent_until_a_gateway_answers_and_news_come_at_once(tmp_path: Path, case: str) -> None:
+def test_a_stop_is_sent_until_a_gateway_answers(tmp_path: Path, case: str) -> None:
     path, outcome, text = STOPS[case]
     told = asked(tmp_path, path, stop)
     assert told.outcome is outcome
@@ -250,7 +250,7 @@ class HangingPath(ScriptedPath):
         raise AssertionError("it hangs")
 
 
-def test_a_stop_waits_for_no_path_that_hangs(tmp_path: Path) -> None:
+def test_a_stop_does_not_wait_for_a_hanging_path(tmp_path: Path) -> None:
     hanging, path = HangingPath(), ScriptedPath(stop=[IT_IS_DONE])
 
     async def stop_on_both(asker: FleetCommands) -> CommandAnswer:
@@ -262,7 +262,7 @@ def test_a_stop_waits_for_no_path_that_hangs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
-def test_a_stop_is_certainly_unsent_if_each_path_says_so(tmp_path: Path, others: list[Given]) -> None:
+def test_a_stop_is_unsent_only_if_every_path_reports_it(tmp_path: Path, others: list[Given]) -> None:
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
     async def stop_on_all(asker: FleetCommands) -> CommandAnswer:
@@ -274,7 +274,7 @@ def test_a_stop_is_certainly_unsent_if_each_path_says_so(tmp_path: Path, others:
     assert [path.asked[:1] for path in paths] == [["stop"]] * 3
 
 
-def test_a_full_disk_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+def test_a_full_disk_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     def full(*record: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -287,7 +287,7 @@ def test_a_full_disk_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
     assert path.asked == ["stop"]
 
 
-def test_a_log_that_cannot_be_opened_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+def test_an_unopened_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
     (tmp_path / "asked.jsonl").mkdir()
     told = asked(tmp_path, path, write)
@@ -340,7 +340,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 @pytest.mark.parametrize(
     ("by", "noted"), [("\x1b[31m", r"\x1b[31m"), ("\ud800", r"\ud800"), ("", "somebody"), (None, "somebody")]
 )
-def test_a_stop_is_sent_whatever_its_asker_calls_himself(tmp_path: Path, by: Any, noted: str) -> None:
+def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted: str) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
 
     async def stopped(asker: FleetCommands) -> CommandAnswer:
@@ -353,12 +353,12 @@ def test_a_stop_is_sent_whatever_its_asker_calls_himself(tmp_path: Path, by: Any
 
 
 @pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
-def test_a_plant_that_cannot_be_read(tmp_path: Path, what: Any) -> None:
+def test_an_unreadable_plant_sends_nothing(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):
         asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
 
 
-def test_a_plant_that_was_read_before_will_do(tmp_path: Path) -> None:
+def test_an_earlier_copy_of_the_plant_is_enough(tmp_path: Path) -> None:
     plant = Plant()
     plant._failure = FleetError("no server")
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
@@ -377,7 +377,7 @@ def test_a_stop_of_a_named_line_needs_no_plant(tmp_path: Path) -> None:
         asked(tmp_path, path, stop, plant)
 
 
-def test_a_drive_that_the_plant_has_not_keeps_no_other_s_stop_back(tmp_path: Path) -> None:
+def test_an_unknown_drive_does_not_block_other_stops(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}])
     told = asked(tmp_path, path, lambda asker: asker.stop(["pmp-2", "pump-1"]))
     assert path.asked == ["stop"]
@@ -390,7 +390,7 @@ def test_a_drive_that_the_plant_has_not_keeps_no_other_s_stop_back(tmp_path: Pat
 
 
 @pytest.mark.parametrize("what", ["write", "stop"])
-def test_a_drive_that_the_plant_has_not(tmp_path: Path, what: str) -> None:
+def test_an_unknown_drive_is_rejected_with_suggestions(tmp_path: Path, what: str) -> None:
     path = ScriptedPath()
     calls: dict[str, Callable[[FleetCommands], Awaitable[CommandAnswer]]] = {
         "write": lambda asker: asker.write("pump1", "frequency", 20.0),

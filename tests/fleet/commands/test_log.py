@@ -59,7 +59,7 @@ async def _write_and_stop(desk: Desks) -> None:
     assert desk.written == {"control"}
 
 
-def test_a_killed_log_thread_keeps_a_command_back_and_no_stop(tmp_path: Path) -> None:
+def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     with desks(tmp_path) as desk, patch.object(CommandLog, "_add", side_effect=SystemExit("killed")):
         asyncio.run(_write_and_stop(desk))
 
@@ -76,9 +76,7 @@ async def test_records_are_in_the_order_of_the_calls_and_none_follows_the_closin
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [HANGING_LOG, HANGING_LINE], ids=["log", "line"])
-def test_a_disk_or_a_port_that_hangs_does_not_keep_the_process_from_ending(
-    tmp_path: Path, script: str
-) -> None:
+def test_a_hanging_disk_or_port_does_not_block_the_exit(tmp_path: Path, script: str) -> None:
     words = [sys.executable, "-c", script, str(tmp_path / "commands.jsonl")]
     with BoundProcess(words, stderr=subprocess.PIPE, text=True) as process:
         _, errors = process.communicate(timeout=PATIENCE)

@@ -56,7 +56,7 @@ async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[Comma
             await path.close()
 
 
-def test_a_commander_may_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
+def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
     async def main(made: Desks) -> None:
         async with commanded(servers, made):
             for user, outcome in (("viewer", CommandOutcome.NOT_SENT), ("commander", CommandOutcome.DONE)):

@@ -89,7 +89,7 @@ async def test_a_renewal_counts_from_its_sending() -> None:
     assert lease.until == trial.masterships[0].until == sent + USUAL.lease
 
 
-async def test_a_taking_that_was_stored_and_not_answered_counts_for_nothing_until_it_is_renewed() -> None:
+async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
     """The time of its sending is unknown."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
@@ -117,7 +117,7 @@ async def test_the_deadline_is_the_second_latest() -> None:
     assert lease.until == began + SECOND + USUAL.lease
 
 
-async def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
+async def test_the_lease_survives_one_lost_path_but_not_two() -> None:
     trial, lease = await begun()
     trial.buckets[1].is_down = True
     for _ in range(20):
@@ -135,7 +135,7 @@ async def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> N
     assert lease.session == 1
 
 
-def test_a_renewal_that_failed_is_tried_again_soon() -> None:
+def test_a_failed_renewal_is_retried_soon() -> None:
     """The renewal does not wait once its bucket has a leader."""
 
     async def main() -> None:
@@ -159,7 +159,7 @@ def test_a_renewal_that_failed_is_tried_again_soon() -> None:
     run_controlled(main())
 
 
-async def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
+async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     trial, lease = await begun()
     until = lease.until
     for bucket in trial.buckets:
@@ -202,7 +202,7 @@ async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> No
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_the_end_of_a_session_is_written_over_its_own_renewals_alone(later: dict[str, Any]) -> None:
+async def test_an_end_replaces_only_renewals_of_its_own_session(later: dict[str, Any]) -> None:
     trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
@@ -279,7 +279,7 @@ async def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     assert [value["session"] for value in trial.values()] == [2, 2, 2]
 
 
-async def test_no_number_of_a_session_is_used_twice_whatever_others_write() -> None:
+async def test_no_session_number_is_used_twice_whatever_others_write() -> None:
     """Otherwise lines that others consider free could belong to a session that polls them."""
     trial = Trial()
     lease = trial.lease()
@@ -323,7 +323,7 @@ async def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
     assert not first.is_valid
 
 
-async def test_one_path_that_is_free_is_not_taken() -> None:
+async def test_a_single_free_path_is_not_taken() -> None:
     """Else a gateway that waits would take the paths of another one of its name one after the other."""
     trial = Trial()
     first, second = trial.lease(), trial.lease()
@@ -345,7 +345,7 @@ async def test_two_simultaneous_starts_are_never_both_valid() -> None:
     assert [first.is_valid, second.is_valid] == begun
 
 
-async def test_a_session_that_has_not_begun_takes_no_path_that_another_one_lives_by() -> None:
+async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
     """The first one's renewal of path 0 comes before the second one's taking of it; path 2 was renewed all
     the time."""
     trial = Trial()
@@ -409,7 +409,7 @@ async def test_a_lock_of_another_machine_or_file_proves_nothing(
         assert not await trial.lease(lock=lock).try_to_begin()
 
 
-async def test_a_copy_of_a_disk_proves_nothing_and_neither_does_a_machine_that_was_started_again(
+async def test_a_copied_disk_or_a_reboot_proves_no_death(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The machine's id, the path and the lock's own id are copied; the kernel's boot is not."""
@@ -446,7 +446,7 @@ def test_without_one_of_its_ids_a_machine_has_none(
 # ---- those who watch ----
 
 
-async def test_a_dead_gateway_is_ended_after_a_lease_by_the_watchers_clock() -> None:
+async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() -> None:
     trial = Trial()
     lease, observer = trial.lease(), trial.observer()
     assert await lease.try_to_begin()
@@ -483,7 +483,7 @@ async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bo
     assert observer.is_over("a", 1)
 
 
-async def test_only_the_judged_revision_is_ended() -> None:
+async def test_only_the_stale_revision_is_ended() -> None:
     """A record that is renewed between the judgement and its end stays, even if it was read again."""
     trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
@@ -525,7 +525,7 @@ async def test_no_gateway_ends_itself() -> None:
     assert not any(value["ended"] for value in trial.values("b"))
 
 
-async def test_a_gateway_that_was_cut_off_ends_no_other() -> None:
+async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
     """Else all gateways would end each other when servers that were away come back."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
@@ -607,7 +607,7 @@ def test_a_possibly_dead_gateway_is_read_at_once(since_s: float, rests_s: float)
     run_controlled(main())
 
 
-async def test_without_answers_no_gateway_is_judged() -> None:
+async def test_without_answers_no_gateway_counts_as_dead() -> None:
     """The server that it reads from may be suspended while others renew the leases."""
     trial, _lease, observer = await watched()
     for bucket in trial.buckets:
@@ -626,7 +626,7 @@ async def test_without_answers_no_gateway_is_judged() -> None:
     assert observer.dead().keys() == {"a"}
 
 
-async def test_an_end_by_another_counts_when_the_lease_must_have_run_out() -> None:
+async def test_an_end_by_another_counts_once_the_lease_has_expired() -> None:
     """Its writer may be hasty, wrong, or worse: until then the ended one may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
@@ -648,7 +648,7 @@ async def test_an_end_by_another_counts_when_the_lease_must_have_run_out() -> No
     assert late.is_over("a", 1)
 
 
-async def test_an_end_of_ones_own_session_counts_at_once() -> None:
+async def test_a_gateways_own_end_counts_at_once() -> None:
     trial, lease, observer = await watched()
     await lease.end()
     await look(observer)
@@ -656,7 +656,7 @@ async def test_an_end_of_ones_own_session_counts_at_once() -> None:
     assert await trial.lease().try_to_begin()
 
 
-async def test_a_gateway_of_this_name_waits_where_another_one_wrote_the_end() -> None:
+async def test_a_namesake_waits_if_another_gateway_wrote_the_end() -> None:
     trial = Trial()
     lease, second = trial.lease(), trial.lease()
     assert await lease.try_to_begin()
@@ -693,7 +693,7 @@ async def test_an_ended_path_stays_ended_for_this_session() -> None:
     assert lease.is_valid
 
 
-async def test_a_session_that_lost_a_path_is_weak_until_a_whole_one_follows() -> None:
+async def test_a_session_without_a_path_is_weak_until_the_next() -> None:
     trial, lease, observer = await watched()
     assert (lease.is_weak, observer.weak()) == (False, [])
     trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
@@ -738,7 +738,7 @@ async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_path_that_was_ended_before_its_taking_was_known_makes_a_session_weak() -> None:
+async def test_a_session_is_weak_if_a_late_path_was_ended() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()

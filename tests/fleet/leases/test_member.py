@@ -166,7 +166,7 @@ async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> As
             await path.close()
 
 
-async def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluster) -> None:
+async def test_each_gateway_has_its_share_and_dead_ones_are_replaced(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", "c") as running:
         await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
         dead = running.members["b"]
@@ -229,7 +229,7 @@ async def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
         assert not any(member.keeper.lost for member in (a, b, c))
 
 
-async def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None:
+async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         drained = running.members["c"]
         drained.drain()
@@ -263,7 +263,7 @@ def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
     asyncio.run(main())
 
 
-async def test_an_orderly_end_is_not_waited_for(fleet: Cluster) -> None:
+async def test_an_orderly_end_hands_over_at_once(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         await running.leave("a")
         await until(running.all_are_polled, "leave")
@@ -290,7 +290,7 @@ async def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
         await until(running.all_are_polled, "the plant as before")
 
 
-async def test_beside_gateways_with_other_rules_no_line_is_taken(
+async def test_beside_an_incompatible_gateway_no_line_is_claimed(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither at a gateway's start, nor when an incompatible one joins."""
@@ -316,7 +316,7 @@ async def test_beside_gateways_with_other_rules_no_line_is_taken(
 
 
 @pytest.mark.long
-async def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
+async def test_a_dead_node_moves_no_line(fleet: Cluster) -> None:
     """Two of three paths are renewed as before while the third waits for another leader: 4 to 9 s."""
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         member = running.members["a"]

@@ -96,7 +96,7 @@ def test_a_closing_line_answers_its_stops_until_it_is_closed(tmp_path: Path) -> 
         asyncio.run(main())
 
 
-def test_a_stop_is_carried_out_and_answered_to_an_inbox_alone(tmp_path: Path) -> None:
+def test_a_stop_is_answered_only_to_an_inbox(tmp_path: Path) -> None:
     """An answer that goes to a record of the plant would take its line from all gateways."""
     answered: list[str] = []
 
@@ -123,7 +123,7 @@ def test_a_stop_is_carried_out_and_answered_to_an_inbox_alone(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("may_wait", [True, False])
-def test_a_command_under_way_is_waited_for_where_the_lease_leaves_time(
+def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
     tmp_path: Path, may_wait: bool
 ) -> None:
     """The requester gets the result, before the end of the line can cut the answer off."""
@@ -182,9 +182,7 @@ class ClosedLines(SlowLines):
 
 
 @pytest.mark.parametrize("drives", [None, ["pump"]])
-def test_a_stop_that_finds_its_line_closed_is_left_to_the_next_master(
-    tmp_path: Path, drives: list[str] | None
-) -> None:
+def test_a_stop_on_a_closed_line_is_left_to_the_next_master(tmp_path: Path, drives: list[str] | None) -> None:
     """The requester would accept a refusal, and ask no other gateway."""
 
     async def main() -> None:

@@ -139,7 +139,7 @@ class DeadTrial(Trial):
         await asyncio.wait_for(self.is_polled(), 10)
 
 
-async def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is_over() -> None:
+async def test_a_claimed_line_accepts_stops_at_once_and_commands_after_the_guard() -> None:
     trial = await claimed()
     assert trial.lines.taken == {"hall"}
 
@@ -155,7 +155,7 @@ async def test_a_claimed_line_takes_stops_at_once_and_commands_when_the_guard_is
     assert may() == (False, False)
 
 
-async def test_a_line_that_another_has_by_its_record_takes_neither_stops_nor_commands() -> None:
+async def test_a_line_of_another_gateway_accepts_neither_stops_nor_commands() -> None:
     """It is about to be let go, and its new master answers."""
     trial = await claimed()
     trial.clock.pass_s(1)
@@ -178,7 +178,7 @@ async def test_lines_are_released_while_there_is_time_to_close_them() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_written() -> None:
+async def test_after_the_lease_waiting_work_neither_opens_nor_writes() -> None:
     trial = Trial()
     bucket = trial.buckets[0]
     writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
@@ -200,7 +200,7 @@ async def test_what_waited_until_the_lease_was_over_is_neither_opened_nor_writte
     assert trial.lines.taken == set()
 
 
-async def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> None:
+async def test_a_line_lost_while_waiting_is_not_opened() -> None:
     trial = Trial()
     openings = trial.keeper._openings = asyncio.Semaphore(0)
     await trial.read_and_begin()
@@ -212,7 +212,7 @@ async def test_a_line_that_became_anothers_while_it_waited_is_not_opened() -> No
     assert trial.lines.taken == set()
 
 
-async def test_a_closed_line_takes_no_stops() -> None:
+async def test_a_closed_line_accepts_no_stops() -> None:
     trial = await claimed()
     trial.keeper.releasing = {"hall"}
     await trial.reconcile()
@@ -274,7 +274,7 @@ async def test_a_line_of_a_dead_master_is_claimed_by_two() -> None:
 
 
 @pytest.mark.parametrize("place", [0, 1])
-async def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
+async def test_a_bucket_without_a_leader_does_not_delay_a_claim(place: int) -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[place].is_down = True
@@ -284,7 +284,7 @@ async def test_a_bucket_without_a_leader_holds_no_claim_up(place: int) -> None:
     assert owners(trial).count(ME) == 2
 
 
-async def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_late_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -295,7 +295,7 @@ async def test_a_bucket_that_answers_late_holds_no_claim_up(monkeypatch: pytest.
     assert trial.keeper.moves == 1
 
 
-async def test_a_refused_claim_waits_for_no_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Retry at once with newer records: a server that is cut off does not answer for long."""
     monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
     trial = DeadTrial()
@@ -322,7 +322,7 @@ async def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
     assert owners(trial) == [NOBODY, ME, ME]
 
 
-async def test_where_all_leases_are_late_no_bucket_is_written_last() -> None:
+async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
     """Servers that are busy are slow in all buckets."""
     trial = DeadTrial()
     await trial.read_and_begin()
@@ -347,7 +347,7 @@ async def test_a_bucket_with_a_lost_home_does_not_delay_claims(monkeypatch: pyte
     await asyncio.wait_for(trial.is_polled(), 10)
 
 
-async def test_where_another_was_first_nothing_more_is_written() -> None:
+async def test_a_lost_race_ends_the_claim() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
@@ -382,7 +382,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
     await until(lambda: owners(trial) == [NOBODY] * 3)
 
 
-async def test_an_answer_that_is_late_does_not_undo_the_giving_away() -> None:
+async def test_a_late_answer_does_not_undo_a_release() -> None:
     """The record was read before its answer came, and given away at once."""
     trial = Trial()
     await trial.read_and_begin()
@@ -420,7 +420,7 @@ async def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
     await until(lambda: "hall" in trial.keeper.polled)
 
 
-async def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
+async def test_an_unclosed_line_ends_the_gateway() -> None:
     """Its session is not ended: the others wait for as long as if it had died."""
     trial = await claimed()
 
@@ -436,7 +436,7 @@ async def test_a_line_that_is_not_closed_for_certain_ends_the_gateway() -> None:
     assert trial.keeper.polled
 
 
-async def test_a_line_on_which_anything_fails_is_that_line_s_alone(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
     """Such as a user's own class: it is logged with its cause, and tried again."""
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]

@@ -32,29 +32,29 @@ def test_a_released_line_has_no_master() -> None:
     assert told(FIRST, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
 
 
-def test_a_move_that_another_saw_whole_is_taken_from_it() -> None:
+def test_a_more_complete_report_of_a_move_replaces_another() -> None:
     assert told(move(2, None, "gw-2"), move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2")]
     assert told(move(2, "gw-1", "gw-2"), move(2, None, "gw-2")) == [("gw-1", "gw-2")]
 
 
-def test_a_line_that_one_gave_away_and_another_took_has_moved_once() -> None:
+def test_a_release_and_a_claim_by_two_gateways_are_one_move() -> None:
     """Each sees its own half: a drained gateway follows no lines, and the next one started late."""
     giver, taker = [FIRST, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
     assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]
 
 
-def test_turns_of_other_lines_are_other_moves() -> None:
+def test_moves_of_different_lines_are_separate() -> None:
     moves = told(move(2, "gw-1", ""), move(3, "", "gw-2", "hall-2"))
     assert moves == [("", "gw-2"), ("gw-1", "")]
 
 
-def test_what_is_told_comes_back() -> None:
+def test_a_move_survives_json() -> None:
     one = move(7, None, "gw-1")
     assert move_of(one.as_json()) == one
 
 
-def test_the_newest_are_kept_of_very_many() -> None:
+def test_only_the_newest_moves_are_kept() -> None:
     moves = Moves(most=10)
     for turn in range(1000, 0, -1):  # a first look reads its buckets in no order of time
         moves.add([move(turn, None, "gw-1", f"line-{turn}")])

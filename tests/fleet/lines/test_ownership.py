@@ -44,7 +44,7 @@ def test_few_lines_move_when_a_gateway_leaves_or_comes() -> None:
     assert must <= moved(all_of_them, without) <= must + len(LINES) // 20
 
 
-def test_all_gateways_find_the_same_in_any_order() -> None:
+def test_the_assignment_does_not_depend_on_order() -> None:
     lines, gateways = LINES[:], GATEWAYS[:]
     random.Random(1).shuffle(lines)
     random.Random(2).shuffle(gateways)
@@ -73,7 +73,7 @@ def test_each_line_is_with_the_heaviest_gateway_that_has_room(lines: int, number
     assert assign(LINES[:lines], GATEWAYS[:number]) == wanted
 
 
-def test_no_gateway_no_share() -> None:
+def test_without_gateways_no_line_is_assigned() -> None:
     assert assign(LINES, []) == {}
 
 
@@ -160,7 +160,7 @@ def test_claims_and_releases(case: str) -> None:
     assert found == wanted
 
 
-def test_nothing_is_written_elsewhere_before_the_first_record_was_read() -> None:
+def test_no_claim_before_the_first_record_was_read() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     records["first"] = None
     assert claim_of(ME, records, is_over) is None
@@ -197,7 +197,7 @@ def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tu
     return record and (record.value["gateway"], record.value["session"])
 
 
-def test_the_owner_is_whom_two_records_name_or_the_first_one_alone() -> None:
+def test_the_owner_has_two_votes() -> None:
     assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
     assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
     assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
@@ -225,7 +225,7 @@ def test_names_that_cannot_be_in_a_subject(name: str) -> None:
     ("name", "better"),
     [("hall 1", "hall-1"), ("hall.1", "hall-1"), ("зал 1", "1"), ("", "line-1"), ("*", "line-1")],
 )
-def test_a_name_that_would_do_is_said(name: str, better: str) -> None:
+def test_an_invalid_name_gets_a_suggestion(name: str, better: str) -> None:
     with pytest.raises(ValueError, match=f": write {better}$"):
         names.checked_name("line", name)
     assert names.is_name(better)

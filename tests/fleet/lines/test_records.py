@@ -51,7 +51,7 @@ class Trial:
         return self.bucket.asked > before
 
 
-def test_of_lines_that_are_free_or_ours_nothing_is_asked_again() -> None:
+def test_free_and_own_lines_are_read_once() -> None:
     trial = Trial()
     trial.bucket.store("mine", ME)
     trial.bucket.store("free", NOBODY)
@@ -65,7 +65,7 @@ def test_of_lines_that_are_free_or_ours_nothing_is_asked_again() -> None:
 
 
 @pytest.mark.parametrize("value", [OTHER, owner_value(("a", 1), 1, 0)])
-def test_a_line_of_another_session_is_asked_for_until_it_is_not(value: Any) -> None:
+def test_a_line_of_another_session_is_read_until_it_is_free(value: Any) -> None:
     trial = Trial()
     trial.bucket.store("line", value)
     trial.follower.want(["line"])
@@ -76,7 +76,7 @@ def test_a_line_of_another_session_is_asked_for_until_it_is_not(value: Any) -> N
     assert not trial.asks()
 
 
-def test_of_a_line_that_we_have_by_other_records_nothing_is_asked() -> None:
+def test_lines_owned_by_other_records_are_not_read() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])
@@ -87,7 +87,7 @@ def test_of_a_line_that_we_have_by_other_records_nothing_is_asked() -> None:
     assert not trial.asks()
 
 
-def test_a_doubted_line_is_asked_for_again_and_again_though_it_has_left_the_share(
+def test_an_uncertain_line_is_read_again_even_outside_the_share(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The unanswered write may still be stored when the bucket has a leader again."""
@@ -118,7 +118,7 @@ def test_an_older_record_of_a_server_that_is_behind_changes_nothing() -> None:
     assert is_mine(trial.follower.records["line"])
 
 
-async def test_a_larger_share_is_asked_for_at_once() -> None:
+async def test_a_larger_share_is_read_at_once() -> None:
     trial = Trial()
     trial.follower.want(["line"])
     await trial.follower.look()
@@ -156,7 +156,7 @@ def test_moves_name_the_former_master_once_two_records_agree() -> None:
     assert moves_of(records) == [("b", "a"), ("", "b")]
 
 
-def test_a_session_has_lines_of_which_one_record_names_it() -> None:
+def test_one_record_is_enough_to_own_a_line() -> None:
     records = followed()
     take(records, 1, OTHER, FIRST, SECOND)
     take(records, 2, ME, FIRST)

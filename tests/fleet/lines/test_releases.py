@@ -54,7 +54,7 @@ def test_lines_wait_until_two_buckets_are_known_to_have_a_leader(monkeypatch: py
     assert trial.releases.due(LINES) == {FIRST["own_1"], FIRST["own_2"]}
 
 
-def test_nothing_is_asked_where_no_line_is_to_be_released_and_nothing_is_believed_later(
+def test_servers_are_checked_only_while_lines_wait_for_release(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trial = Trial(monkeypatch)
@@ -81,7 +81,7 @@ def test_lines_wait_while_a_server_of_two_buckets_is_silent(monkeypatch: pytest.
     assert trial.releases.due(LINES) == LINES - {FIRST["own_1"]}
 
 
-def test_a_server_that_is_silent_for_long_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(LINES)

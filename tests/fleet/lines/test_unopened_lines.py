@@ -24,7 +24,7 @@ def failed(unopened: UnopenedLines, line: str) -> None:
         unopened.failed(line)
 
 
-def test_a_line_is_named_after_some_failed_openings_in_a_row() -> None:
+def test_a_line_is_reported_after_several_failed_openings() -> None:
     unopened = UnopenedLines(HandClock())
     for _ in range(OPENINGS - 1):
         unopened.failed("a")
@@ -38,7 +38,7 @@ def test_a_line_is_named_after_some_failed_openings_in_a_row() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_a_polled_line_is_named_once_its_port_is_lost_for_long() -> None:
+def test_a_polled_line_is_reported_once_its_port_is_lost_for_long() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     unopened.lost("a")
@@ -74,7 +74,7 @@ def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s
     assert lost_after(0.1)
 
 
-def test_one_line_at_a_time_is_tried_again_and_ever_more_rarely() -> None:
+def test_trials_take_one_line_at_a_time_with_backoff() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -90,7 +90,7 @@ def test_one_line_at_a_time_is_tried_again_and_ever_more_rarely() -> None:
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
-def test_a_line_that_no_gateway_can_open_is_tried_first_and_as_often() -> None:
+def test_hopeless_lines_are_tried_first_and_without_backoff() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -105,7 +105,7 @@ def test_a_line_that_no_gateway_can_open_is_tried_first_and_as_often() -> None:
     assert unopened.named() == {"a", "b", "c"}
 
 
-def test_once_a_trial_ended_well_the_others_are_tried_without_a_wait() -> None:
+def test_after_a_successful_trial_the_others_follow_at_once() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -116,7 +116,7 @@ def test_once_a_trial_ended_well_the_others_are_tried_without_a_wait() -> None:
         unopened.opened(line)
 
 
-def test_a_trial_takes_a_line_of_our_own_share_and_its_success_forgets_the_others() -> None:
+def test_a_trial_prefers_our_own_share_and_its_success_clears_the_rest() -> None:
     """Another gateway's line would not stay here after a trial."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
@@ -131,7 +131,7 @@ def test_a_trial_takes_a_line_of_our_own_share_and_its_success_forgets_the_other
     assert unopened.named() == frozenset()
 
 
-def test_a_line_that_does_not_come_back_ends_its_trial() -> None:
+def test_a_trial_ends_if_the_line_does_not_come_back() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     failed(unopened, "a")
@@ -156,7 +156,7 @@ SHARED = assign(LINES, ["a", "b", "c"])
 OF_A = {line for line, name in SHARED.items() if name == "a"}
 
 
-def test_only_named_lines_move_and_every_gateway_finds_the_same() -> None:
+def test_only_reported_lines_move_to_the_same_gateway_for_all() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
     assert set(found.values()) == {"b", "c"}
     assert {line for line in LINES if found[line] != SHARED[line]} == OF_A
@@ -172,7 +172,7 @@ def test_a_line_goes_to_a_gateway_that_has_not_tried_it() -> None:
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_that_does_not_say_what_it_cannot_open_is_given_nothing() -> None:
+def test_a_gateway_without_a_list_of_unopened_lines_gets_none() -> None:
     """Another version would not take lines handed over to it."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

@@ -126,7 +126,7 @@ async def read_all(client: Client, sink: SampleSink, place: int, every: float = 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_behind_for", [3, 10_000], ids=["looks", "ever"])
-def test_a_server_that_is_behind_ends_no_reading_of_all(
+def test_a_lagging_server_does_not_end_a_full_read(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_behind_for: int
 ) -> None:
     looks = itertools.count()
@@ -165,7 +165,7 @@ async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: 
 
 
 @pytest.mark.slow
-async def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_several_answers_are_stored(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
     async with client_of(running) as client:
         await say_all(client, 1, 12)
@@ -178,7 +178,7 @@ async def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest
 
 @pytest.mark.long
 @pytest.mark.parametrize("is_good", [True, False], ids=["rows", "garbage"])
-async def test_a_commit_ends_where_it_has_much_in_memory(
+async def test_a_commit_ends_at_its_memory_limit(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
     """Few rows may have long names, and ignored messages were read too."""
@@ -312,9 +312,7 @@ def commit_of(
     return Commit(stream, first, last, sources or {"a.x": last}, [table], len(table))
 
 
-def test_a_commit_has_its_name_once_it_is_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of system calls decides what a power cut leaves."""
     calls: list[str] = []
     really_synced, really_renamed = os.fsync, Path.rename
@@ -352,7 +350,7 @@ def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> Non
         ParquetSink(tmp_path)
 
 
-def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SinkError, match="cannot be written: Not a directory"):
         ParquetSink(tmp_path / "file")
@@ -383,7 +381,7 @@ async def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres)
 
 
 @pytest.mark.long
-def test_values_that_are_missing_in_part(empty: Postgres) -> None:
+def test_partly_missing_values_read_back(empty: Postgres) -> None:
     sink = PostgresSink(empty.where)
     sink.begin("then")
     table = unpack(message(0, 1))
@@ -440,7 +438,7 @@ def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Post
 
 
 @pytest.mark.slow
-def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postgres) -> None:
+def test_rows_after_a_moved_position_are_refused(empty: Postgres) -> None:
     """Behind a pooler several may have the same lock."""
     sink = PostgresSink(empty.where)
     sink.begin("then")
@@ -453,7 +451,7 @@ def test_rows_behind_a_place_that_another_hub_has_moved_are_refused(empty: Postg
 
 
 @pytest.mark.slow
-def test_no_database(empty: Postgres) -> None:
+def test_a_missing_database_is_one_sentence(empty: Postgres) -> None:
     sink = PostgresSink(f"{empty.where} connect_timeout=2".replace(f"port={empty.port}", "port=1"))
     with pytest.raises(SinkError, match=r"PostgreSQL: .*Connection refused"):
         sink.begin("then")
@@ -462,7 +460,7 @@ def test_no_database(empty: Postgres) -> None:
 
 
 @pytest.mark.long
-def test_rights_that_do_not_suffice(empty: Postgres) -> None:
+def test_insufficient_rights_are_one_sentence(empty: Postgres) -> None:
     empty.ask("drop role if exists reader; create role reader login")
     sink = PostgresSink(empty.where.replace("user=multidrop", "user=reader"))
     with pytest.raises(SinkError, match="PostgreSQL: permission denied for database postgres"):

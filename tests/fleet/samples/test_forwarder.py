@@ -103,7 +103,7 @@ async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: P
     spool.close()
 
 
-async def test_a_restarted_gateway_goes_on_behind_what_the_stream_has(
+async def test_a_restarted_gateway_continues_after_the_last_stored_message(
     running: Cluster, tmp_path: Path
 ) -> None:
     async with client_of(running) as client:
@@ -155,9 +155,7 @@ async def test_after_any_doubt_each_message_is_there_once(
     spool.close()
 
 
-async def test_answers_of_servers_among_a_logs_messages_are_passed_over(
-    running: Cluster, tmp_path: Path
-) -> None:
+async def test_server_answers_within_a_log_are_skipped(running: Cluster, tmp_path: Path) -> None:
     """Whoever asks a server anything may have its answer sent there: nothing is sent again, and nothing kept
     back."""
     spool = filled(tmp_path / "spool", 2)
@@ -205,7 +203,7 @@ async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
     ]
 
 
-async def test_messages_that_the_spool_dropped_are_passed_over(running: Cluster, tmp_path: Path) -> None:
+async def test_dropped_messages_of_the_spool_are_skipped(running: Cluster, tmp_path: Path) -> None:
     filled(tmp_path / "spool", 5).close()
     spool = Spool(tmp_path / "spool", "gateway-1", most=1)
     await store(spool, 25)
@@ -244,7 +242,7 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
 
 
 @pytest.mark.long
-async def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     spool = filled(tmp_path / "spool", 3)
     with cluster(tmp_path / "nats", 1) as servers:
         async with client_of(servers) as client, forwarding(spool, client) as forwarder:
@@ -275,7 +273,7 @@ async def test_the_largest_message_comes_back(running: Cluster) -> None:
 # ---- mistakes ----
 
 
-def test_a_server_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mute_server_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples_stream, "ANSWER_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"nats://127.0.0.1:{listener.getsockname()[1]}"
@@ -283,14 +281,14 @@ def test_a_server_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
             asyncio.run(connect([url]))
 
 
-def test_an_old_server(tmp_path: Path) -> None:
+def test_an_old_server_is_refused(tmp_path: Path) -> None:
     said = r"is 2\.\d+; a fleet needs 2\.12 or newer"
     with cluster(tmp_path, 1, old_server_program()) as servers, pytest.raises(TooOld, match=said):
         asyncio.run(connect(servers.urls))
 
 
 @pytest.mark.slow
-async def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
+async def test_a_missing_stream_is_reported_and_awaited(running: Cluster, tmp_path: Path) -> None:
     async with client_of(running) as client:
         await samples_stream._ask(client, "STREAM.DELETE.samples", {})
         for asked in (about(client), last_of(client, "samples.a.b")):
@@ -309,7 +307,7 @@ async def test_no_such_stream(running: Cluster, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_rights_that_do_not_suffice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_insufficient_rights_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
     with cluster(tmp_path, 1) as servers:
         path = tmp_path / "n1.conf"

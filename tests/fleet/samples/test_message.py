@@ -28,7 +28,7 @@ def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
 
 
 @pytest.mark.slow
-def test_the_rows_come_back() -> None:
+def test_rows_read_back_unchanged() -> None:
     (message,) = packed(example())
     assert message.rows == len(EXAMPLE)
     wanted = [(*row[:2], row[2] and 1000, *row[3:], None) for row in EXAMPLE]  # 7 ns, rounded up to 1 us
@@ -36,7 +36,7 @@ def test_the_rows_come_back() -> None:
 
 
 @pytest.mark.slow
-def test_pyarrow_alone_opens_it() -> None:
+def test_pyarrow_opens_a_message() -> None:
     """By the table in the module's docstring, and no function of ours."""
     (message,) = packed(example())
     with pa.ipc.open_stream(message.data) as reader:
@@ -179,13 +179,13 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
         ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
     ],
 )
-def test_rows_that_no_store_takes_are_no_message(column: str, rows: pa.Array, said: str) -> None:
+def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, said: str) -> None:
     """A hub that could not keep one message would never come to those behind it, of all gateways."""
     with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
 
 
-def test_another_writers_rows_are_rows() -> None:
+def test_rows_of_another_arrow_writer_are_accepted() -> None:
     assert rows_of(unpack(written()))[0][3:] == ("fan", "speed", 1.0, "ok", "Hz")
     assert len(unpack(written(drive=named("ü" * 500, "fan")))) == 2
 
@@ -203,7 +203,7 @@ def alike(rows: int) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_a_message_of_more_rows_than_ours_have_is_none() -> None:
+def test_a_message_with_too_many_rows_is_rejected() -> None:
     many = MOST_ROWS + 1
     columns = alike(many)
     with pytest.raises(MessageError, match="65537 rows; the limit is 65536"):
@@ -243,9 +243,7 @@ def bomb(compression: str) -> bytes:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_what_would_grow_beyond_measure_is_not_unpacked(
-    compression: str, most_allocated: Callable[[], int]
-) -> None:
+def test_decompression_bombs_are_not_unpacked(compression: str, most_allocated: Callable[[], int]) -> None:
     data = bomb(compression)
     before = most_allocated()
     with pytest.raises(MessageError, match=r"2684\d{5} bytes unpacked; the limit is 4194304"):
@@ -255,9 +253,7 @@ def test_what_would_grow_beyond_measure_is_not_unpacked(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("column", OF_ONE_TEXT)
-def test_columns_that_would_grow_by_a_cast_are_no_message(
-    column: str, most_allocated: Callable[[], int]
-) -> None:
+def test_columns_that_grow_by_a_cast_are_rejected(column: str, most_allocated: Callable[[], int]) -> None:
     rows = 30_000
     columns = alike(rows)
     data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
@@ -267,7 +263,7 @@ def test_columns_that_would_grow_by_a_cast_are_no_message(
     assert most_allocated() - before < 8 << 20
 
 
-def test_rows_that_take_no_bytes_are_counted_first(most_allocated: Callable[[], int]) -> None:
+def test_rows_without_bytes_are_limited_too(most_allocated: Callable[[], int]) -> None:
     schema = pa.schema([("time", pa.null())])
     rows = pa.RecordBatch.from_arrays([pa.Array.from_buffers(pa.null(), 1 << 30, [None])], schema=schema)
     sink = pa.BufferOutputStream()
@@ -286,7 +282,7 @@ def test_an_older_format_version_is_rejected() -> None:
 
 
 @pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
-def test_the_size_is_that_which_pyarrow_unpacks(options: pa.ipc.IpcWriteOptions | None) -> None:
+def test_the_size_equals_the_buffers_that_pyarrow_unpacks(options: pa.ipc.IpcWriteOptions | None) -> None:
     """Equal texts are compressed, random numbers are not, and empty lists have no bytes."""
     dice = random.Random(3)
     data = written(

@@ -78,7 +78,7 @@ def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
     assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # without a description
 
 
-def test_a_gateway_notes_the_units_of_a_line_that_it_takes(tmp_path: Path) -> None:
+def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
     units = PolledUnits()
     lines = FleetLines(Mastership(), tmp_path, units)
     lines._take(record('unit = "V"'))
@@ -112,7 +112,7 @@ def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None
     assert {found[at] for at in range(52, 90, 4)} == {"A"}
 
 
-def test_units_have_the_words_of_a_history() -> None:
+def test_units_are_named_as_in_a_history() -> None:
     plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
     assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
     assert polled_units.RAW == quantities.RAW
@@ -141,7 +141,7 @@ BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [1, 120])
-def test_plots_of_a_hubs_folder_put_no_two_units_together(kept: Path, points: int) -> None:
+def test_plots_do_not_mix_units(kept: Path, points: int) -> None:
     with History(kept) as history:
         found = history.buckets([f"pump-1.value_{at}" for at in (1, 2, 3, 4)], BEGIN, END, points)
         before = history.buckets("pump-1.value_1", BEGIN, BEFORE, points)["pump-1.value_1"]
@@ -175,6 +175,6 @@ def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_a_file_of_a_hub_is_read_by_its_folder(kept: Path) -> None:
+def test_a_single_file_of_a_hub_is_refused(kept: Path) -> None:
     with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder with"):
         multidrop.open_recording(min((kept / "rows").iterdir()))

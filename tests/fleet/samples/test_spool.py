@@ -65,7 +65,7 @@ def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_second_of_rows_is_a_message_without_being_asked(spool: Spool, folder: Path) -> None:
+def test_rows_become_a_message_after_a_second(spool: Spool, folder: Path) -> None:
     spool.append(numbered(0, 3))
     until(lambda: spool.state().written == 30)
     assert [file.name for file in folder.glob("*.arrows")] == ["000000000001-30.arrows"]
@@ -82,7 +82,7 @@ def test_16384_rows_are_a_message_at_once(
     assert len(list(folder.glob("*.arrows"))) == 1
 
 
-def test_the_log_goes_on_behind_its_newest_message(folder: Path) -> None:
+def test_a_log_continues_after_its_newest_message(folder: Path) -> None:
     filled(folder, 3)
     log = json.loads((folder / "spool.json").read_text())["log"]
     spool = Spool(folder, GATEWAY)
@@ -139,7 +139,7 @@ def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
         shutil.rmtree(folder)
 
 
-def test_the_number_of_a_message_that_was_put_away_is_not_given_again_after_any_start(folder: Path) -> None:
+def test_the_number_of_a_damaged_message_is_not_reused(folder: Path) -> None:
     """The stream may have had it whole: another one of this number would be taken for its copy."""
     filled(folder, 2, exchanges=2)
     newest = max(folder.glob("*.arrows"))
@@ -164,7 +164,7 @@ def _is_whole(data: bytes) -> bool:
         return False
 
 
-def test_nothing_has_its_name_before_it_is_on_the_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of system calls decides what a power cut leaves."""
     calls: list[str] = []
     names: dict[int, str] = {}
@@ -246,7 +246,7 @@ def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
     assert "the spool is full at" in caplog.text
 
 
-def test_early_removals_are_counted_when_the_stream_answers(folder: Path) -> None:
+def test_removals_before_the_first_answer_are_counted_later(folder: Path) -> None:
     filled(folder, 6)
     spool = Spool(folder, GATEWAY, most=1)  # the newest stays
     store(spool, 30, 5)
@@ -260,7 +260,7 @@ def test_early_removals_are_counted_when_the_stream_answers(folder: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_logged_and_delays_no_poller(
+def test_a_full_disk_is_logged_and_does_not_delay_the_poller(
     folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.01)
@@ -291,7 +291,7 @@ def test_a_full_disk_is_logged_and_delays_no_poller(
 
 
 @pytest.mark.slow
-def test_a_full_disk_takes_what_was_forwarded_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_removes_forwarded_messages_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.01)
     filled(folder, 3)
     spool = Spool(folder, GATEWAY)
@@ -308,7 +308,7 @@ def test_a_full_disk_takes_what_was_forwarded_first(folder: Path, monkeypatch: p
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("acknowledged", "left"), [(None, [1, 2, 3]), (0, [1, 2, 3]), (1, [2, 3]), (3, [3])])
-def test_a_full_disk_takes_neither_what_the_stream_lacks_nor_the_newest_which_says_what_comes_next(
+def test_a_full_disk_keeps_unsent_messages_and_the_newest(
     folder: Path, monkeypatch: pytest.MonkeyPatch, acknowledged: int | None, left: list[int]
 ) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.001)
@@ -362,7 +362,7 @@ def test_two_processes_do_not_write_one_spool(spool: Spool, folder: Path) -> Non
         Spool(folder, GATEWAY)
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "report.txt").write_text("mine")
     with pytest.raises(SpoolError, match=r"is not a spool: it holds 'report.txt' and no spool.json"):
         Spool(tmp_path, GATEWAY)
@@ -378,14 +378,14 @@ def test_another_gateways_spool_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", '{"format": "multidrop spool 9"}', '{"format": "multidrop spool 1"}']
 )
-def test_a_head_that_is_none(folder: Path, text: str) -> None:
+def test_an_invalid_head_is_refused(folder: Path, text: str) -> None:
     folder.mkdir()
     (folder / "spool.json").write_text(text)
     with pytest.raises(SpoolError, match=r"spool.json is not the head of a spool of this version"):
         Spool(folder, GATEWAY)
 
 
-def test_a_folder_that_cannot_be_written() -> None:
+def test_an_unwritable_folder_is_refused() -> None:
     with (
         read_only_directory() as path,
         pytest.raises(SpoolError, match=f"the spool {path} cannot be written: Permission denied"),
@@ -394,12 +394,12 @@ def test_a_folder_that_cannot_be_written() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a.b", "a b", "*", ">", "ä", "a/b"])
-def test_a_name_that_no_subject_may_have(folder: Path, name: str) -> None:
+def test_names_invalid_in_subjects_are_rejected(folder: Path, name: str) -> None:
     with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
         Spool(folder, name)
 
 
-def test_a_batch_comes_back_as_it_was(spool: Spool, folder: Path) -> None:
+def test_a_stored_batch_reads_back_unchanged(spool: Spool, folder: Path) -> None:
     batch = numbered(0, 20)
     spool.append(batch)
     assert spool.sync(30.0)

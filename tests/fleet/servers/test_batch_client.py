@@ -55,7 +55,7 @@ def test_nats_py_has_the_place_where_answers_are_taken() -> None:
     assert inspect.iscoroutinefunction(Client._process_msg)
 
 
-async def test_answers_are_taken_at_once(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_answers_bypass_the_queue_of_nats_py(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     async def fail(self: BatchClient, message: object) -> None:
         raise AssertionError("it came in nats-py's own way")
 
@@ -82,7 +82,7 @@ def _rested(path: ServerPath) -> None:
         b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
     ],
 )
-def test_the_servers_headers_count_whatever_the_writer_has_sent(writers: bytes) -> None:
+def test_server_headers_take_precedence_over_the_writers(writers: bytes) -> None:
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 
@@ -95,11 +95,11 @@ def test_the_servers_headers_count_whatever_the_writer_has_sent(writers: bytes) 
         b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
     ],
 )
-def test_other_headers_are_of_no_stored_message(headers: bytes) -> None:
+def test_other_headers_end_an_answer(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
-async def test_a_record_like_an_end_marker_hides_no_later_one(one: Cluster, way: str) -> None:
+async def test_a_record_like_an_end_marker_does_not_hide_later_ones(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
@@ -158,7 +158,7 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
 
 
 @pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
-async def test_what_a_server_that_is_cut_off_got_is_asked_again(
+async def test_reads_lost_on_a_cut_off_server_are_repeated(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
 ) -> None:
     monkeypatch.setattr(direct_gets, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
@@ -231,7 +231,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
         await one_of.close()
 
 
-async def test_a_pong_that_comes_too_late_ends_no_reading(one: Cluster) -> None:
+async def test_a_late_pong_does_not_end_reading(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     given_up = asyncio.get_running_loop().create_future()
     given_up.cancel()  # as a flush leaves it that timed out
@@ -257,7 +257,7 @@ async def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> 
 
 
 @pytest.mark.usefixtures("way")
-async def test_other_messages_go_where_they_went(one: Cluster) -> None:
+async def test_other_messages_are_delivered_as_usual(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     assert isinstance(client, BatchClient)
     await client.replies([Request("$JS.API.INFO", b"")], 5.0)

@@ -70,31 +70,31 @@ def asked(ways: Sequence[SlowWay]) -> list[list[float]]:
     return [way.asked for way in ways]
 
 
-def test_at_rest_one_way_is_asked_once() -> None:
+def test_a_prompt_answer_needs_one_request() -> None:
     ways = [SlowWay("a", 0.01), SlowWay("b", 0.01), SlowWay("c", 0.01)]
     assert answer(*ways) == ("a", 0.01)
     assert asked(ways) == [[0.0], [], []]
 
 
-def test_a_question_that_a_server_without_a_network_got_goes_to_the_others_too() -> None:
+def test_an_unanswered_read_is_repeated_on_all_paths() -> None:
     """By chance a server passes it on to the one that is cut off."""
     ways = [SlowWay("a"), SlowWay("b", NEVER, 0.01), SlowWay("c")]
     assert answer(*ways) == ("b", 0.21)
     assert asked(ways) == [[0.0, 0.2], [0.1, 0.2], [0.1, 0.2]]
 
 
-def test_an_answer_to_the_first_question_counts_though_it_was_asked_again() -> None:
+def test_a_late_first_answer_counts_after_a_repeat() -> None:
     ways = [SlowWay("a", 0.15), SlowWay("b")]
     assert answer(*ways) == ("a", 0.15)
 
 
-def test_a_long_answer_is_not_asked_for_again_while_its_messages_come() -> None:
+def test_a_long_answer_is_not_requested_again_while_it_arrives() -> None:
     ways = [SlowWay("a", 0.01, pause=0.09), SlowWay("b", 0.01)]
     assert answer(*ways) == ("a", 0.28)
     assert asked(ways) == [[0.0], []]
 
 
-def test_a_way_that_fails_is_not_waited_for() -> None:
+def test_a_failed_path_is_not_waited_for() -> None:
     ways = [SlowWay("a", 0.0, failure=Unsure("lost")), SlowWay("b", 0.01), SlowWay("c")]
     assert answer(*ways) == ("b", 0.01)
 
@@ -107,7 +107,7 @@ def test_a_failure_of_all_paths_is_raised_at_once() -> None:
         assert asked(ways) == [[0.0], *[[0.01]] * (number - 1)]
 
 
-def test_what_may_not_be_asked_is_asked_once() -> None:
+def test_a_forbidden_read_is_not_repeated() -> None:
     ways = [SlowWay("a", 0.01, failure=NoRight("no")), SlowWay("b", 0.01)]
     with pytest.raises(NoRight):
         answer(*ways)
@@ -151,13 +151,13 @@ def questions(reads: int, ways: Sequence[LateWay], spare: Spare) -> int:
     return sum(map(len, asked(ways))) - before
 
 
-def test_nothing_is_asked_again_before_answers_came_in_time() -> None:
+def test_no_read_is_repeated_before_timely_answers() -> None:
     """Many gateways that start together each read a lot."""
     assert questions(100, [LateWay(0.9) for _ in range(3)], Spare()) == 100
 
 
 @pytest.mark.slow
-def test_a_cluster_that_is_slow_is_not_asked_again_and_again() -> None:
+def test_a_slow_cluster_gets_no_repeats() -> None:
     ways, spare = [LateWay(0.9) for _ in range(3)], full()
     assert 300 < questions(300, ways, spare) < 300 + MOST_SPARE
     assert questions(300, ways, spare) == 300
@@ -165,7 +165,7 @@ def test_a_cluster_that_is_slow_is_not_asked_again_and_again() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [2, 5, 20])
-def test_where_one_read_of_some_is_late_few_questions_are_asked_again(late: int) -> None:
+def test_occasional_late_reads_cause_few_repeats(late: int) -> None:
     ways, spare = [LateWay(0.9) for _ in range(3)], full()
     questions(300, ways, spare)
     count = 0
@@ -176,7 +176,7 @@ def test_where_one_read_of_some_is_late_few_questions_are_asked_again(late: int)
     assert count < 300 * (1 + EARNED)
 
 
-def test_answers_in_time_pay_for_questions_that_are_asked_again() -> None:
+def test_timely_answers_earn_repeats() -> None:
     ways, spare = [LateWay(0.9) for _ in range(3)], full()
     questions(300, ways, spare)
     for way in ways:
@@ -186,7 +186,7 @@ def test_answers_in_time_pay_for_questions_that_are_asked_again() -> None:
     assert questions(1, ways, spare) == 3
 
 
-def test_there_are_questions_to_spare_until_a_dead_route_is_left() -> None:
+def test_the_budget_lasts_until_a_dead_route_is_dropped() -> None:
     """A gateway reads some 100 times within these 3 s, and a third of its questions is lost."""
     ways, spare = [LateWay(0.01) for _ in range(3)], full()
     took = []
@@ -203,7 +203,7 @@ def test_there_are_questions_to_spare_until_a_dead_route_is_left() -> None:
     assert max(took) < 0.12
 
 
-def test_a_path_without_a_question_to_spare_comes_to_an_end() -> None:
+def test_a_failed_read_without_budget_ends() -> None:
     spare = Spare()
     ways = [SlowWay("a", 0.01, failure=Unsure("it ended with 503")), SlowWay("b", 0.01)]
 

@@ -87,12 +87,12 @@ def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
     return Servers(monkeypatch)
 
 
-def test_nothing_is_handed_over_while_all_servers_are_there(servers: Servers) -> None:
+def test_no_hand_over_while_all_servers_are_present(servers: Servers) -> None:
     servers.pass_s(100)
     assert set(servers.terms.values()) == {1}
 
 
-def test_nothing_is_handed_over_for_a_server_that_lags(servers: Servers) -> None:
+def test_a_lagging_server_causes_no_hand_over(servers: Servers) -> None:
     servers.lagging = {"n3"}
     servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
@@ -118,7 +118,7 @@ def test_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Serve
     assert HAND_OVER_S < ASKS_S
 
 
-def test_a_bucket_whose_leader_was_silent_is_kept_ahead_once_it_has_another(servers: Servers) -> None:
+def test_a_bucket_with_a_new_leader_is_handed_over(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     servers.pass_s(1)
@@ -126,7 +126,7 @@ def test_a_bucket_whose_leader_was_silent_is_kept_ahead_once_it_has_another(serv
     assert servers.leaders[names.LEASES[2]] == "n2"
 
 
-def test_a_server_that_is_silent_for_long_is_left_alone_until_it_was_back(servers: Servers) -> None:
+def test_a_long_silent_server_is_ignored_until_it_returns(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     servers.pass_s(round(SILENT_FOR_S) + 5)
@@ -140,20 +140,20 @@ def test_a_server_that_is_silent_for_long_is_left_alone_until_it_was_back(server
     assert all(servers.terms[bucket] > before[bucket] for bucket in names.LEASES)
 
 
-def test_where_a_bucket_finds_no_leader_no_other_is_handed_over(servers: Servers) -> None:
+def test_after_a_failed_hand_over_no_other_follows(servers: Servers) -> None:
     servers.silent, servers.stuck = {"n3"}, set(names.LEASES)
     servers.leaders[names.LEASES[2]] = "n1"
     servers.pass_s(1)
     assert sorted(servers.terms.values()) == [1, 1, 2]
 
 
-def test_one_server_alone_hands_nothing_over(servers: Servers) -> None:
+def test_a_single_server_hands_nothing_over(servers: Servers) -> None:
     servers.silent = {"n2", "n3"}
     servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
 
 
-def test_a_leader_that_answers_nothing_holds_no_look_up(servers: Servers) -> None:
+def test_a_silent_leader_does_not_delay_the_others(servers: Servers) -> None:
     servers.silent = {"n2"}
 
     async def main() -> None:
@@ -187,7 +187,7 @@ def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
     run_controlled(main())
 
 
-def test_leaders_come_home_once_they_can(servers: Servers) -> None:
+def test_leaders_return_home(servers: Servers) -> None:
     """A leader that was handed over for a silent server returns home afterwards."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}

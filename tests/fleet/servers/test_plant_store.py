@@ -67,7 +67,7 @@ def as_text(line: Any) -> str:
     )
 
 
-def test_lines_come_out_as_they_went_in(tmp_path: Path) -> None:
+def test_stored_lines_equal_the_plants(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT, "utf-8")
     again = lines_again(path, tmp_path / "gateway")
@@ -96,7 +96,7 @@ def test_a_record_writes_no_file_outside_of_its_folder(tmp_path: Path, name: str
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-async def test_lines_that_are_as_before_keep_their_revision() -> None:
+async def test_unchanged_lines_keep_their_revision() -> None:
     memory = MemoryBucket("plant")
     bucket: Any = memory
     first = {name: {"line": {"name": name}, "files": {}} for name in ("a", "b", "c")}
@@ -110,7 +110,7 @@ async def test_lines_that_are_as_before_keep_their_revision() -> None:
     assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
 
 
-def test_a_line_s_record_has_its_own_lists_alone(tmp_path: Path) -> None:
+def test_a_lines_record_has_only_its_own_lists(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT)
     _, before = read_plant(path)

@@ -86,7 +86,7 @@ def told(servers: SecuredCluster, user: str, *words: str) -> str:
 
 @pytest.mark.slow  # the longest file of its room starts first
 @pytest.mark.long
-def test_a_route_to_a_server_that_is_silent_is_left_soon(tmp_path: Path) -> None:
+def test_a_route_to_a_silent_server_is_dropped_soon(tmp_path: Path) -> None:
     """By itself NATS takes a minute and more, and hands that server questions for so long."""
 
     def routes(node: SecuredNode) -> int:
@@ -129,7 +129,7 @@ def test_a_missing_right_is_one_sentence(
 
 
 @pytest.mark.slow
-def test_a_stored_message_that_is_asked_for_into_anothers_samples_is_left_out(
+def test_a_stored_message_directed_into_anothers_samples_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Servers with an account for all send what is asked for wherever its asker says, with its headers."""
@@ -253,7 +253,7 @@ def test_a_tls_server_is_not_contacted_without_tls(run: Run, servers: SecuredClu
 
 
 @pytest.mark.long
-def test_a_context_for_tls_believes_this_authority_alone(servers: SecuredCluster) -> None:
+def test_tls_trusts_only_the_given_authority(servers: SecuredCluster) -> None:
     context = servers.options("hub")["tls"]
     assert context.verify_mode is ssl.CERT_REQUIRED
     assert context.check_hostname

@@ -99,7 +99,7 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
             asyncio.run(_init(old.urls))
 
 
-def test_servers_that_do_not_look_at_all_writers_records_are_refused(
+def test_servers_that_ignore_other_writers_records_are_refused(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such ones would give a lease to its gateway and to who ends it. Some answers may come too late."""
@@ -109,7 +109,7 @@ def test_servers_that_do_not_look_at_all_writers_records_are_refused(
 
 
 @table(("is_carried_out",), [(True,), (False,)])
-def test_a_removal_that_nobody_answers_is_looked_after(
+def test_an_unanswered_removal_is_checked_and_repeated(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A busy leader may be late with its answer to the end of the contest."""
@@ -131,7 +131,7 @@ def test_a_removal_that_nobody_answers_is_looked_after(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_server_that_is_down_is_waited_for_at_first_and_not_later(tmp_path: Path) -> None:
+def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
     """Buckets created without it would stay on two servers: the failure of either ends all polling."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
@@ -167,9 +167,7 @@ NO_LEADER = (
 
 
 @pytest.mark.slow
-def test_servers_that_say_that_they_cannot_decide_have_no_quorum(
-    nats: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_undecided_servers_have_no_quorum(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
 
     async def refuse(self: ServerPath, subject: str, *rest: object) -> SimpleNamespace:
@@ -231,9 +229,7 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_a_leader_that_is_being_elected_is_waited_for(
-    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_election_in_progress_is_waited_for(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bucket has no leader for a moment after its leader died, though most servers run."""
     told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
 
