@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 from lines import PATIENCE
 from motors import MAKE
+from profile_families import MAKE as PROFILES
 from simulated_bus import SimulatedBus, is_write, one
 from stop_frames import all_stopped, starts
 from toy import Toy
@@ -22,11 +24,7 @@ from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read
 from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import (
-    NoReply,
-    Unconfirmed,
-    WriteForbidden,
-)
+from multidrop.errors import BusError, NoReply, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 
@@ -196,6 +194,23 @@ def test_a_staggered_start_does_not_stop_drives_it_never_reached(monkeypatch: py
     line.frames.clear()
     with pytest.raises(WriteForbidden, match="OC1"):
         start_staggered(drives, 1.0)
+    assert {request.address for request, _ in line.frames if is_write(request)} == {1, 2}
+
+
+def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The stop of an IBD, 0001H to 2000H, runs an INVT Goodrive, which is no built-in family."""
+    sims: list[Any] = [simulated(InnovertIBD(1)), simulated(PROFILES["invt-goodrive"](2))]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives: list[Any] = [line.attach(InnovertIBD(address)) for address in (1, 2)]
+    drives[0].set_frequency(20)
+    with pytest.raises(WriteForbidden, match="confirmed = 1"):
+        start_staggered(drives, 1.0)
+    assert {request.address for request, _ in line.frames if is_write(request)} == {1}
+    assert not any(sim.motor.goal for sim in sims)
+    with suppress(BusError):
+        drives[1].stop(seconds=1)  # a stop that the user calls is sent
     assert {request.address for request, _ in line.frames if is_write(request)} == {1, 2}
 
 

@@ -23,9 +23,11 @@ HEARD_S = PAUSE_NS / 2e9
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
-    If a start fails, stop that drive and all started before it, and raise the failure. A drive whose stop is
-    called on any thread during this call is not started. Drives that wait for their turn are read regularly,
-    because after a silence a setpoint that cannot be read back is assumed lost.
+    If a start fails, stop that drive and all started before it, and raise the failure. That drive itself is
+    sent no stop if its identity is not confirmed and nothing was sent to it, because the stop of its declared
+    family may start another one. A drive whose stop is called on any thread during this call is not started.
+    Drives that wait for their turn are read regularly, because after a silence a setpoint that cannot be read
+    back is assumed lost.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s: it must be 0 or more")
@@ -37,9 +39,11 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
         try:
             if number:
                 unheard_s = _await_turn(drives[number:], gap, unheard_s)
-            drive.carry_out_move(drive.start.script(direction), call and call.restarted())
+            call = call and call.restarted()
+            drive.carry_out_move(drive.start.script(direction), call)
         except BaseException:
-            _stop(drives[: number + 1])
+            is_safe_to_stop = call is None or call.sent or drive.bus.knows_identity(drive)
+            _stop(drives[: number + bool(is_safe_to_stop)])
             raise
 
 
