@@ -583,14 +583,14 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
             lines = made.poller._lines
             polled_line = lines.find("hall")
             return (
-                len(polled_line._drives._planned),
+                len(polled_line._planned),
                 len(polled_line._maker._made),
                 len(polled_line._maker._rows),
                 len(lines._numbered),
                 len(lines._free),
                 max(lines._numbered),
                 len(polled_line.bus._exchanges._peers._known),
-                len(polled_line._drives._gone),
+                len(polled_line._gone),
             )
 
         def adopt_some(number: int) -> None:

@@ -18,7 +18,7 @@ from multidrop import PollingFailed
 from multidrop.core import Port, RowQueue
 from multidrop.drive import Drive
 from multidrop.poller import Poller
-from multidrop.polling import line_drives, polled_line
+from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
 from multidrop.polling.port_queue import PortQueue
 from multidrop.sim import Simulator, Wire, simulated
@@ -100,8 +100,8 @@ def of_line(name: str, method: Callable[..., Any], failure: BaseException) -> Ca
 @pytest.mark.parametrize(
     ("kind", "method"),
     [
-        (line_drives.LineDrives, "observe"),
-        (line_drives.LineDrives, "measure"),
+        (polled_line.PolledLine, "_observe"),
+        (polled_line.PolledLine, "_learn"),
         (PortQueue, "keep_busy"),
         (PortQueue, "conclude"),
     ],
@@ -380,7 +380,7 @@ def test_own_classes_may_fail_later(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert issubclass(Own, Drive)
     monkeypatch.setattr(polled_line, "LEARN_NS", 10_000_000)
-    monkeypatch.setattr(line_drives, "MARGIN", -1.0)  # planned again at each look
+    monkeypatch.setattr(polled_line, "MARGIN", -1.0)  # planned again at each look
     with Simulator([Wire([simulated(Toy(1))], unpaced=True) for _ in range(2)]) as simulator:
         ill, well = (wire.path for wire in simulator.wires)
         poller = Poller(

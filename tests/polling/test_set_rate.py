@@ -140,7 +140,7 @@ def test_memory_is_bounded_over_many_rates() -> None:
 
         def kept() -> tuple[int, ...]:
             gc.collect()
-            return len(line._maker._made), len(line._drives._planned), len(line._schedule.jobs)
+            return len(line._maker._made), len(line._planned), len(line._schedule.jobs)
 
         for number in range(20):
             made.poller.set_rate("pump-1", "fault", 0.1 + number / 1000)

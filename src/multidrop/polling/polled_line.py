@@ -1,4 +1,7 @@
-"""PolledLine: the polling of one line, with its drives, its schedule, and a port that may be lost."""
+"""PolledLine: the polling of one line, with its drives, its schedule, and a port that may be lost.
+
+A drive's blocks are planned again if its measured response delay differs too much from the planned one.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,7 @@ from multidrop.errors import LineError
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.schedule import Schedule
 from multidrop.plant.model import PlantLine, PolledDrive
-from multidrop.polling.jobs import JobMaker, PolledJob, RowNames
-from multidrop.polling.line_drives import LineDrives
+from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, RowNames
 from multidrop.polling.port_queue import PortQueue, Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.transport import clock
@@ -102,8 +104,7 @@ STANDBY_NS = 500_000_000  # interval between miss rows of a line that is not pol
 RETRY_NS = 500_000_000  # pause after polling failed; doubled by each further failure
 LONGEST_RETRY_NS = 30_000_000_000
 SOUND_NS = 10_000_000_000  # time without a failure after which earlier failures are forgotten
-
-_log = logging.getLogger("multidrop.polling")
+MARGIN = 0.05  # fraction by which a response delay may lie outside the range of its plan
 
 
 class PolledLine:
@@ -129,7 +130,12 @@ class PolledLine:
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        self._drives = LineDrives(bus, self._schedule, self._maker, self._refusals)
+        self._planned: dict[PolledDrive, PlannedJobs] = {}  # includes removed drives, until `forget`
+        self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
+        self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
+        self._gone: dict[int, Peer] = {}  # peers of removed drives, by address; may still be in an exchange
+        self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
+        self._observed: list[tuple[int, int, bool]] = []  # for each: failures, late until, has answered
         self._is_started = False
         self._learnt_ns = 0
         self._reopening = Reopening(bus)
@@ -161,11 +167,12 @@ class PolledLine:
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
         """The present drives with their polled registers."""
-        return self._drives.polled
+        return tuple(self._present.values())
 
     @property
     def since_ns(self) -> dict[str, int]:
-        return self._drives.since_ns
+        """By drive name, when the drive's polls were last changed (ns, CLOCK_MONOTONIC)."""
+        return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def add(self, polled: PolledDrive) -> None:
         """Start polling a drive; one that was polled before has the same jobs again.
@@ -177,8 +184,32 @@ class PolledLine:
         settings = polled.drive.settings  # before locking: polling must not wait while a port is being opened
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
-            self._drives.add(polled, is_started=self._is_started)
+            drive = self.bus.attach(polled.drive)
+            try:
+                if polled not in self._planned:
+                    self._planned[polled] = self._maker.plan(polled, drive.response_delay)
+            except BaseException:
+                self.bus.detach(drive)
+                raise
+            now = clock.now_ns()
+            self._present[drive] = polled
+            self._since_ns[drive] = now
+            if self._planned[polled].jobs:
+                self._polled.append((drive, self.bus.peer(drive)))
+            if self._is_started:
+                self._schedule_jobs(drive, now)
         self._row_queue.call(self.number)
+
+    def _schedule_jobs(self, drive: Drive, due_ns: int) -> None:
+        """Schedule the jobs of a drive, first due at `due_ns`."""
+        jobs = self._planned[self._present[drive]].jobs
+        for job in jobs:
+            self._schedule.add(job, due_ns)
+        if jobs and not self.bus.peer(drive).has_answered:
+            self._schedule.back_off.meet(drive.address)
+
+    def _jobs(self, drive: Drive) -> list[PolledJob]:
+        return [job for job in self._schedule.jobs if job.owner is drive]
 
     def put_in_order(self) -> None:
         """Poll the drives in the order in which changes of the line's settings take the least time."""
@@ -189,23 +220,32 @@ class PolledLine:
 
     def await_gone(self, address: int) -> None:
         """Wait for the last exchange of a drive that was removed from this address."""
-        peer = self._drives.take_gone(address)
+        peer = self._gone.pop(address, None)
         while peer and not self._is_left and self.bus.is_asking(peer):
             clock.sleep(GONE_S)
 
     def remove(self, drive: Drive) -> None:
         """Stop polling a drive; its queued exchanges are still carried out."""
         with self._lock:
-            now = clock.now_ns()
-            self._miss(_over(self._drives.slots(drive), now), Status.POLL_ENDED)
-            self._drives.remove(drive)
+            jobs = self._jobs(drive)
+            slots = [(job, job.due_ns) for job in jobs if job.period_ns]
+            self._miss(_over(slots, clock.now_ns()), Status.POLL_ENDED)
+            for job in jobs:
+                self._schedule.remove(job)
+            self._schedule.back_off.forget(drive.address)
+            self._refusals.forget(drive)
+            self._present.pop(drive, None)
+            self._since_ns.pop(drive, None)
+            self._polled = [(other, peer) for other, peer in self._polled if other is not drive]
+            self._gone[drive.address] = self.bus.peer(drive)
         self.bus.detach(drive)
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
         """Forget the jobs of a drive that was removed for good, but keep its peer."""
         with self._lock:
-            self._drives.forget(drive)
+            self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
+            self._maker.forget_drive(drive)
 
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
         """Set the period `every` in s of a polled register, or of all of them if `register` is None.
@@ -214,15 +254,51 @@ class PolledLine:
         slot now. Raises ValueError for a register that is not polled.
         """
         with self._lock:
-            after = self._drives.polled_of(drive).at_rate(register, every)
+            after = self._present[drive].at_rate(register, every)
         self.set_polls(after)
 
     def set_polls(self, after: PolledDrive) -> None:
         """Change the polled registers or the rates of a present drive; unchanged polls keep their slots."""
         with self._lock:
-            if not self._drives.set_polls(after, is_started=self._is_started):
+            drive = after.drive
+            before = self._present[drive]
+            if after == before:
                 return
+            peer, now = self.bus.peer(drive), clock.now_ns()
+            planned = self._maker.plan(after, peer.response_delay or drive.response_delay)
+            self._since_ns[drive] = now
+            if self._is_started:
+                self._change_jobs(drive, planned.jobs, now)
+            others = [(other, known) for other, known in self._polled if other is not drive]
+            self._polled = [*others, (drive, peer)] if planned.jobs else others
+            self._planned.pop(before)
+            self._planned[after] = planned
+            self._present[drive] = after
         self._row_queue.call(self.number)
+
+    def _change_jobs(self, drive: Drive, wanted: list[PolledJob], now_ns: int) -> None:
+        """Replace a drive's jobs by these; its queued exchanges are still carried out.
+
+        Refused registers are polled normally again.
+        """
+        present = self._jobs(drive)
+        old = [job for job in present if job not in wanted]
+        # A new job takes the earliest slot of the old jobs of its period, or else of any present job.
+        latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
+        dues = {job.period_ns: job.due_ns for job in latest_first}
+        self._refusals.forget(drive)
+        for period_ns in dict.fromkeys(job.period_ns for job in [*wanted, *old]):
+            self._schedule.replace(
+                [job for job in old if job.period_ns == period_ns],
+                [job for job in wanted if job.period_ns == period_ns and job not in present],
+                dues.get(period_ns, now_ns) if period_ns else now_ns,
+            )
+        self._maker.forget(old)
+        back_off = self._schedule.back_off
+        if not wanted:
+            back_off.forget(drive.address)
+        elif not present and not self.bus.peer(drive).has_answered:
+            back_off.meet(drive.address)
 
     # ---- polling ----
 
@@ -233,7 +309,7 @@ class PolledLine:
             self.bus.reset_statistics()
             polled = [polled.drive for polled in self.polled]  # the bus may have other drives too
             for drive in in_order(polled, self.switching):
-                self._drives.begin(drive, self.started_ns)
+                self._schedule_jobs(drive, self.started_ns)
             self._is_started = True
         self._row_queue.call(self.number)
 
@@ -277,7 +353,11 @@ class PolledLine:
         """
         if self._is_broken:
             self._queue.abandon()
-            self._drives.begin_anew(now_ns)
+            self._schedule.clear()
+            self._observed = []
+            for drive in self._present:
+                self._refusals.forget(drive)
+                self._schedule_jobs(drive, now_ns)
             self._is_broken = False
         port = self.bus.line.queue
         if now_ns < self._retry_ns or (self._queue.port is None and port is not None and port.pending):
@@ -315,17 +395,42 @@ class PolledLine:
                 return
             if now_ns - self._learnt_ns >= LEARN_NS:
                 self._learn(now_ns)
-            self._drives.observe(now_ns)
+            self._observe(now_ns)
             self._refusals.heed(now_ns)
             self._queue.keep_busy(port, now_ns)
             self._miss_unasked(now_ns)
 
+    def _observe(self, now_ns: int) -> None:
+        """Report the drives' failures and late replies to the schedule's back-off, if they changed."""
+        seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
+        if seen == self._observed:
+            return
+        self._observed = seen
+        for (drive, peer), (failures, late_until_ns, has_answered) in zip(self._polled, seen, strict=True):
+            self._schedule.back_off.observe(
+                drive.address,
+                failures,
+                now_ns,
+                late_until_ns=late_until_ns,
+                cost_ns=peer.next_timeout_ns,
+                has_answered=has_answered,
+            )
+
     def _learn(self, now_ns: int) -> None:
-        """Update exchange durations and the plan with the drives' measured response delays."""
+        """Update exchange durations and plans with the drives' measured response delays.
+
+        A plan is kept while refusals have split its blocks.
+        """
         self._learnt_ns = now_ns
-        delays = self._drives.measure()
+        delays = {drive: peer.response_delay for drive, peer in self._polled}
+        for job in self._schedule.jobs:
+            job.duration_ns = job.own_ns + round((delays[job.owner] or job.owner.response_delay) * 1e9)
         self._queue.measure()
-        self._drives.plan_anew(delays, now_ns)
+        for polled in self._present.values():
+            planned, delay = self._planned[polled], delays.get(polled.drive)
+            if delay and not planned.plan.suits(delay, MARGIN) and {*planned.jobs} <= {*self._schedule.jobs}:
+                self._planned[polled] = better = self._maker.plan(polled, delay)
+                self._change_jobs(polled.drive, better.jobs, now_ns)
 
     # ---- rows without a value ----
 
@@ -425,3 +530,7 @@ class PolledLine:
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
     """Return the slots that end by `ended_ns`; in a slot that ends later, no value is missed yet."""
     return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]
+
+
+def _due(job: PolledJob) -> int:
+    return job.due_ns
