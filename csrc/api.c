@@ -68,7 +68,7 @@ void md_port_stop(struct md_port *port)
     md_engine_leave(port->engine);
 }
 
-void md_port_let_go(struct md_port *port, void *memory)
+void md_port_free(struct md_port *port, void *memory)
 {
     (void)memory;
     md_port_stop(port);
@@ -123,10 +123,10 @@ void md_port_tap(struct md_port *port, struct md_tap *tap)
     md_engine_leave(port->engine);
 }
 
-void md_port_tell_echo(struct md_port *port, int echo)
+void md_port_set_echo(struct md_port *port, int echo)
 {
     md_engine_enter(port->engine);
-    md_turn_tell_echo(&port->turn, echo);
+    md_turn_set_echo(&port->turn, echo);
     md_engine_leave(port->engine);
 }
 
@@ -178,7 +178,7 @@ static int is_attended(const struct md_port *port)
 {
     if (port->turn.line.listened_ns)
         return 0;
-    return port->turn.whose != MD_NOBODYS ||
+    return port->turn.source != MD_NO_SOURCE ||
            port->engine->wakes[port->index] <= md_line_silent_ns(&port->turn.line);
 }
 

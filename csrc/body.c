@@ -326,7 +326,7 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
     return 1;
 }
 
-int md_is_gateways(int framing, const struct md_message *reply)
+int md_is_from_gateway(int framing, const struct md_message *reply)
 {
     return framing == MD_TCP && (reply->exception == NO_PATH || reply->exception == NO_TARGET);
 }

@@ -8,10 +8,7 @@
 
 #include <string.h>
 
-/* ---- packets of capture files ---- */
-
-/* This section reads the packets of pcap and pcapng files. The caller reads the rare blocks that describe a
- * pcapng file's interfaces. */
+/* ---- packets of pcap and pcapng files; the caller reads the blocks that describe interfaces ---- */
 
 enum {
     RECORD_HEAD = 16, /* bytes before a packet of a pcap file */
@@ -459,6 +456,12 @@ static void explain(struct md_decoder *decoder, const struct md_stream *stream)
     decoder->failure = md_reason(splitter->framing, &splitter->request, completion->raw, completion->raw_len);
 }
 
+/* A gateway's exception means that the drive did not reply. */
+static int reply_result(const struct md_span *span)
+{
+    return md_is_from_gateway(span->framing, &span->message) ? MD_NO_REPLY : (int)span->len;
+}
+
 static int take(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
@@ -473,8 +476,7 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
         decoder->is_sure = span->kind == MD_REQUEST;
         break;
     case MD_REPLY:
-        if (!add_rows(decoder, md_is_gateways(span->framing, &span->message) ? MD_NO_REPLY : (int)span->len,
-                      columns))
+        if (!add_rows(decoder, reply_result(span), columns))
             return MD_NO_ROOM;
         break;
     default:

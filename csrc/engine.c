@@ -17,9 +17,7 @@
  * first byte of each object is read, because the processor drops a prefetch from a page without a cached
  * translation. */
 
-enum { CACHE_LINE = 64 };
-
-enum { STEPS_AHEAD = 4 };
+enum { CACHE_LINE = 64, STEPS_AHEAD = 4 };
 
 static void bring(const void *from, size_t len)
 {
@@ -46,11 +44,11 @@ static void bring_exchange(const struct md_exchange *exchange)
 /* Return the exchange in flight; NULL: none. */
 static const struct md_exchange *present(const struct md_port *port)
 {
-    return port->turn.whose != MD_NOBODYS ? port->turn.line.exchange : NULL;
+    return port->turn.source != MD_NO_SOURCE ? port->turn.line.exchange : NULL;
 }
 
 /* Return the address of the pointer to the next repeated exchange; NULL: none. */
-static const struct md_exchange *const *next_name(const struct md_port *port)
+static const struct md_exchange *const *next_pointer(const struct md_port *port)
 {
     const struct md_turn *turn = &port->turn;
     return turn->round_len ? &turn->round[turn->round_at] : NULL;
@@ -60,8 +58,8 @@ static void bring_exchanges(const struct md_port *port)
 {
     if (present(port))
         bring_exchange(present(port));
-    if (next_name(port))
-        bring(next_name(port), sizeof *next_name(port));
+    if (next_pointer(port))
+        bring(next_pointer(port), sizeof *next_pointer(port));
 }
 
 static void bring_drives(const struct md_port *port)
@@ -71,16 +69,16 @@ static void bring_drives(const struct md_port *port)
         bring(exchange->drive, offsetof(struct md_drive, late_until_ns));
     if (exchange && exchange->block)
         bring(exchange->block, sizeof *exchange->block);
-    if (next_name(port))
-        bring_exchange(*next_name(port));
+    if (next_pointer(port))
+        bring_exchange(*next_pointer(port));
 }
 
 static void bring_rest(const struct md_port *port)
 {
     if (present(port))
         bring(md_usual_delays(present(port)->drive), 1);
-    if (next_name(port))
-        bring((*next_name(port))->drive, offsetof(struct md_drive, counters));
+    if (next_pointer(port))
+        bring((*next_pointer(port))->drive, offsetof(struct md_drive, counters));
 }
 
 /* Each step reads memory that the step below has prefetched earlier: the last step runs for the port farthest
@@ -207,11 +205,11 @@ static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
  * only listens and the exchange may be a stop. */
 static int may_have_news(const struct md_port *port)
 {
-    return port->turn.whose == MD_NOBODYS || port->turn.line.listened_ns;
+    return port->turn.source == MD_NO_SOURCE || port->turn.line.listened_ns;
 }
 
-/* Block SIGPIPE: writing to a port whose far end is closed must not end the process. */
-static void bear_broken_pipes(void)
+/* Block SIGPIPE: writing to a port source far end is closed must not end the process. */
+static void ignore_broken_pipes(void)
 {
 #ifndef _WIN32
     sigset_t pipes;
@@ -226,7 +224,7 @@ static void *run(void *argument)
     struct md_engine *engine = argument;
     void *ready[READY];
     int is_woken;
-    bear_broken_pipes();
+    ignore_broken_pipes();
 #ifdef __linux__
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
 #endif

@@ -13,7 +13,7 @@
 /* The state of the transceiver's direction. */
 struct md_rs485 {
     int mode;        /* enum md_rs485_mode */
-    int tells_end;   /* the driver reports when the last bit has left */
+    int reports_end; /* the driver reports when the last bit has left */
     int is_sending;  /* RTS makes the transceiver send */
     int64_t sent_ns; /* when the last bit leaves if the UART started immediately */
     int64_t look_ns; /* time of the next check whether the last bit has left */
@@ -93,7 +93,6 @@ int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
 ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
 /* Switch the transceiver to receiving once the last bit has left; 0, or -errno if the port is lost. */
 int md_rs485_look(struct md_port *port, int64_t now_ns);
-
 
 /* ---- system calls on a descriptor; on Windows it is a handle, and windows/ has these functions ---- */
 

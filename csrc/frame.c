@@ -51,8 +51,6 @@ uint8_t md_lrc(const uint8_t *bytes, size_t len)
     return (uint8_t)-md_sum(bytes, len);
 }
 
-/* ---- frames ---- */
-
 /* ---- parsing ---- */
 
 static int hex_digit(uint8_t character)
@@ -291,7 +289,7 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
         int why = md_parse_reply(framing, bytes + at, len - at, request, &reply);
         if (why == MD_INCOMPLETE)
             why = MD_CUT_SHORT;
-        if (why > 0 && md_is_gateways(framing, &reply))
+        if (why > 0 && md_is_from_gateway(framing, &reply))
             return MD_NO_REPLY;
         if (weight(why) > weight(reason))
             reason = why;

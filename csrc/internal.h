@@ -92,7 +92,7 @@ int md_tcp_length(const uint8_t *bytes, size_t len);
  * devices put another length into the header. */
 int md_tcp_is_exception(const uint8_t *bytes, size_t len, const struct md_message *request);
 /* Return 1 if a gateway reports that the drive is unreachable or silent. */
-int md_is_gateways(int framing, const struct md_message *reply);
+int md_is_from_gateway(int framing, const struct md_message *reply);
 /* Return why these bytes are not the reply: an enum md_frame_fault, MD_CUT_SHORT or MD_NO_REPLY. */
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
 
@@ -140,10 +140,10 @@ struct md_waiter;
 
 struct md_waiter *md_waiter_new(void); /* NULL: see errno */
 void md_waiter_free(struct md_waiter *waiter);
-/* Report `whose` whenever the descriptor is readable; -1: see errno. */
-int md_waiter_add(struct md_waiter *waiter, int fd, void *whose);
+/* Report `owner` whenever the descriptor is readable; -1: see errno. */
+int md_waiter_add(struct md_waiter *waiter, int fd, void *owner);
 /* Set whether a descriptor is watched. */
-void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched);
+void md_waiter_change(struct md_waiter *waiter, int fd, void *owner, int watched);
 void md_waiter_remove(struct md_waiter *waiter, int fd);
 /* Wait at most `timeout_ns`, forever if it is negative; write the owners of readable descriptors, and return
  * how many. */

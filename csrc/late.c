@@ -12,9 +12,7 @@
 
 #include <string.h>
 
-/* ---- one request whose reply may still come ---- */
-
-/* An outstanding request: its send times, and the replies that fit it. */
+/* ---- an outstanding request: one whose reply may still come ---- */
 
 enum { DATA_KEPT = sizeof((struct md_owed){0}.data), LAST_READ = 0x04 };
 
@@ -119,12 +117,10 @@ static void drop_time(struct md_owed *owed)
 
 /* ---- proofs ---- */
 
-/* A drive's proofs. Some may not work: a device may be silent to registers that it lacks, and a document
- * may be wrong about a register's range. */
-
-/* A proof that was never answered is dropped after MOST_VAIN failures. No reply counts as a failure only
- * if the drive has replied to another request since the last failure. */
-enum { MOST_VAIN = 2, ANSWERED = 0xFF };
+/* Some proofs may not work: a device may be silent to registers that it lacks, and a document may be wrong
+ * about a register's range. A proof that was never answered is dropped after MOST_FAILURES failures. A
+ * missing reply counts only if the drive has replied to another request since the last failure. */
+enum { MOST_FAILURES = 2, ANSWERED = 0xFF };
 
 /* Return the index of this exchange in the drive's list of proofs, or proof_count if it is not a proof. Then
  * the list is not read, because it is elsewhere in memory and most exchanges are not proofs. */
@@ -148,7 +144,7 @@ static void drop_proof(struct md_drive *drive, uint32_t at)
     drive->proof_count--;
     for (; at < drive->proof_count; at++) {
         drive->proofs[at] = drive->proofs[at + 1];
-        drive->vain[at] = drive->vain[at + 1];
+        drive->proof_failures[at] = drive->proof_failures[at + 1];
     }
     if (drive->proof_count == 1)
         drive->proof_count = 0;
@@ -158,16 +154,16 @@ void md_proof_end(const struct md_exchange *exchange, int result)
 {
     struct md_drive *drive = exchange->drive;
     uint32_t at = proof_at(exchange);
-    if (at == drive->proof_count || drive->vain[at] == ANSWERED)
+    if (at == drive->proof_count || drive->proof_failures[at] == ANSWERED)
         return;
     uint64_t replies = md_replies(drive);
-    int is_silent_to_it = result == MD_NO_REPLY && replies != drive->vain_at;
+    int is_silent_to_it = result == MD_NO_REPLY && replies != drive->failed_at;
     if (result > 0)
-        drive->vain[at] = ANSWERED;
+        drive->proof_failures[at] = ANSWERED;
     if (!is_silent_to_it && result != MD_BAD_ECHO) /* MD_BAD_ECHO: the value is out of its documented range */
         return;
-    drive->vain_at = replies;
-    if (++drive->vain[at] == MOST_VAIN)
+    drive->failed_at = replies;
+    if (++drive->proof_failures[at] == MOST_FAILURES)
         drop_proof(drive, at);
 }
 
@@ -175,14 +171,12 @@ static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
 {
     for (uint32_t i = 0; i < MD_MOST_PROOFS && i < drive->proof_count; i++)
         if (is_same(owed, drive->proofs[i]))
-            drive->vain[i] = ANSWERED;
+            drive->proof_failures[i] = ANSWERED;
 }
 
-/* ---- late replies ---- */
+/* ---- outstanding requests of a drive ---- */
 
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no path delays bytes for two minutes */
-
-/* ---- outstanding requests of a drive ---- */
 
 /* Find the same request among the drive's outstanding ones. */
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)

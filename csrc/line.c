@@ -10,8 +10,6 @@
 
 /* ---- states ---- */
 
-/* The next state for each state and event. */
-
 enum { IDLE = MD_IDLE, SILENCE, CHECK, READY, WRITING, AWAITING, LAST_LOOK, NONE = -1 };
 
 const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
@@ -27,18 +25,16 @@ const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
 
 /* ---- listening for another master ---- */
 
-/* Listening before the first request: a line has one master, and a new one checks that no other master sends.
- * Unexpected bytes are another master's requests or the replies to them. They restart the wait, so the first
- * request leaves after a silence that is long enough. The wait lasts at least for the guard time: in that
- * time the kernel's timer ends a suspended former master. A Modbus TCP connection shows no other master;
- * there only the guard counts.
+/* Before its first request a new master listens, because a line has only one master. Unexpected bytes are
+ * another master's requests, or replies to them. They restart the wait, so that the first request leaves
+ * after a long enough silence. The wait lasts at least for the guard time, in which the kernel's timer ends
+ * a suspended former master. On Modbus TCP, which shows no other master's frames, only the guard time counts.
  *
  * A stop does not wait: the motor must stop, even beside another master. */
 
 enum { LONGEST_RTU = 256 }; /* serial-line guide V1.02, 2.5.1 */
 
-/* The deadline allows one restart of the wait: one burst may be the last reply to a master that has just
- * gone. */
+/* The deadline allows one restart of the wait: a burst may be the last reply to a master that has left. */
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -59,7 +55,7 @@ void md_listen_put_back(struct md_line *line)
     md_line_go(line, MD_ENDED);
 }
 
-void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
+void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns)
 {
     if (line->transactions) /* on a network these bytes are a late reply to this process */
         return;
@@ -77,13 +73,10 @@ static int end_listening(struct md_line *line, int64_t now_ns)
     return 1;
 }
 
-/* ---- the end of an exchange ---- */
-
-/* The end of an exchange: its bytes for the tap, its completion, and the counts of its drive and block. */
+/* ---- what an exchange leaves: bytes for the tap, its completion, counts of its drive and block ---- */
 
 /* Return 1 if the result means that the drive is silent or unreachable. A damaged reply shows that it
  * answers. */
-
 static int is_failure(int result)
 {
     switch (result) {
@@ -168,11 +161,9 @@ static void complete(struct md_line *line, struct md_ending ending)
     count(line->exchange, completion);
 }
 
-/* ---- the state machine ---- */
+/* ---- the end of an exchange ---- */
 
 static const int64_t WORTH_WAITING = 250000; /* ns; a shorter sleep costs more than reading the port */
-
-/* ---- the end of an exchange ---- */
 
 /* Return the silence around an exchange. A network needs none, but without ids in replies a silence separates
  * them: a second copy of one could be mistaken for the next reply. */
@@ -219,7 +210,7 @@ void md_line_init(struct md_line *line, int64_t now_ns)
     *line = (struct md_line){.state = MD_IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
 }
 
-/* Set tx to the request's bytes, which the exchange stores if they are few. Return 0, or an enum
+/* Set tx to the request's bytes; a short frame is stored in the exchange. Return 0, or an enum
  * md_frame_fault. */
 static int load(struct md_line *line, const struct md_exchange *exchange)
 {
@@ -381,7 +372,7 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
 {
     line->quiet_ns = later(line->quiet_ns, now_ns); /* the last request may still be leaving */
     if (line->listened_ns)
-        md_listen_hear(line, len, now_ns);
+        md_listen_receive(line, len, now_ns);
     if (line->state != MD_IDLE)
         line->completion->stale += (uint32_t)len;
     if (!md_line_is_under_way(line))

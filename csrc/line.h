@@ -66,7 +66,7 @@ struct md_line {
     struct md_drive *late; /* the first drive with late replies due */
     struct md_tap *tap;  /* gets all bytes of the line; NULL: none */
     uint8_t echo;        /* enum md_echo, learnt; failures do not reset it */
-    uint8_t echo_is_told; /* configured as echoing: never unlearnt */
+    uint8_t echo_is_configured; /* as echoing: never unlearnt */
     uint8_t echo_due;    /* the adapter's copy of the request is still to come */
     uint8_t lone_copies; /* copies in a row that were accepted as replies, up to a bound */
     uint8_t transactions; /* enum md_transactions, set before the first exchange */
@@ -83,7 +83,7 @@ struct md_line {
     uint8_t rx[MD_RX_ROOM];
     uint8_t long_tx[MD_MOST_FRAME]; /* a request that its exchange does not store */
     uint16_t transaction;           /* of the last request */
-    uint16_t frame_len, frame_told; /* bytes of an incomplete Modbus TCP frame; how many went to the tap */
+    uint16_t frame_len, frame_tapped; /* bytes of an incomplete Modbus TCP frame; how many went to the tap */
     uint8_t frame[MD_MOST_TCP];
 };
 
@@ -110,8 +110,8 @@ void md_listen_put_back(struct md_line *line); /* undo the start of a waiting ex
 
 /* ---- turn.c: the order of exchanges on a line; bytes and times are arguments ---- */
 
-/* The source of an exchange; MD_BEFOREHAND: proofs and echo probes. */
-enum md_whose { MD_NOBODYS, MD_BEFOREHAND, MD_URGENT, MD_QUEUED, MD_REPEATED };
+/* The source of an exchange; MD_AHEAD: proofs and echo probes. */
+enum md_source { MD_NO_SOURCE, MD_AHEAD, MD_URGENT, MD_QUEUED, MD_REPEATED };
 
 struct md_slot {
     const struct md_exchange *exchange;
@@ -137,7 +137,7 @@ struct md_before {
 };
 
 struct md_turn {
-    int whose, last;      /* enum md_whose: of the exchange in flight, and of the previous one */
+    int source, last;     /* enum md_source: of the exchange in flight, and of the previous one */
     int is_ending;        /* start no polled exchange */
     int has_done_urgent;  /* an urgent one ended; the engine resets this */
     struct md_urgent *urgent;
@@ -162,7 +162,7 @@ int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchan
                    const int64_t *not_before_ns, int n);
 uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *exchanges, uint32_t n);
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
-void md_turn_tell_echo(struct md_turn *turn, int echo);
+void md_turn_set_echo(struct md_turn *turn, int echo);
 int md_turn_end(struct md_turn *turn);
 int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive);
 int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns);
@@ -182,7 +182,7 @@ static inline void md_line_go(struct md_line *line, enum md_line_event event)
         line->state = next;
 }
 
-void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns); /* bytes came while listening */
+void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns); /* bytes came while listening */
 
 /* Return 1 if the exchange in flight waits for the end of listening. Stops do not wait. */
 static inline int md_listen_is_held(const struct md_line *line)

@@ -160,8 +160,8 @@ struct md_drive {
     struct md_counters counters;
     int64_t answered_ns;               /* no reply to an earlier request can come */
     int64_t late_until_ns;             /* late replies may come in any order until then */
-    uint64_t vain_at;                  /* the drive's reply count when a proof last failed */
-    uint8_t vain[MD_MOST_PROOFS];      /* failures of each proof; 255: it was answered once */
+    uint64_t failed_at;                /* the drive's reply count when a proof last failed */
+    uint8_t proof_failures[MD_MOST_PROOFS]; /* 255: the proof was answered once */
     uint32_t doubtful;                 /* replies that may have answered another process */
     uint32_t unanswered_count;
     const struct md_exchange **proofs; /* reads whose replies differ from all that are missing */
@@ -171,7 +171,7 @@ struct md_drive {
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* of a read */
-int64_t md_vain_ns(const struct md_drive *drive);            /* timeout of the next read after failures */
+int64_t md_next_timeout_ns(const struct md_drive *drive);    /* of the next read, after failures */
 int64_t md_delay_edge(int bucket); /* least delay of a bucket; its width is an eighth of that */
 /* Copy the outstanding requests of a drive that this one replaces. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
@@ -302,9 +302,9 @@ void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct 
 void md_port_stop(struct md_port *port);
 /* Stop and free the port. `memory` is unused; the argument keeps the client's memory alive during the
  * call. */
-void md_port_let_go(struct md_port *port, void *memory);
+void md_port_free(struct md_port *port, void *memory);
 /* Set whether the adapter echoes: MD_ECHO is final, MD_NO_ECHO holds until an echo comes. */
-void md_port_tell_echo(struct md_port *port, int echo);
+void md_port_set_echo(struct md_port *port, int echo);
 /* Deliver rows to `row_queue`, and call its client with `number` when the port needs attention. */
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
 /* Queue exchanges with the earliest time of each; return how many fitted. One client at a time. A slot

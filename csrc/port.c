@@ -66,7 +66,7 @@ static int may_send(struct md_port *port)
 /* Return 1 if the request has expired, by a clock that includes the computer's sleep. */
 static int is_expired(const struct md_turn *turn)
 {
-    if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
+    if (turn->source != MD_URGENT || turn->line.tx_at > 0)
         return 0;
     return turn->urgent->expires_ns && md_boottime_ns() > turn->urgent->expires_ns;
 }
@@ -125,7 +125,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
 /* Return 1 if the request has left and the reply is due. */
 static int is_sent(const struct md_port *port)
 {
-    return port->turn.whose != MD_NOBODYS && port->turn.line.completion->sent_ns;
+    return port->turn.source != MD_NO_SOURCE && port->turn.line.completion->sent_ns;
 }
 
 /* A sleeping processor always wakes late, by about the same time. Therefore the thread sleeps that much
@@ -134,7 +134,7 @@ static int is_sent(const struct md_port *port)
  * thread does not spin before the read of a reply either, because that read may be early. */
 static int is_worth_spinning(const struct md_port *port)
 {
-    return port->engine->count <= MOST_SPINNING && port->turn.whose != MD_URGENT;
+    return port->engine->count <= MOST_SPINNING && port->turn.source != MD_URGENT;
 }
 
 static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
@@ -181,7 +181,7 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
  * at the end of the silence, so the client need not wake it. */
 static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
 {
-    return turn->whose == MD_NOBODYS && turn->last == MD_URGENT &&
+    return turn->source == MD_NO_SOURCE && turn->last == MD_URGENT &&
            md_line_silent_ns(&turn->line) - now_ns > MD_MOST_LATENESS;
 }
 
@@ -219,7 +219,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
         watch(port, 0);
     else if (!port->is_blind)
         watch(port, 1);
-    int is_early = wake_ns != MD_NEVER && (port->is_blind || turn->whose == MD_NOBODYS) &&
+    int is_early = wake_ns != MD_NEVER && (port->is_blind || turn->source == MD_NO_SOURCE) &&
                    (is_sent(port) || (is_worth_spinning(port) && !is_expected));
     wake_ns -= is_early ? engine->lateness_ns : 0;
     engine->wakes[port->index] = sooner(wake_ns, direction_ns(port));

@@ -41,7 +41,7 @@ static int may_become_copy(const struct md_line *line, size_t at)
 
 static void learn(struct md_line *line, int echo)
 {
-    if (!line->echo_is_told)
+    if (!line->echo_is_configured)
         line->echo = (uint8_t)echo;
 }
 
@@ -80,7 +80,6 @@ enum copy { IS_ECHO, MAY_BE_REPLY, IS_REPLY };
 
 /* Classify a copy without other bytes: the adapter's echo, or the drive's reply if that may equal the
  * request. */
-
 static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
 {
     if (!may_be_reply || line->echo == MD_ECHO) {
@@ -98,11 +97,6 @@ static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
 int md_echo_is_in_doubt(const struct md_line *line)
 {
     return line->echo == MD_ECHO_UNKNOWN || line->lone_copies == MOST_LONE_COPIES;
-}
-
-static void forget_lone_copies(struct md_line *line)
-{
-    line->lone_copies = 0;
 }
 
 void md_echo_keep(struct md_line *line)
@@ -313,7 +307,7 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
         *ending = (struct md_ending){used, at, (size_t)used};
         return 1;
     }
-/* The reply took this long, whichever request it answers. */
+    /* The reply took this long, whichever request it answers. */
     md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0);
     md_reply_extend(line);
     if (md_is_read(exchange->framing, exchange->request.function)) {
@@ -407,7 +401,7 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns)
     size_t begin = md_echo_is_copy(line, 0) ? line->tx_len : 0; /* skip the echo */
     int is_doubtful = 0;
     if (line->rx_len == 0)
-        forget_lone_copies(line);
+        line->lone_copies = 0;
     if (begin > 0 && begin == line->rx_len) {
         int used = md_reply_parse(line, 0, &reply);
         enum copy copy = learn_lone_copy(line, used > 0);

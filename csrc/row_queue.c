@@ -13,7 +13,7 @@ enum { MOST_SPARE = 64, WORDS = MD_MOST_NUMBERS / 64 };
 
 struct md_row_queue {
     pthread_mutex_t mutex; /* guards all below */
-    pthread_cond_t called_up;
+    pthread_cond_t is_called;
     size_t chunk_rows, most_chunks;
     struct md_columns **chunks; /* a ring */
     size_t first, count;        /* of the chunks that hold rows */
@@ -71,7 +71,7 @@ struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks)
     queue->chunk_rows = chunk_rows;
     queue->most_chunks = most_chunks;
     pthread_mutex_init(&queue->mutex, NULL);
-    init_condition(&queue->called_up);
+    init_condition(&queue->is_called);
     return queue;
 }
 
@@ -81,7 +81,7 @@ static void destroy(struct md_row_queue *queue)
         md_columns_free(queue->chunks[(queue->first + i) % queue->most_chunks]);
     while (queue->spares)
         md_columns_free(queue->spare[--queue->spares]);
-    pthread_cond_destroy(&queue->called_up);
+    pthread_cond_destroy(&queue->is_called);
     pthread_mutex_destroy(&queue->mutex);
     free(queue->chunks);
     free(queue);
@@ -228,7 +228,7 @@ void md_row_queue_call(struct md_row_queue *queue, uint32_t number)
     uint64_t *word = &queue->called[number / 64], bit = UINT64_C(1) << number % 64;
     queue->calls += !(*word & bit);
     *word |= bit;
-    pthread_cond_signal(&queue->called_up);
+    pthread_cond_signal(&queue->is_called);
     pthread_mutex_unlock(&queue->mutex);
 }
 
@@ -247,7 +247,7 @@ int md_row_queue_await(struct md_row_queue *queue, int64_t timeout_ns, uint32_t 
 {
     int64_t until_ns = md_now_ns() + timeout_ns;
     pthread_mutex_lock(&queue->mutex);
-    while (!queue->calls && timeout_ns > 0 && wait_until(&queue->called_up, &queue->mutex, until_ns) == 0)
+    while (!queue->calls && timeout_ns > 0 && wait_until(&queue->is_called, &queue->mutex, until_ns) == 0)
         ;
     int n = take_calls(queue, numbers, room);
     pthread_mutex_unlock(&queue->mutex);

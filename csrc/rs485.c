@@ -16,18 +16,18 @@ static int is_by_rts(const struct md_rs485 *rs485)
     return rs485->mode == MD_RS485_RTS_UP || rs485->mode == MD_RS485_RTS_DOWN;
 }
 
-static int steer(struct md_port *port, int is_sending)
+static int set_direction(struct md_port *port, int is_sending)
 {
     port->rs485.is_sending = is_sending;
     return md_descriptor_set_rts(port->fd, is_sending == (port->rs485.mode == MD_RS485_RTS_UP));
 }
 
 /* Return 1 if the last bit has left; otherwise set look_ns. */
-static int is_out(struct md_port *port, int64_t now_ns)
+static int has_left(struct md_port *port, int64_t now_ns)
 {
     struct md_rs485 *rs485 = &port->rs485;
     rs485->look_ns = now_ns + LOOK_AGAIN_NS;
-    if (rs485->tells_end)
+    if (rs485->reports_end)
         return md_descriptor_is_shifted_out(port->fd) != 0;
     if (md_descriptor_is_queued(port->fd)) {
         rs485->empty_ns = 0;
@@ -46,8 +46,8 @@ int md_rs485_begin(struct md_port *port, int mode)
     if (mode == MD_RS485_KERNEL)
         failure = md_descriptor_take_rs485(port->fd);
     else if (is_by_rts(&port->rs485)) {
-        port->rs485.tells_end = md_descriptor_is_shifted_out(port->fd) >= 0;
-        failure = steer(port, 0);
+        port->rs485.reports_end = md_descriptor_is_shifted_out(port->fd) >= 0;
+        failure = set_direction(port, 0);
         if (!failure && mode == MD_RS485_RTS_DOWN) /* otherwise the closed port would send forever */
             failure = md_port_keep_rts(port->fd);
     }
@@ -61,7 +61,7 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
     struct md_rs485 *rs485 = &port->rs485;
     if (!is_by_rts(rs485))
         return md_descriptor_write(port->fd, bytes, len);
-    int was_sending = rs485->is_sending, failure = was_sending ? 0 : steer(port, 1);
+    int was_sending = rs485->is_sending, failure = was_sending ? 0 : set_direction(port, 1);
     if (failure) {
         errno = -failure;
         return -1;
@@ -74,7 +74,7 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
         rs485->look_ns = rs485->sent_ns;
         rs485->empty_ns = 0;
     } else if (!was_sending) {
-        steer(port, 0);
+        set_direction(port, 0);
     }
     errno = error;
     return written;
@@ -86,12 +86,12 @@ int md_rs485_look(struct md_port *port, int64_t now_ns)
     int is_lost = port->turn.progress.lost != 0, is_stuck = 0;
     if (!rs485->is_sending || (now_ns < rs485->look_ns && !is_lost))
         return 0;
-    if (!is_lost && (!is_out(port, now_ns) || port->turn.line.state == MD_WRITING)) {
+    if (!is_lost && (!has_left(port, now_ns) || port->turn.line.state == MD_WRITING)) {
         is_stuck = now_ns > rs485->sent_ns + MOST_HELD_NS;
         if (!is_stuck)
             return 0;
     }
-    int failure = steer(port, 0);
+    int failure = set_direction(port, 0);
     if (port->is_closing) /* the closing waits for this */
         md_wakeup_ring(&port->engine->wakeup);
     return is_stuck ? -ETIMEDOUT : failure;

@@ -70,15 +70,15 @@ int64_t md_timeout_ns(const struct md_exchange *exchange)
         int64_t late_ns = sooner(learnt(&drive->patience_ns), exchange->timeout_ns);
         return later(sooner(doubled_ns, drive->most_timeout_ns), late_ns);
     }
-    return later(md_vain_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
+    return later(md_next_timeout_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
 }
 
 /* A write may wait longer than the drive's timeout; the window starts after that wait. */
 int64_t md_window_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    int64_t longer_ns = later(md_timeout_ns(exchange) - md_vain_ns(drive), 0);
-    return longer_ns + later(3 * md_vain_ns(drive), drive->most_timeout_ns);
+    int64_t longer_ns = later(md_timeout_ns(exchange) - md_next_timeout_ns(drive), 0);
+    return longer_ns + later(3 * md_next_timeout_ns(drive), drive->most_timeout_ns);
 }
 
 int64_t md_present_timeout_ns(const struct md_drive *drive)
@@ -86,7 +86,7 @@ int64_t md_present_timeout_ns(const struct md_drive *drive)
     return later(usual_timeout_ns(drive), learnt(&drive->patience_ns));
 }
 
-int64_t md_vain_ns(const struct md_drive *drive)
+int64_t md_next_timeout_ns(const struct md_drive *drive)
 {
     uint32_t failures = __atomic_load_n(&drive->failures, __ATOMIC_RELAXED);
     return failures % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
@@ -121,7 +121,7 @@ int64_t md_reply_due_ns(const struct md_exchange *exchange)
 /* ---- late replies ---- */
 
 /* Set the longer timeout; 0 if it does not exceed the usual one. */
-static void be_patient(struct md_drive *drive, int64_t patience_ns)
+static void set_patience(struct md_drive *drive, int64_t patience_ns)
 {
     learn(&drive->patience_ns, patience_ns > usual_timeout_ns(drive) ? patience_ns : 0);
 }
@@ -139,7 +139,7 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
         smooth(drive, delay_ns);
     }
     if (drive->patience_ns > 2 * delay_ns)
-        be_patient(drive, drive->patience_ns - drive->patience_ns / 8);
+        set_patience(drive, drive->patience_ns - drive->patience_ns / 8);
     return delay_ns;
 }
 
@@ -148,20 +148,19 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact)
 {
     int64_t patience_ns = sooner(delay_ns + delay_ns / 2, MOST_PATIENCE);
-    be_patient(drive, is_exact ? patience_ns : later(patience_ns, drive->patience_ns));
+    set_patience(drive, is_exact ? patience_ns : later(patience_ns, drive->patience_ns));
 }
 
 void md_learn_silence(struct md_drive *drive)
 {
     if (drive->patience_ns)
-        be_patient(drive, drive->patience_ns / 2);
+        set_patience(drive, drive->patience_ns / 2);
 }
 
 /* ---- counters ---- */
 
 /* Counters only grow, so the figures of a time span are the difference of two readings. Response delays are
  * counted in buckets, PARTS to each doubling. */
-
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket starts near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 

@@ -47,7 +47,7 @@ static int may_be_awaited(const struct md_line *line, const uint8_t *bytes, size
 static int frame_length(const struct md_line *line)
 {
     int whole = md_tcp_length(line->frame, line->frame_len);
-    if (line->frame_told || line->frame_len < MD_TCP_HEAD ||
+    if (line->frame_tapped || line->frame_len < MD_TCP_HEAD ||
         !may_be_awaited(line, line->frame, line->frame_len))
         return whole;
     if (md_tcp_is_exception(line->frame, line->frame_len, &line->exchange->request))
@@ -74,8 +74,8 @@ static void cut_off(struct md_line *line, size_t len)
 /* Drop all bytes before a possible start of the awaited reply. */
 static void realign(struct md_line *line, int64_t now_ns)
 {
-    cut_off(line, line->frame_told);
-    line->frame_told = 0;
+    cut_off(line, line->frame_tapped);
+    line->frame_tapped = 0;
     while (line->frame_len && !may_be_awaited(line, line->frame, line->frame_len)) {
         skip(line, line->frame, 1, now_ns);
         cut_off(line, 1);
@@ -101,26 +101,26 @@ static size_t seek(struct md_line *line, const uint8_t *bytes, size_t len, int64
 /* Drop a frame that belongs to no exchange. */
 static void drop(struct md_line *line, int64_t now_ns)
 {
-    md_tap_put(line->tap, MD_NOISE, now_ns, line->frame + line->frame_told,
-               (size_t)(line->frame_len - line->frame_told));
-    line->frame_len = line->frame_told = 0;
+    md_tap_put(line->tap, MD_NOISE, now_ns, line->frame + line->frame_tapped,
+               (size_t)(line->frame_len - line->frame_tapped));
+    line->frame_len = line->frame_tapped = 0;
 }
 
 void md_tcp_disown(struct md_line *line)
 {
-    size_t untold = (size_t)(line->frame_len - line->frame_told);
-    md_tap_put(line->tap, MD_NOISE, line->completion->sent_ns, line->frame + line->frame_told, untold);
-    line->completion->stale += (uint32_t)untold;
-    line->frame_told = line->frame_len;
+    size_t untapped = (size_t)(line->frame_len - line->frame_tapped);
+    md_tap_put(line->tap, MD_NOISE, line->completion->sent_ns, line->frame + line->frame_tapped, untapped);
+    line->completion->stale += (uint32_t)untapped;
+    line->frame_tapped = line->frame_len;
     line->is_adrift |= line->frame_len > 0;
 }
 
 size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     size_t enough = line->transactions == MD_IGNORED ? KNOWN_HEAD : MD_TCP_HEAD;
-    if (line->is_adrift && line->frame_told && len >= enough && may_be_awaited(line, bytes, len))
+    if (line->is_adrift && line->frame_tapped && len >= enough && may_be_awaited(line, bytes, len))
         drop(line, now_ns); /* the rest of the frame is missing */
-    if (line->is_adrift && !line->frame_told)
+    if (line->is_adrift && !line->frame_tapped)
         return seek(line, bytes, len, now_ns);
     int whole = frame_length(line);
     size_t end = whole > 0 ? (size_t)whole : MD_TCP_HEAD;
@@ -193,7 +193,7 @@ static int is_reply_to(const struct md_line *line, const struct md_unanswered *u
     if (line->frame_len > EXCEPTION_AT && (body[1] & MD_EXCEPTION_BIT))
         reply.exception = body[2];
     return md_get16(line->frame) == unanswered->transaction && body[0] == unanswered->address &&
-           !md_is_gateways(MD_TCP, &reply);
+           !md_is_from_gateway(MD_TCP, &reply);
 }
 
 /* If the frame is a drive's late reply, learn how late it is. */
@@ -243,7 +243,7 @@ static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_endi
                           : used == MD_BAD_LENGTH || used == MD_NO_START;
     line->is_adrift |= (uint8_t)is_odd;
     line->is_proven |= used > 0;
-    if (used > 0 && md_is_gateways(MD_TCP, &reply)) { /* the drive may still answer */
+    if (used > 0 && md_is_from_gateway(MD_TCP, &reply)) { /* the drive may still answer */
         expect(line);
         *ending = (struct md_ending){MD_NO_REPLY, at, line->frame_len};
         return 1;
@@ -266,13 +266,13 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
 {
     int is_awaited = line->state >= MD_AWAITING, is_end = 0;
     int whole = frame_length(line);
-    if (line->is_adrift && !line->frame_told)
+    if (line->is_adrift && !line->frame_tapped)
         return 0;
     if (whole == MD_INCOMPLETE || (whole > 0 && line->frame_len < whole))
         return 0;
     if (is_awaited)
         line->completion->skipped += line->frame_len;
-    if (is_awaited && (line->is_out_of_step || (is_ours(line) && !line->frame_told))) {
+    if (is_awaited && (line->is_out_of_step || (is_ours(line) && !line->frame_tapped))) {
         size_t at = keep(line);
         is_end = !line->is_out_of_step && judge(line, at, now_ns, ending);
     } else if (is_awaited) {
@@ -285,7 +285,7 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
         pass(line, now_ns);
         line->is_adrift = 0;
     }
-    line->frame_len = line->frame_told = 0;
+    line->frame_len = line->frame_tapped = 0;
     return is_end;
 }
 
@@ -294,9 +294,9 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
 struct md_ending md_tcp_missed(struct md_line *line)
 {
     const struct md_exchange *exchange = line->exchange;
-    if (line->frame_len && !line->frame_told && is_ours(line)) {
+    if (line->frame_len && !line->frame_tapped && is_ours(line)) {
         keep(line);
-        line->frame_told = line->frame_len;
+        line->frame_tapped = line->frame_len;
     }
     line->is_adrift |= line->frame_len > 0;
     expect(line);

@@ -9,9 +9,8 @@
 
 enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */
 
-/* Return the request to send before the exchange: an echo probe, or a proof, which prevents that a late
- * reply is mistaken for the exchange's. NULL: send the exchange itself. */
-
+/* Return the request to send before the exchange: an echo probe, or a proof, so that no late reply is
+ * mistaken for the exchange's. NULL: send the exchange itself. */
 static const struct md_exchange *find_before(struct md_before *before, const struct md_exchange *exchange,
                                              int is_echo_in_doubt, int64_t now_ns)
 {
@@ -78,7 +77,7 @@ uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *e
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 {
     struct md_urgent **at = &turn->urgent;
-    if (*at && turn->whose == MD_URGENT) /* the first one is in flight */
+    if (*at && turn->source == MD_URGENT) /* the first one is in flight */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
         if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* otherwise in order of arrival */
@@ -87,18 +86,18 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
     *at = urgent;
 }
 
-void md_turn_tell_echo(struct md_turn *turn, int echo)
+void md_turn_set_echo(struct md_turn *turn, int echo)
 {
     turn->line.echo = (uint8_t)echo;
-    turn->line.echo_is_told = echo == MD_ECHO; /* MD_NO_ECHO may change: an echo must not confirm a write */
+    turn->line.echo_is_configured = echo == MD_ECHO; /* MD_NO_ECHO is unlearnt if an echo comes */
     md_store(&turn->progress.echo, (uint32_t)echo);
 }
 
 int md_turn_end(struct md_turn *turn)
 {
     turn->is_ending = 1;
-    int is_waiting = turn->whose == MD_NOBODYS || md_listen_is_held(&turn->line);
-    return !is_waiting && turn->whose != MD_URGENT;
+    int is_waiting = turn->source == MD_NO_SOURCE || md_listen_is_held(&turn->line);
+    return !is_waiting && turn->source != MD_URGENT;
 }
 
 /* The line time of an exchange starts with the silence before it, never before the line's last activity (see
@@ -113,7 +112,7 @@ int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns)
 
 int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive)
 {
-    if (turn->whose != MD_NOBODYS && turn->line.exchange->drive == drive)
+    if (turn->source != MD_NO_SOURCE && turn->line.exchange->drive == drive)
         return 1;
     uint32_t submitted = md_load(&turn->progress.submitted);
     for (uint32_t at = turn->progress.done; at != submitted; at++)
@@ -132,8 +131,6 @@ void md_count_stop(uint32_t *stops)
 {
     __atomic_fetch_add(stops, 1, __ATOMIC_SEQ_CST);
 }
-
-/* ---- turns ---- */
 
 enum {
     POLLED = 20,            /* polling gets 1/20 of a line that urgent requests keep busy */
@@ -169,12 +166,12 @@ static int64_t ready_ns(const struct md_exchange *exchange)
 }
 
 /* Start the exchange and return 1; or, if another request must precede it, start that one and return 0. */
-static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
+static int begin(struct md_turn *turn, int source, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
     const struct md_exchange *first =
         find_before(&turn->before, exchange, md_echo_is_in_doubt(&turn->line), now_ns);
-    turn->whose = first ? MD_BEFOREHAND : whose;
+    turn->source = first ? MD_AHEAD : source;
     md_line_begin(&turn->line, first ? first : exchange, first ? &turn->completion : completion, now_ns);
     if (turn->progress.lost)
         md_line_abandon(&turn->line, MD_LINE_LOST, turn->lost_error);
@@ -186,7 +183,7 @@ static int begin(struct md_turn *turn, int whose, const struct md_exchange *exch
 /* Return 1 if a stop came after the urgent request in flight and no byte of the request has left. */
 static int is_overtaken(const struct md_turn *turn)
 {
-    if (turn->whose != MD_URGENT || turn->line.tx_at > 0)
+    if (turn->source != MD_URGENT || turn->line.tx_at > 0)
         return 0;
     const struct md_exchange *exchange = turn->urgent->exchange;
     return exchange->stops && md_load(exchange->stops) != exchange->stops_seen;
@@ -264,9 +261,9 @@ static void stop_repeating(struct md_turn *turn)
 /* Count the line time of an exchange. */
 static void settle(struct md_turn *turn, int64_t took_ns)
 {
-    if (turn->whose == MD_URGENT)
+    if (turn->source == MD_URGENT)
         turn->owed_ns += took_ns / (POLLED - 1);
-    else if (turn->whose != MD_BEFOREHAND && turn->owed_ns > 0)
+    else if (turn->source != MD_AHEAD && turn->owed_ns > 0)
         turn->owed_ns -= took_ns;
     turn->owed_ns = sooner(turn->owed_ns, MOST_OWED_NS);
 }
@@ -288,7 +285,7 @@ static int is_stop_waiting(const struct md_turn *turn)
 
 /* Return 1 if it is a polled exchange's turn before the urgent requests: never twice in a row, and never
  * before a stop. */
-static int is_polls_turn(const struct md_turn *turn)
+static int is_polling_due(const struct md_turn *turn)
 {
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
 }
@@ -299,7 +296,7 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     int is_held = 0;
     *wake_ns = MD_NEVER;
     struct md_urgent *urgent = find_urgent(turn, &is_held, wake_ns, now_ns);
-    if (!is_held && (!urgent || is_polls_turn(turn)) && take_polled(turn, wake_ns, now_ns))
+    if (!is_held && (!urgent || is_polling_due(turn)) && take_polled(turn, wake_ns, now_ns))
         return 1;
     if (urgent) {
         if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_overtaken(turn))
@@ -336,28 +333,28 @@ static void step_back(struct md_turn *turn)
 /* Record the end of the exchange in flight. */
 static void finish(struct md_turn *turn)
 {
-    int whose = turn->whose;
-    turn->last = whose;
-    turn->whose = MD_NOBODYS;
+    int source = turn->source;
+    turn->last = source;
+    turn->source = MD_NO_SOURCE;
     if (turn->progress.echo != (uint32_t)turn->line.echo)
         md_store(&turn->progress.echo, (uint32_t)turn->line.echo);
     if (turn->progress.foreign != turn->line.foreign)
         md_store(&turn->progress.foreign, turn->line.foreign);
-    if (whose == MD_BEFOREHAND)
+    if (source == MD_AHEAD)
         return;
-    int goes_on = !turn->progress.lost && (whose == MD_URGENT || !turn->is_ending);
+    int goes_on = !turn->progress.lost && (source == MD_URGENT || !turn->is_ending);
     if (is_again(&turn->before, turn->line.exchange, turn->line.completion) && goes_on) {
-        if (whose == MD_REPEATED)
+        if (source == MD_REPEATED)
             step_back(turn);
         return;
     }
-    if (whose == MD_URGENT) {
+    if (source == MD_URGENT) {
         turn->urgent->is_done = turn->has_done_urgent = 1;
         turn->urgent = turn->urgent->next;
         return;
     }
     report(turn);
-    if (whose == MD_QUEUED) {
+    if (source == MD_QUEUED) {
         md_store(&turn->progress.done, turn->progress.done + 1);
         uint32_t left = pending(turn);
         if (left == turn->room / 4 || left == 0)
@@ -370,14 +367,14 @@ static void finish(struct md_turn *turn)
 /* If the exchange in flight only listens so far, put it back, because a stop must not wait for it. */
 static void give_way(struct md_turn *turn)
 {
-    int whose = turn->whose;
+    int source = turn->source;
     md_listen_put_back(&turn->line);
-    turn->whose = MD_NOBODYS;
-    if (whose == MD_URGENT) {
+    turn->source = MD_NO_SOURCE;
+    if (source == MD_URGENT) {
         struct md_urgent *urgent = turn->urgent;
         turn->urgent = urgent->next;
         md_turn_add_urgent(turn, urgent);
-    } else if (whose == MD_REPEATED) {
+    } else if (source == MD_REPEATED) {
         step_back(turn);
     }
 }
@@ -386,7 +383,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     struct md_line *line = &turn->line;
     for (;;) {
-        if (turn->whose == MD_NOBODYS && !take(turn, wake_ns, now_ns))
+        if (turn->source == MD_NO_SOURCE && !take(turn, wake_ns, now_ns))
             return MD_DONE;
         if (md_listen_is_held(line) && is_stop_waiting(turn)) {
             give_way(turn);
@@ -408,13 +405,13 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 void md_turn_lose(struct md_turn *turn, int error)
 {
-    int is_polled = turn->whose == MD_QUEUED || turn->whose == MD_REPEATED;
+    int is_polled = turn->source == MD_QUEUED || turn->source == MD_REPEATED;
     int is_cut_off = is_polled && turn->line.is_proven && md_line_is_under_way(&turn->line);
     turn->lost_error = error;
     md_store(&turn->progress.cut_off, (uint32_t)is_cut_off);
     md_store(&turn->progress.lost, 1);
     md_line_abandon(&turn->line, MD_LINE_LOST, error);
-    if (is_cut_off && turn->whose == MD_REPEATED)
+    if (is_cut_off && turn->source == MD_REPEATED)
         step_back(turn);
     stop_repeating(turn);
 }
@@ -423,9 +420,9 @@ void md_turn_lose(struct md_turn *turn, int error)
  * here still gets its rows. */
 void md_turn_close(struct md_turn *turn)
 {
-    int is_told = turn->whose == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;
-    if (is_told && turn->whose != MD_NOBODYS) {
-        md_line_abandon(&turn->line, turn->whose == MD_URGENT ? MD_LINE_LOST : MD_POLL_ENDED, 0);
+    int is_reported = turn->source == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;
+    if (is_reported && turn->source != MD_NO_SOURCE) {
+        md_line_abandon(&turn->line, turn->source == MD_URGENT ? MD_LINE_LOST : MD_POLL_ENDED, 0);
         finish(turn);
     }
     for (; turn->urgent; turn->urgent = turn->urgent->next) {

@@ -64,15 +64,15 @@ void md_waiter_free(struct md_waiter *waiter)
     free(waiter);
 }
 
-int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
+int md_waiter_add(struct md_waiter *waiter, int fd, void *owner)
 {
-    struct epoll_event event = {.events = EPOLLIN, .data.ptr = whose};
+    struct epoll_event event = {.events = EPOLLIN, .data.ptr = owner};
     return epoll_ctl(waiter->epoll, EPOLL_CTL_ADD, fd, &event);
 }
 
-void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched)
+void md_waiter_change(struct md_waiter *waiter, int fd, void *owner, int watched)
 {
-    struct epoll_event event = {.events = watched ? EPOLLIN : 0, .data.ptr = whose};
+    struct epoll_event event = {.events = watched ? EPOLLIN : 0, .data.ptr = owner};
     epoll_ctl(waiter->epoll, EPOLL_CTL_MOD, fd, &event);
 }
 

@@ -10,7 +10,7 @@
 
 struct md_waiter {
     struct pollfd *fds; /* an unwatched descriptor is stored as ~fd, which poll() ignores */
-    void **whose;
+    void **owners;
     int count, room;
 };
 
@@ -22,10 +22,10 @@ static int grow(struct md_waiter *waiter)
     struct pollfd *fds = realloc(waiter->fds, (size_t)room * sizeof *fds);
     if (fds)
         waiter->fds = fds;
-    void **whose = realloc(waiter->whose, (size_t)room * sizeof *whose);
-    if (whose)
-        waiter->whose = whose;
-    if (!fds || !whose)
+    void **owners = realloc(waiter->owners, (size_t)room * sizeof *owners);
+    if (owners)
+        waiter->owners = owners;
+    if (!fds || !owners)
         return 0;
     waiter->room = room;
     return 1;
@@ -47,11 +47,11 @@ struct md_waiter *md_waiter_new(void)
 void md_waiter_free(struct md_waiter *waiter)
 {
     free(waiter->fds);
-    free(waiter->whose);
+    free(waiter->owners);
     free(waiter);
 }
 
-int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
+int md_waiter_add(struct md_waiter *waiter, int fd, void *owner)
 {
     struct pollfd entry = {.fd = fd, .events = POLLIN};
     if (fd < 0 || poll(&entry, 1, 0) < 0 || entry.revents & POLLNVAL)
@@ -60,19 +60,19 @@ int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
         errno = ENOMEM;
     else {
         waiter->fds[waiter->count] = entry;
-        waiter->whose[waiter->count++] = whose;
+        waiter->owners[waiter->count++] = owner;
         return 0;
     }
     return -1;
 }
 
-void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched)
+void md_waiter_change(struct md_waiter *waiter, int fd, void *owner, int watched)
 {
     int at = find(waiter, fd);
     if (at < 0)
         return;
     waiter->fds[at].fd = watched ? fd : ~fd;
-    waiter->whose[at] = whose;
+    waiter->owners[at] = owner;
 }
 
 void md_waiter_remove(struct md_waiter *waiter, int fd)
@@ -81,7 +81,7 @@ void md_waiter_remove(struct md_waiter *waiter, int fd)
     if (at < 0)
         return;
     waiter->fds[at] = waiter->fds[--waiter->count];
-    waiter->whose[at] = waiter->whose[waiter->count];
+    waiter->owners[at] = waiter->owners[waiter->count];
 }
 
 /* Without ppoll() the wait lasts whole milliseconds, and the caller waits for the rest. */
@@ -101,6 +101,6 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
     int left = wait_for_any(waiter, timeout_ns), n = 0;
     for (int at = 0; at < waiter->count && n < left && n < room; at++)
         if (waiter->fds[at].fd >= 0 && waiter->fds[at].revents)
-            ready[n++] = waiter->whose[at];
+            ready[n++] = waiter->owners[at];
     return left < 0 ? left : n;
 }

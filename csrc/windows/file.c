@@ -171,7 +171,7 @@ static int grow(unsigned at)
     return 1;
 }
 
-int md_file_add(int fd, void *whose)
+int md_file_add(int fd, void *owner)
 {
     HANDLE handle = handle_of(fd);
     DWORD type = fd > 0 ? GetFileType(handle) : FILE_TYPE_UNKNOWN;
@@ -188,7 +188,7 @@ int md_file_add(int fd, void *whose)
     }
     file->handle = handle;
     file->kind = type == FILE_TYPE_CHAR ? &md_port_kind : &md_socket_kind;
-    file->whose = whose;
+    file->owner = owner;
     files[(unsigned)fd / 4] = file;
     md_file_watch(fd, 1);
     return 0;
@@ -233,7 +233,7 @@ void md_file_remove(int fd)
         free(file);
 }
 
-int md_files_ready(void **whose, int room)
+int md_files_ready(void **owners, int room)
 {
     int n = 0;
     while (first_ready && n < room) {
@@ -241,7 +241,7 @@ int md_files_ready(void **whose, int room)
         first_ready = file->next_ready;
         file->is_ready = 0;
         if (file->is_watched)
-            whose[n++] = file->whose;
+            owners[n++] = file->owner;
     }
     return n;
 }

@@ -14,7 +14,7 @@
 struct md_file {
     HANDLE handle;
     const struct md_file_kind *kind;
-    void *whose;
+    void *owner;
     int is_watched;
     int is_reading, is_writing; /* the system is reading `byte`, or writing `leaving` */
     int is_held;                /* `byte` has come, and is not taken yet */
@@ -46,11 +46,11 @@ int md_port_prepare(HANDLE handle); /* remove the timeouts of its reads and writ
 void md_file_has_read(struct md_file *file, DWORD error, DWORD got);
 void md_file_has_written(struct md_file *file, DWORD error);
 
-int md_file_add(int fd, void *whose); /* -1: see errno */
+int md_file_add(int fd, void *owner); /* -1: see errno */
 void md_file_watch(int fd, int is_watched);
 void md_file_remove(int fd);
-/* Write the owners of watched files that can be read into `whose`, and return how many. */
-int md_files_ready(void **whose, int room);
+/* Write the owners of watched files that can be read into `owners`, and return how many. */
+int md_files_ready(void **owners, int room);
 int md_file_is_writing(int fd); /* the last request has not left yet */
 
 int md_errno_of(DWORD error); /* of GetLastError() or WSAGetLastError() */

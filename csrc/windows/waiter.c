@@ -39,17 +39,17 @@ void md_waiter_free(struct md_waiter *waiter)
 }
 
 /* Without an owner it is the wake-up. */
-int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
+int md_waiter_add(struct md_waiter *waiter, int fd, void *owner)
 {
-    if (whose)
-        return md_file_add(fd, whose);
+    if (owner)
+        return md_file_add(fd, owner);
     waiter->objects[WAKEUP] = handle_of(fd);
     return 0;
 }
 
-void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched)
+void md_waiter_change(struct md_waiter *waiter, int fd, void *owner, int watched)
 {
-    (void)waiter, (void)whose;
+    (void)waiter, (void)owner;
     md_file_watch(fd, watched);
 }
 

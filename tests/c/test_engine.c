@@ -64,7 +64,7 @@ static void *come_and_go(void *argument)
             usleep(100);
         md_port_end(port);
         md_port_stop(port);
-        md_port_let_go(port, NULL);
+        md_port_free(port, NULL);
         close(ends[0]);
         close(ends[1]);
     }
@@ -98,7 +98,7 @@ static void check_a_broken_pipe_is_a_lost_port(void)
     md_port_carry_out(port, &subject.exchange, 0, 0, &found, NULL);
     assert(found.result == MD_LINE_LOST && found.error == EPIPE && !found.sent_ns);
     md_port_stop(port);
-    md_port_let_go(port, NULL);
+    md_port_free(port, NULL);
     close(ends[0]);
     close(ends[1]);
 }

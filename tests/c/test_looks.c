@@ -72,7 +72,7 @@ int main(void)
 
     for (int i = 0; i < PORTS; i++) {
         md_port_stop(ports[i]);
-        md_port_let_go(ports[i], NULL);
+        md_port_free(ports[i], NULL);
         close(ends[i][0]);
         close(ends[i][1]);
     }

@@ -222,11 +222,11 @@ static void check_rest_is_held_back(void)
 static void check_all_foreign_bytes_are_counted(void)
 {
     struct md_line line = {.listen_ns = 5};
-    md_listen_hear(&line, 3, 10);
-    md_listen_hear(&line, 4, 20);
+    md_listen_receive(&line, 3, 10);
+    md_listen_receive(&line, 4, 20);
     assert(line.foreign == 7 && line.listened_ns == 25);
     line.transactions = 1; /* a late reply to this process */
-    md_listen_hear(&line, 3, 30);
+    md_listen_receive(&line, 3, 30);
     assert(line.foreign == 7 && line.listened_ns == 25);
 }
 
@@ -322,7 +322,7 @@ int main(void)
     check_unsent(&stop);
 
     md_port_stop(port);
-    md_port_let_go(port, NULL);
+    md_port_free(port, NULL);
     md_mastership_free(mastership);
     close(ends[0]);
     close(ends[1]);

@@ -21,7 +21,7 @@ static struct {
     int64_t changed_ns; /* RTS was set last */
     int is_up, changes, writes_while_receiving;
     int sending_level, takes, rings, keeps;
-    int tells_end, rts_error, write_error;
+    int reports_end, rts_error, write_error;
     int has_mode, is_deaf;  /* the driver has an RS-485 mode, and does not take it */
     uint32_t flags;
 } uart;
@@ -90,7 +90,7 @@ int ioctl(int fd, int request, ...)
         return change(request == TIOCMBIS);
     case TIOCSERGETLSR:
         *(unsigned *)argument = is_left ? TIOCSER_TEMT : 0;
-        return uart.tells_end ? 0 : refuse(ENOTTY);
+        return uart.reports_end ? 0 : refuse(ENOTTY);
     case TIOCOUTQ: /* its shift register is not counted */
         *(int *)argument = uart.now_ns + CHARACTER_NS < uart.end_ns;
         return 0;
@@ -117,7 +117,7 @@ ssize_t write(int fd, const void *bytes, size_t len)
 
 static const struct md_exchange asked = {.character_ns = CHARACTER_NS};
 
-static struct md_port *new_port(int mode, int tells_end)
+static struct md_port *new_port(int mode, int reports_end)
 {
     static struct md_engine engine;
     static struct md_port port;
@@ -128,7 +128,7 @@ static struct md_port *new_port(int mode, int tells_end)
     uart.takes = 1000;
     uart.sending_level = mode != MD_RS485_RTS_DOWN;
     uart.is_up = 1; /* as open() leaves it */
-    uart.tells_end = tells_end;
+    uart.reports_end = reports_end;
     CHECK(md_rs485_begin(&port, mode) == 0);
     return &port;
 }
@@ -150,7 +150,7 @@ static void check_direction(void)
 {
     static const struct {
         const char *row;
-        int mode, tells_end, len;
+        int mode, reports_end, len;
         int64_t start_ns, percent, most_ns; /* RTS falls so much later than the last bit */
     } rows[] = {
         {"an UART that tells its end", MD_RS485_RTS_UP, 1, 8, 0, 100, 0},
@@ -165,7 +165,7 @@ static void check_direction(void)
     static const uint8_t frame[256] = {0};
     for (size_t i = 0; i < COUNT(rows); i++) {
         row = rows[i].row;
-        struct md_port *port = new_port(rows[i].mode, rows[i].tells_end);
+        struct md_port *port = new_port(rows[i].mode, rows[i].reports_end);
         CHECK(uart.is_up != uart.sending_level); /* the bus is free from the start */
         CHECK(uart.keeps == (rows[i].mode == MD_RS485_RTS_DOWN));
         uart.start_ns = rows[i].start_ns;

@@ -102,7 +102,7 @@ int main(void)
         assert(looks_of(ask_by_hand, port, &exchange) <= FEW);
 
     md_port_stop(port);
-    md_port_let_go(port, NULL);
+    md_port_free(port, NULL);
     close(ends[0]);
     shutdown(ends[1], SHUT_RDWR);
     pthread_join(drives, NULL);

@@ -109,7 +109,7 @@ int main(void)
     assert(rung == 1);
 
     md_port_stop(port);
-    md_port_let_go(port, NULL);
+    md_port_free(port, NULL);
     close(ends[0]);
     shutdown(ends[1], SHUT_RDWR);
     pthread_join(drives, NULL);

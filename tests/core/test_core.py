@@ -400,7 +400,7 @@ def test_a_configured_echo_needs_no_probe(drive: Drive, echo: Echo) -> None:
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
-        port.tell_echo(echo)
+        port.set_echo(echo)
         assert port.carry_out(read(7, echo_probe=read(99))).result == 7
     assert requested == [7]
 

@@ -136,7 +136,7 @@ def test_a_silent_drive_has_all_its_time_once_and_then_rarely(line: LineDriver, 
     found, reckoned = [], []
     for _ in range(20):
         line.now = max(line.now, drive.late_until_ns)
-        reckoned.append(drive.vain_ns // MS)
+        reckoned.append(drive.next_timeout_ns // MS)
         found.append(time_out(line, drive) // MS)
     assert found == reckoned == [60, 300, *(15 * [60]), 300, 60, 60]
     assert drive.failures == 20

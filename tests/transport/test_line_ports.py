@@ -86,7 +86,7 @@ def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
     echo: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Echo] = []
-    monkeypatch.setattr(Port, "tell_echo", lambda port, each: told.append(each))
+    monkeypatch.setattr(Port, "set_echo", lambda port, each: told.append(each))
     with Simulator([wire()]) as sim, Bus(sim.wires[0].path, echo=echo) as bus:
         bus.line.reopen()
         assert told == [Echo(echo)] * 2

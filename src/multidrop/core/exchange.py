@@ -229,9 +229,9 @@ class Peer:
         return float(self.c.delay_ns) / 1e9
 
     @property
-    def vain_ns(self) -> int:
+    def next_timeout_ns(self) -> int:
         """The timeout of the next read if the drive stays silent."""
-        return int(lib.md_vain_ns(self.c))
+        return int(lib.md_next_timeout_ns(self.c))
 
     @property
     def silences(self) -> int:

@@ -195,7 +195,7 @@ def _owner_of(port: Any, memory: _PortMemory) -> Any:
     calls its destructor before it drops the handle, and the garbage collector calls all destructors before it
     frees memory, also at interpreter exit. No Python code runs in between, so no signal can interrupt this.
     """
-    return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_let_go, port))
+    return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_free, port))
 
 
 def _stop(port: Any, memory: _PortMemory) -> None:
@@ -251,9 +251,9 @@ class Port:
         with self._memory.replacing("tap", tap):
             lib.md_port_tap(self.c, tap.c)
 
-    def tell_echo(self, echo: Echo) -> None:
+    def set_echo(self, echo: Echo) -> None:
         """Set whether the adapter echoes."""
-        lib.md_port_tell_echo(self.c, _ECHOES[echo])
+        lib.md_port_set_echo(self.c, _ECHOES[echo])
 
     def switch(self, rs485: RS485) -> None:
         """Set what switches the transceiver's direction. Call it before the first request.

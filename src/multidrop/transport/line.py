@@ -182,7 +182,7 @@ class Line:
             raise LineError(self.port, UNOPENED)
         try:
             core = self._opened.open()
-            core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
+            core.set_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
             self._log.opened(self.identity)

@@ -114,7 +114,7 @@ class ClockedPort:
         lib.md_turn_init(self._turn, self._slots, self.room, clocked.now)
         self._turn.line.transactions = transactions
         if transactions:
-            lib.md_turn_tell_echo(self._turn, lib.MD_NO_ECHO)
+            lib.md_turn_set_echo(self._turn, lib.MD_NO_ECHO)
 
     # ---- client side ----
 

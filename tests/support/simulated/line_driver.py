@@ -65,7 +65,7 @@ class LineDriver:
 
     def set_echo(self, known: int) -> None:
         """Set the echo, as a line's user does."""
-        self.echo, self._line.echo_is_told = known, known == lib.MD_ECHO
+        self.echo, self._line.echo_is_configured = known, known == lib.MD_ECHO
 
     @property
     def is_out_of_step(self) -> bool:
