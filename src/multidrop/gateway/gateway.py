@@ -316,6 +316,7 @@ class Gateway:
         while True:
             if self.poller is not None:
                 self.guarded("statistics", self._read_statistics, self.poller)
+            self.guarded("minute", self.hub.note_minute)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
             self._has_news = True  # a frame is due: its time shows pages that the gateway is alive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -216,6 +217,18 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     assert is_fresh(hub)
     clock.now_ns += row.holds_ns + 1
     assert not is_fresh(hub)
+
+
+def test_the_last_minute_has_a_point_a_second_and_null_for_a_miss(hub: Hub) -> None:
+    assert hub.last_minute() == {}
+    for at in range(0, 1000, 5):  # periods of 100 ms
+        hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
+        hub.note_minute()
+    points = hub.last_minute()["pump-1"]["output_frequency"]
+    assert len(points) == 60
+    assert [after - before for (before, _), (after, _) in pairwise(points)] == [1000] * 59
+    assert points[-1] == (points[0][0] + 59_000, None)
+    assert points[-2][1] == 980.0
 
 
 def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:

@@ -85,6 +85,17 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     assert "revision" not in following  # it is as before
 
 
+def test_the_last_minute_is_there_for_a_page_that_opens(gateway: Served) -> None:
+    def points() -> list[Any]:
+        found: list[Any] = gateway.get("/api/minute").json.get("pump-1", {}).get("output_frequency", [])
+        return found
+
+    until(points)
+    ((ms, value), *_) = points()
+    assert abs(ms - time.time() * 1e3) < 60_000
+    assert value == 0.0
+
+
 @pytest.mark.long
 def test_a_silent_drives_values_are_said_to_be_old(gateway: Served) -> None:
     gateway.sims["pump-2"]["output_current"] = 45.6

@@ -86,6 +86,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/plant", pages.plant),
         Route("/api/drive/{name:path}", pages.drive),
         Route("/api/lines", pages.lines),
+        Route("/api/minute", pages.minute),
         Route("/api/fleet", pages.fleet),
         Route("/api/history", pages.history),
         Route("/api/export", pages.export),
@@ -191,6 +192,9 @@ class _Pages:
 
     async def lines(self, request: Request) -> Response:
         return JsonResponse(line_views(self._gateway))
+
+    async def minute(self, request: Request) -> Response:
+        return JsonResponse(self._gateway.hub.last_minute())
 
     async def fleet(self, request: Request) -> Response:
         part: Any = self._gateway.feeds.get("fleet")

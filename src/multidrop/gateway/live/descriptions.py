@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any, cast
 from multidrop import Drive, PlantLine, PolledDrive, Register
 from multidrop.drive import verbs_of
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.live.hub import FREQUENCIES, Hub
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
-FREQUENCIES = ("output_frequency", "motor_speed")
 CURRENTS = ("output_current",)
 
 

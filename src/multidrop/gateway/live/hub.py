@@ -6,7 +6,9 @@ sleep, all earlier rows are stale.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from math import isfinite
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -31,7 +33,6 @@ _STATES = {
 LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between the reads of two clocks
 FAULT_REGISTER = "fault"
 RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
-_TURNING = ("output_frequency", "motor_speed")  # the motor turns if one is not 0
 _ANSWERED = ("exception ", "no valid value")  # prefixes of the status of a miss if the drive did reply
 
 
@@ -80,6 +81,11 @@ class FreshValues(Mapping[str, float]):
         return sum(1 for _ in self)
 
 
+FREQUENCIES = ("output_frequency", "motor_speed")  # registers of a drive's frequency, the best one first
+MINUTE_POINTS = 60
+LEAST_POINT_MS = 900  # between two points of the last minute
+
+
 class Newest(NamedTuple):
     """The newest row of one register of one drive."""
 
@@ -126,6 +132,8 @@ class _Watched:
             poll.register.name: RegisterRows(poll.register, max(cycle_s, poll.every or 0.0), since_ns)
             for poll in polled.polls
         }
+        self.frequency = next((name for name in FREQUENCIES if name in self.cells), "")
+        self.minute: deque[tuple[int, float | None]] = deque(maxlen=MINUTE_POINTS)  # time in ms, value
 
 
 class Hub:
@@ -227,6 +235,27 @@ class Hub:
         self._slept_ns = max(slept_ns, self._slept_ns)
         return now_ns, self._woke_ns
 
+    # ---- the last minute ----
+
+    def note_minute(self) -> None:
+        """Add each drive's newest frequency to its last minute; call this once a second."""
+        for watched in self._watched.values():
+            cell = watched.cells.get(watched.frequency)
+            if cell is None or cell.newest is None:
+                continue
+            time_ns, _, value, status = cell.newest
+            ms = time_ns // 1_000_000
+            if not watched.minute or abs(ms - watched.minute[-1][0]) >= LEAST_POINT_MS:
+                watched.minute.append((ms, None if status or not isfinite(value) else value))
+
+    def last_minute(self) -> dict[str, dict[str, list[tuple[int, float | None]]]]:
+        """Return the last minute by drive and register: times in ms, and values; None is a miss."""
+        return {
+            name: {watched.frequency: list(watched.minute)}
+            for name, watched in self._watched.items()
+            if watched.minute
+        }
+
     # ---- values ----
 
     def newest(self, drive: str, register: str) -> Newest | None:
@@ -310,7 +339,9 @@ class Hub:
         if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
             register = watched.polled.drive.registers[FAULT_REGISTER]
             return Shown(FAULT, _words(register, fresh[FAULT_REGISTER]))
-        is_turning = any(fresh.get(name) for name in _TURNING)  # a motor at 0 Hz may run with a setpoint of 0
+        is_turning = any(
+            fresh.get(name) for name in FREQUENCIES
+        )  # a motor at 0 Hz may run with a setpoint of 0
         if is_turning:
             return Shown(RUNS, None)
         note = found.note if found is not None else _lack(watched)
@@ -354,7 +385,7 @@ def _look_for_trip(watched: _Watched) -> None:
 
 def _turns_since(watched: _Watched, since_ns: int) -> bool:
     """Return True if all values that show a turning motor were requested after this time."""
-    cells = [cell for name in ("status", *_TURNING) if (cell := watched.cells.get(name)) and cell.good]
+    cells = [cell for name in ("status", *FREQUENCIES) if (cell := watched.cells.get(name)) and cell.good]
     return all(cell.good[1] > since_ns for cell in cells if cell.good)
 
 

@@ -1,7 +1,7 @@
 // The connection to the gateway: one pending request for a frame, and the frame's age.
 
 import { get } from "./api.js";
-import { store, takeFrame, takePlant } from "./store.js";
+import { store, takeFrame, takeMinute, takePlant } from "./store.js";
 
 const PATIENCE_MS = 25000; // the gateway answers after 20 s without news
 const AGAIN_MS = 500;
@@ -56,6 +56,7 @@ export async function run() {
       restMs = 0;
       if (!isKnown) {
         takePlant(await get("api/plant"));
+        takeMinute(await get("api/minute").catch(() => ({})));
         [n, isKnown] = [NONE, true];
       }
       const told = await newer(document.hidden ? NONE : n);

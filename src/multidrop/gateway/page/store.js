@@ -58,6 +58,19 @@ function isSame(before, registers, name) {
   return meaning(before.registers.get(name)) === meaning(registers.get(name));
 }
 
+// Take the last minute of registers, which fills sparklines at once: {drive: {register: [[ms, value]]}}.
+export function takeMinute(minute) {
+  for (const [name, registers] of Object.entries(minute)) {
+    const pasts = store.drives.get(name)?.pasts;
+    for (const [register, points] of Object.entries(registers)) {
+      if (!pasts || pasts.has(register)) continue;
+      const ring = new Ring(most());
+      for (const [ms, value] of points) ring.add(ms, value ?? NaN);
+      pasts.set(register, ring);
+    }
+  }
+}
+
 // Take a frame, or what changed since the one before: keep each value that is newer than its last one.
 export function takeFrame(told) {
   const frame = told.since === undefined ? told : merged(store.frame, told);
