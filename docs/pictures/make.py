@@ -50,7 +50,7 @@ poll = ["output_frequency", "output_current"]
 
 
 def demo_screen() -> str:
-    """Return an SVG of the last full screen that `multidrop demo` draws on a terminal."""
+    """Return an SVG of a full screen that `multidrop demo` draws on a terminal."""
     with TemporaryDirectory() as directory:
         return _svg(_last_screen(_drawn(directory)))
 
@@ -74,9 +74,10 @@ def _drawn(directory: str) -> str:
 
 
 def _last_screen(drawn: str) -> str:
-    """Return the last screen before the program closes it."""
+    """Return the last screen on which a drive has a fault, or else the last one."""
     on_screen, _, _ = drawn.partition("\x1b[?1049l")
-    last = on_screen.split("\x1b[H")[-1]
+    screens = on_screen.split("\x1b[H")
+    last = next((one for one in reversed(screens) if " fault " in one), screens[-1])
     return re.sub(r"\x1b\[\?\d+[hl]", "", last).replace("\r", "")
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 from multidrop.cli.monitor import is_possible, watch
 from multidrop.cli.poll import add_polling_arguments, conclude, follow, tap_text
@@ -37,7 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
         _check_web(arguments)
         from multidrop.cli.serve import serve_demo
 
-        return serve_demo(is_shown=not arguments.no_browser)
+        status = serve_demo(is_shown=not arguments.no_browser)
+        print_text("\n".join(_next(WEB_NEXT)))
+        return status
     _make_room(arguments.out)
     with TemporaryDirectory(prefix="multidrop-") as directory:
         path, faults = demo_files(Path(directory))
@@ -70,25 +72,39 @@ def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
     samples, misses = counted(summary["samples"], "sample"), counted(summary["misses"], "miss", "misses")
     yield f"{samples} and {misses} in {out}"
     yield from tap_text(summary)
-    yield ""
-    yield "Next:"
+    yield from _next([WEB, NextCommand(("report", str(out)), "this recording as a page", "plot"), SCAN])
+
+
+class NextCommand(NamedTuple):
+    """A command to try next, its effect, and the extra that it needs."""
+
+    words: tuple[str, ...]
+    effect: str
+    extra: str = ""
+
+    @property
+    def lacks(self) -> str:
+        """How to install what is missing; "" if nothing is."""
+        is_there = all(map(find_spec, LIBRARIES[self.extra]))
+        return "" if is_there else f"; first: {install_command(self.extra)}"
+
+
+LIBRARIES = {"": (), "plot": ("matplotlib",), "serve": ("starlette", "uvicorn")}
+WEB = NextCommand(("demo", "--web"), "this plant on a page", "serve")
+SCAN = NextCommand(("scan", "/dev/ttyUSB0"), "find your own drives, by reading only")
+WEB_NEXT = (
+    NextCommand(("demo",), "this plant on a terminal, recorded"),
+    SCAN,
+    NextCommand(("serve", "plant.toml"), "your own plant on this page", "serve"),
+)
+
+
+def _next(commands: Sequence[NextCommand]) -> Iterator[str]:
+    """Yield the next commands, with the program as it was typed."""
     typed = sys.argv[0]
     program = typed if Path(typed).name == "multidrop" and which("multidrop") != typed else "multidrop"
-    yield from aligned(
-        [
-            (f"  {command_line([program, *words])}", what + _needs(extra, library))
-            for words, what, extra, library in (
-                (("demo", "--web"), "this plant on a page", "serve", "starlette"),
-                (("report", str(out)), "this recording as a page", "plot", "matplotlib"),
-                (("scan", "/dev/ttyUSB0"), "your own drives: only reads", "", ""),
-            )
-        ],
-        "<<",
-    )
-
-
-def _needs(extra: str, library: str) -> str:
-    return "" if not library or find_spec(library) else f"; first: {install_command(extra)}"
+    rows = [(f"  {command_line([program, *one.words])}", one.effect + one.lacks) for one in commands]
+    yield from ("", "Next:", *aligned(rows, "<<"))
 
 
 def _check_web(arguments: argparse.Namespace) -> None:

@@ -48,7 +48,8 @@ LINES = {  # drives by line: name, model, framing
     ),
 }
 DRIVES = [name for drives in LINES.values() for name, *_ in drives]
-POLLED = ("status", "output_frequency", "output_current", "fault", "last_fault")  # if their scale is known
+POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
+POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line has time for two requests at 9600 bit/s
 EVERY = "400 ms"
 MAXIMUM_HZ = 50
 TROUBLE = {  # faults of single drives
@@ -88,7 +89,8 @@ def _plant_tables(folder: Path) -> Iterator[str]:
 
 def _polled(family: type[Drive]) -> list[str]:
     """Return the registers whose values have a name or a unit, so that a column can show them."""
-    found = [family.registers[name] for name in POLLED if name in family.registers]
+    wanted = POLLED_OF.get(family.model, POLLED)
+    found = [family.registers[name] for name in wanted if name in family.registers]
     return [one.name for one in found if one.step is not None or one.values is not None]
 
 
