@@ -50,7 +50,8 @@ LINES = {  # drives by line: name, model, framing
 DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
 POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line has time for two requests at 9600 bit/s
-EVERY = "400 ms"
+SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings that explain terminals
+EVERY, SLOW = "400 ms", "10 s"
 MAXIMUM_HZ = 50
 TROUBLE = {  # faults of single drives
     "fan-1": 'trip = "30 s"\nfirst = "4 s"',
@@ -60,7 +61,7 @@ TROUBLE = {  # faults of single drives
     "fan-3": "loss = 0.02",
 }
 DRIFT = 0.25  # of every load
-STEP_S = 0.5  # between two looks of the operator at a drive of each line
+STEP_S = 0.6  # between two looks of the operator at a drive of each line
 CALM = 3  # of so many looks at a running motor, one changes its setpoint
 
 
@@ -83,15 +84,18 @@ def _plant_tables(folder: Path) -> Iterator[str]:
             yield (
                 f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
                 f"address = {address}\nbaudrate = {min(38400, max(family.baudrates))}\n{options}"
-                f'every = "{EVERY}"\npoll = {_polled(family)}\n'
+                f'every = "{EVERY}"\npoll = [{", ".join(_polled(family))}]\n'
             )
 
 
-def _polled(family: type[Drive]) -> list[str]:
-    """Return the registers whose values have a name or a unit, so that a column can show them."""
+def _polled(family: type[Drive]) -> Iterator[str]:
+    """Yield entries of `poll`: registers whose values have a name or a unit, as a column needs."""
     wanted = POLLED_OF.get(family.model, POLLED)
     found = [family.registers[name] for name in wanted if name in family.registers]
-    return [one.name for one in found if one.step is not None or one.values is not None]
+    yield from (f'"{one.name}"' for one in found if one.step is not None or one.values is not None)
+    for name in SLOWLY:
+        if name in family.registers:
+            yield f'{{ register = "{name}", every = "{SLOW}" }}'
 
 
 def _port(link: Path) -> str:
