@@ -169,7 +169,7 @@ def test_a_clock_of_any_resolution_is_read(tmp_path: Path, resolution: bytes, ti
     assert [span.time_ns for span in found] == [time_ns]
 
 
-# ---- what cannot be written ----
+# ---- write errors ----
 
 
 def test_a_capture_on_a_full_disk_is_one_sentence(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from multidrop.core import (
 READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
 
 
-# ---- what is no capture ----
+# ---- other files ----
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,10 @@ def test_a_capture_of_something_else_is_one_sentence(tmp_path: Path, content: by
 
 def described(*options: tuple[int, bytes]) -> bytes:
     """A pcapng file with one interface, described so, and no packet."""
-    told = b"".join(
+    fields = b"".join(
         struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4) for code, value in options
     )
-    interface = struct.pack("<HHI", 147, 0, 0) + told
+    interface = struct.pack("<HHI", 147, 0, 0) + fields
     size = len(interface) + 12
     section = struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
     return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
@@ -77,9 +77,9 @@ def block(kind: int, body: bytes) -> bytes:
     return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
 
 
-def packet(interface: int, content: bytes, told: int | None = None) -> bytes:
-    """An enhanced packet block; `told` is the length in its header."""
-    length = len(content) if told is None else told
+def packet(interface: int, content: bytes, stated: int | None = None) -> bytes:
+    """An enhanced packet block; `stated` is the length in its header."""
+    length = len(content) if stated is None else stated
     return block(6, struct.pack("<5I", interface, 0, 0, length, length) + content + bytes(-len(content) % 4))
 
 
@@ -96,7 +96,7 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         (SECTION + block(1, bytes(4)), " is damaged: what begins at byte 28 is no packet"),
         (described((9, b"\x0a")), ": byte 28: its clock is finer than a nanosecond"),
         (described() + packet(1, READ), NO_PACKET),  # of an interface that is not there
-        (described() + packet(0, READ, told=9), NO_PACKET),  # longer than its block
+        (described() + packet(0, READ, stated=9), NO_PACKET),  # longer than its block
         (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its two lengths differ
         (described() + SECTION, ": byte 48: only the first section can be read"),
         (described() + BIG_ENDIAN_SECTION, ": byte 48: sections of both byte orders cannot be read"),

@@ -130,7 +130,7 @@ def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> No
 
 
 def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -> Path:
-    """Return a capture of these frames, one every 2 ns."""
+    """Return a capture with these frames, one every 2 ns."""
     with CaptureWriter(path) as capture:
         for number, (asked, reply) in enumerate(exchanges):
             capture.write(build_request(Framing.RTU, asked), Side.ASKING, 2 * number, "hall-1")
@@ -148,7 +148,7 @@ def test_more_requests_than_are_remembered_are_decoded_all_the_same(
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
     replies = (Message(each.address, 3, each.start, 1, data) if data else None for each in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
-    told = asked if data else asked[:-1]  # nobody knows whether the last one was answered
+    told = asked if data else asked[:-1]  # whether the last one was answered is unknown
     assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
         (f"address {record.address}", f"holding_register_{record.start}", *end) for record in told
     ]

@@ -126,8 +126,7 @@ def by_time(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
 def check(rows: list[Row], decoded: list[Row]) -> None:
     """The same exchanges, but for the last one: it may have been under way when the poll ended.
 
-    A question that only tells whether the adapter echoes, or whether late answers still come, is in the
-    capture alone, and so is what was asked again because of them.
+    Only the capture has requests that probe for an echo or for late replies, and their repetitions.
     """
     recorded = list(by_time(rows).items())
     read = by_exchange(decoded)
@@ -162,7 +161,7 @@ def test_a_capture_of_all_variants_decodes_to_the_recording(mixed: Mixed) -> Non
 
 @pytest.mark.long
 def test_wireshark_reads_the_capture(mixed: Mixed) -> None:
-    """Each value of an RTU drive: who was asked for what and when, and the registers in the reply."""
+    """Each value of an RTU drive: address, registers and times of the request, and the reply's registers."""
     packets = tshark(mixed.capture)
     by_time = {each["frame.time_epoch"]: (number, each) for number, each in enumerate(packets, 1)}
     replies = {each["modbus.request_frame"]: each for each in packets if each["modbus.request_frame"]}
@@ -346,7 +345,7 @@ def test_two_that_write_into_one_directory_in_the_same_second_both_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for _ in range(2):
-        one_flight = Flight(tmp_path, monkeypatch)  # on a clock that begins at the same time
+        one_flight = Flight(tmp_path, monkeypatch)  # both clocks start at the same time
         one_flight.pass_(10, "hall-1: pump-1: bad checksum")
         one_flight.pass_(5)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -357,7 +356,7 @@ def test_two_that_write_into_one_directory_in_the_same_second_both_do(
 
 def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
-    (tmp_path / "flight-plan.pcapng").touch()  # somebody's own
+    (tmp_path / "flight-plan.pcapng").touch()  # a user's own file
     for _ in range(600):
         one_flight.pass_(1, "hall-1: pump-1: bad checksum")
     assert len(one_flight.recorder.written) == 10

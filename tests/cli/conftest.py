@@ -14,7 +14,7 @@ from multidrop.sim import Simulator, Wire, simulated, wire
 
 @pytest.fixture
 def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A plant file with two drives, of which only the first is simulated; replies come in one piece."""
+    """A plant file with two drives; only the first is simulated. Replies come in one piece."""
     monkeypatch.setattr(wire, "CHUNK", 1.0)
     port = tmp_path / "ports" / "hall-1"
     port.parent.mkdir()

@@ -472,7 +472,7 @@ def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     carry_out = getattr(Bus, place)
 
     def pressed(*args: Any, **details: Any) -> None:
-        if place == "close":  # nothing is left behind
+        if place == "close":  # no file is left
             carry_out(*args, **details)
         raise KeyboardInterrupt
 
@@ -554,7 +554,7 @@ def test_a_stop_continues_after_its_terminal_is_closed(run: Run, che: Che, verb:
 
     received.loses = loses
     with closing_terminal(verb, *words) as terminal:
-        assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it; nobody could be told how it ended
+        assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it; its output is closed
     assert is_closed.is_set()
     assert len(received.writes) >= begun + 3
     assert received.starts == received.starts[:1]
@@ -581,7 +581,7 @@ def test_a_mistake_beside_the_drive_does_not_prevent_a_stop(
     assert "stop done" in out
     assert all(text in err for text in told)
     assert received.sim["status"] == 3
-    assert run("start", *words, "--yes", *mistake)[0] == 2  # and nothing else is sent beside one
+    assert run("start", *words, "--yes", *mistake)[0] == 2  # and only the stop is sent
     assert received.starts == received.starts[:1]
 
 

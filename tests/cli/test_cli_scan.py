@@ -50,7 +50,7 @@ def test_findings_are_printed(run: Run, port: str) -> None:
     status, out, err = run("scan", port, *PATIENTLY)
     assert status == 0
     *told, summary = out.splitlines()
-    told.sort()  # a busy machine's drives are found when they are asked again
+    told.sort()  # on a busy machine the second pass finds the drives
     assert told[0].startswith("address 1: invt-che at 9600 8N1 rtu, ")
     assert told[1].startswith("address 2: innovert-ibd at 9600 8N1 ascii, ")
     assert told[2].startswith("address 3: an unknown Modbus device at 9600 8N1 rtu, ")

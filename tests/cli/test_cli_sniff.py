@@ -194,7 +194,7 @@ def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
     told = [json.loads(line) for line in out.splitlines()]
     assert {record["line"] for record in told[:-1]} == {url}
     assert told[-1]["summary"]["exchanges"] > 10
-    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # it may begin, and end, amid a frame
+    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # both ends may be incomplete
     pair = [[each.frame.hex(" ").upper()] for each in (READ, WRITE)]
     assert sniffed in ((len(sniffed) * pair)[: len(sniffed)], (len(sniffed) * pair)[1 : len(sniffed) + 1])
     if server:
@@ -286,7 +286,7 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
-    """Return the output of `decode` for a capture of these frames, one every ms, without times of day."""
+    """Return the output of `decode` for a capture with these frames, one every ms, without times of day."""
     with CaptureWriter(path) as writer:
         for number, (raw, side) in enumerate(frames):
             writer.write(raw, side, number * 1_000_000, "hall-1")
@@ -376,7 +376,7 @@ def test_columns_of_a_capture_are_counted(run: Run, capture: Path) -> None:
     assert [row.value for row in recorded(out)] == [5000, 5000]
 
 
-# ---- what goes wrong gets one sentence ----
+# ---- errors ----
 
 
 def test_a_port_that_cannot_be_sniffed_is_one_sentence(run: Run, tmp_path: Path) -> None:

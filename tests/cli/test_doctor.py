@@ -92,7 +92,7 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
         yield sim.wires[0].path
 
 
-# ---- what the system says ----
+# ---- facts of the system ----
 
 
 def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_pty_has_neither_flag_nor_mode() -> None:
         os.close(slave)
 
 
-# ---- what is said of it ----
+# ---- sentences ----
 
 
 def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:

@@ -52,7 +52,7 @@ def test_a_cut_line_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
 def test_a_table_that_a_narrower_terminal_wrapped_is_drawn_over_whole(
     tmp_path: Path, size: list[int]
 ) -> None:
-    """51 columns of values are two rows where there are 40, and 38 of the head one."""
+    """On 40 columns, 51 columns of values take two rows, and 38 columns of the head take one."""
     again = [text[: text.index("J") + 1] for text in drawings(tmp_path, "utf-8", size, 80, 80, 40)[1:]]
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
 

@@ -46,7 +46,7 @@ def test_lines_lost_by_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch
         fill(log)
         handler = LogThread(stream, FORMAT)
         handler.handle(record("first"))
-        until(lambda: handler._waiting.empty())  # it is being written, and that stands still
+        until(lambda: handler._waiting.empty())  # its write hangs
         for number in range(8):
             handler.handle(record(f"line {number}"))
         told = [reader.readline().strip()]

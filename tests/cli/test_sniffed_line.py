@@ -45,10 +45,10 @@ def drives() -> list[Drive]:
     ]
 
 
-# ---- masters that know nothing of us ----
+# ---- other programs as masters ----
 
 Said = tuple[int, int, list[int] | int]  # address, function, values or minus the exception code
-NUMBERS = itertools.count(1)  # each is written once: so an exchange can be told from all others
+NUMBERS = itertools.count(1)  # each is written once, so each exchange is unique
 
 
 def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Callable[..., Iterator[Said]]:
@@ -138,7 +138,7 @@ class Damage:
     """One byte in a hundred is changed, lost or doubled on its way to the listener."""
 
     said: bytearray = field(default_factory=bytearray)
-    damaged: list[int] = field(default_factory=list)  # places in what was said
+    damaged: list[int] = field(default_factory=list)  # offsets in the traffic
     chance: random.Random = field(default_factory=lambda: random.Random(2))
 
     def __call__(self, said: bytes) -> bytes:
@@ -186,7 +186,7 @@ def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
     assert len(expected) > 0.3 * len(said)
     sniffed = [tuple(record["frames"]) for record in told[:-1] if record.get("result") in ("ok", "refused")]
     rest = iter(sniffed)
-    assert [each for each in expected if each not in rest] == []  # all of them, in their order
-    assert set(sniffed) <= {each for _, each in exchanges}  # and nothing that was never said
+    assert [each for each in expected if each not in rest] == []  # every exchange, in order
+    assert set(sniffed) <= {each for _, each in exchanges}  # and no invented exchange
     unknown = sum(len(bytes.fromhex(record["unknown"])) for record in told[:-1] if "unknown" in record)
     assert told[-1]["summary"]["unknown_bytes"] == unknown > 0

@@ -150,7 +150,7 @@ class Breaker:
         return call
 
 
-# A segment takes 10 steps, and there are five: 3 apart, each of the ten is tried in one of them or two.
+# Five segments take 10 steps each: with every third step, each of the ten is tried once or twice.
 # Those that are always tried, 23 apart, are other ones in each, and of a merge.
 @pytest.mark.long
 @pytest.mark.parametrize("apart", usually(23, 3))
@@ -251,7 +251,7 @@ def _readable(path: Path) -> list[Row]:
 @pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
 def test_a_segment_without_a_head(tmp_path: Path, content: bytes) -> None:
-    """A machine that lost power may leave a file of nothing, or of zeros."""
+    """After a power cut a file may be empty or contain zeros."""
     rows = segments()
     record(tmp_path, rows)
     (tmp_path / "rows.00000002.arrows").write_bytes(content)

@@ -329,7 +329,7 @@ def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    """Asked again and again for other series and ranges, among them such as begin before or far behind."""
+    """Repeated queries for other series and ranges; some start earlier or much later."""
     monkeypatch.setattr(growing, "MOST_KEPT", most)
     monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
     dice = random.Random(most)
@@ -383,7 +383,7 @@ def test_duckdb_spills_into_a_private_folder(tmp_path: Path, monkeypatch: pytest
 def test_a_slow_reader_outlasts_files_that_are_replaced_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a busy machine each look took as long as a file stood there."""
+    """On a busy machine each listing takes as long as a file exists."""
     record(tmp_path, [random_rows(1, NOON, 100)])
     replaced = iter(range(20))
 

@@ -44,7 +44,7 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
 
 
 def check(history: History, written: dict[str, int], begin: int | None = None) -> int:
-    """Compare each run, or those since `begin`, with its count; return the number of all rows."""
+    """Compare each run, or those since `begin`, with its count. Return the number of all rows."""
     runs: dict[str, list[int]] = defaultdict(list)
     for rows in history.read(None, begin):
         for row in rows:

@@ -68,7 +68,7 @@ def of(
     folder: Path, points: int, begin: int = NOON, end: int = NOON + 300 * SECOND
 ) -> tuple[Buckets, Buckets]:
     with History(folder) as history:
-        for _ in range(2):  # what was learnt of the files changes nothing
+        for _ in range(2):  # cached facts of the files do not matter
             found = history.buckets([SERIES, OTHER], begin, end, points)
     return found[SERIES], found[OTHER]
 

@@ -30,7 +30,7 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.sim.memory import MemoryCell
 
 SEED = 6
-MOST_TOLD = 9  # lines that a client tells before it is killed
+MOST_TOLD = 9  # lines that a client reports before it is killed
 LONGEST_WAIT = 0.03  # s, from then until it is
 
 
@@ -105,7 +105,7 @@ def told(directory: Path, life: str) -> list[str]:
 def check_rows(rows: Sequence[Row]) -> None:
     """The count grew by one from sample to sample, but for exchanges that are rows without a value.
 
-    On a busy machine a drive is thought silent: that it was not asked is told when it would have been.
+    On a busy machine a drive may count as silent: then rows report that it was not asked.
     """
     samples = [row for row in rows if row.value is not None]
     assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(samples))
@@ -123,7 +123,7 @@ def check_recordings(directory: Path, life: str, acknowledged: int | None) -> in
     for suffix in (".arrows", ".csv"):
         path = directory / f"{life}{suffix}"
         if acknowledged is None and (not path.exists() or not path.stat().st_size):
-            continue  # killed before it had begun the recording
+            continue  # killed before the recording existed
         reader = open_recording(path)
         assert reader.metadata == METADATA
         rows = [row for batch in reader for row in batch]
@@ -166,7 +166,7 @@ def test_reported_rows_of_a_killed_client_are_recorded_once(
     acknowledged: list[int] = []
     for life in range(kills):
         # A killed client's last write may still be on its way, as the number that comes next: a client that
-        # finds its number there has nothing to write, and so nothing to note.
+        # finds its number there sends no write, so the audit log has no record of it.
         next_number = counting.numbers[-1] + 2 if counting.numbers else 1
         lines, seconds = chance.randint(0, MOST_TOLD), chance.uniform(0.0, LONGEST_WAIT)
         died_of = nursery.live(str(life), next_number, lines, seconds)

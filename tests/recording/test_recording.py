@@ -1,4 +1,4 @@
-"""Recordings: the library and other programs read what was written, also after a conversion."""
+"""Recordings: the library and other programs read all written rows, also after a conversion."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def test_csv_without_its_metadata_is_read_all_the_same(tmp_path: Path) -> None:
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 ANY = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
-NAME = ANY | st.text("'=+-@\t\r\nx", max_size=4)  # what a spreadsheet may take for a formula
+NAME = ANY | st.text("'=+-@\t\r\nx", max_size=4)  # text that a spreadsheet may evaluate
 SAMPLE = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.floats(allow_nan=False), st.just("ok"))
 NO_NUMBER = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.just(math.nan), st.just("ok"))
 MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
@@ -273,7 +273,7 @@ def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: l
 def test_any_batches_converted(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
 ) -> None:
-    """A drive may send floating-point numbers that are none; nothing equals them but their name."""
+    """A drive may send NaN, which equals only its name."""
     folder = tmp_path_factory.mktemp("any")
     with open_writer(folder / f"a{suffix}", {}) as writer:
         for some in filter(None, batches):
@@ -341,7 +341,7 @@ def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -
 @pytest.mark.slow
 @pytest.mark.long
 def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> None:
-    """Peak memory of a conversion of 13 MB is less than half of them, as of 22 MB."""
+    """A conversion of 13 MB needs less than half that memory at its peak."""
     tracemalloc = pytest.importorskip("tracemalloc")
     with open_writer(tmp_path / "a.arrows", {}) as writer:
         batch = counting(16384)
@@ -509,7 +509,7 @@ class Grown:
 
 @pytest.mark.long
 def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path) -> None:
-    """polars and nanoarrow read no deltas of dictionaries: each changed one is written anew."""
+    """polars and nanoarrow read no deltas, so each changed dictionary is written again."""
     polars = pytest.importorskip("polars", reason="needs polars")
     nanoarrow = pytest.importorskip("nanoarrow")
     path, grown = tmp_path / "a.arrows", Grown()
@@ -526,7 +526,7 @@ def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path
 
 
 def test_a_stream_rewritten_by_another_program_is_read(tmp_path: Path) -> None:
-    """Its dictionaries have other ids, and come as deltas where it likes."""
+    """Its dictionaries have other ids, and some come as deltas."""
     path, grown = record(tmp_path / "a.arrows"), Grown()
     table = pa.ipc.open_stream(path.read_bytes()).read_all()
     with pa.ipc.new_stream(tmp_path / "b.arrows", table.schema) as stream:
@@ -570,7 +570,7 @@ def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
 
 
 def test_a_row_takes_35_bytes_at_most(tmp_path: Path) -> None:
-    """31 drives of 10 values at 10 Hz, in batches of a tenth of a second, some of them misses."""
+    """31 drives with 10 values at 10 Hz, in batches of a tenth of a second; some rows are misses."""
     drives = Names([f"pump-{number}" for number in range(31)])
     registers = Names([f"some_register_{number}" for number in range(10)])
     with open_writer(tmp_path / "a.arrows", METADATA) as writer:

@@ -1,4 +1,4 @@
-"""Recordings after a kill or a full disk, and files that are no recordings: all complete data is kept."""
+"""Recordings after a kill or a full disk keep all complete data; other files are refused."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_random_cuts_of_arrows_lose_only_incomplete_batches(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_a_cut_between_dictionary_and_rows_is_readable_by_all(tmp_path: Path) -> None:
-    """Dictionaries go before their batch, and a cut may leave some of them, and no batch."""
+    """Dictionaries precede their batch: a cut may leave some dictionaries without a batch."""
     polars = pytest.importorskip("polars", reason="needs polars")
     path = tmp_path / "a.arrows"
     lengths, names = [], Names(["pump-0"])
@@ -129,7 +129,7 @@ def test_a_recording_behind_another_is_not_read_as_its_end(tmp_path: Path) -> No
 def test_names_that_would_fill_the_memory_are_damage(
     tmp_path: Path, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A part of what is too much is refused where only that part of it is allowed."""
+    """Scale the limit and the data down by the same factor."""
     monkeypatch.setattr(arrow_decoder, "MOST_SPELLED", 2**28 // part)
     path = tmp_path / "a.arrows"
     row = Row(1, 1, None, "x" * (2**20 // part), "r", None, "no reply")
@@ -332,7 +332,7 @@ def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str)
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_read_only_directory(tmp_path: Path, suffix: str) -> None:
-    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # loads what nobody may be unable to read below
+    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # imports before rights are dropped
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
         with pytest.raises(RecordingError) as failure:
@@ -388,7 +388,7 @@ def test_an_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, suffix: 
 
 
 class Halving:
-    """A file that takes half of what it is given, and is interrupted then."""
+    """A file that writes half of the bytes, and then raises KeyboardInterrupt."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -406,7 +406,7 @@ class Halving:
 
 @pytest.mark.parametrize("room", range(0, 120, 10))
 def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> None:
-    """Wherever the disk becomes full at the beginning: never half of a .csv.json."""
+    """No .csv.json is incomplete, wherever the disk becomes full."""
     path = tmp_path / "a.csv"
     whole = {"plant": "p" * 60}
     try:
@@ -424,7 +424,7 @@ def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> 
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_clock_that_is_set_back_an_hour(tmp_path: Path, suffix: str) -> None:
-    """Rows stay in the order in which they were taken, by monotonic_ns; time says what the clock said."""
+    """Rows stay in the order of monotonic_ns; `time` repeats the clock."""
     path = tmp_path / f"a{suffix}"
     offsets = (UTC_0, UTC_0 - 3600 * SECOND)
     with open_writer(path, METADATA) as writer:

@@ -165,7 +165,7 @@ def test_a_segment_that_could_not_begin_leaves_no_file_and_its_number_is_not_giv
         assert names(tmp_path) == ["run.00000002.arrows"]
 
 
-# ---- what is kept ----
+# ---- retention ----
 
 
 def test_old_segments_are_removed_when_a_segment_starts(tmp_path: Path, hand: Hand) -> None:
@@ -213,7 +213,7 @@ def test_outlived() -> None:
     assert gone(45.0, None, 250) == [1, 2]
     assert gone(45.0, 30.0, 250) == [1, 2]
     assert gone(45.0, None, 99) == [1, 2, 3, 4]
-    assert gone(5.0, 1.0, None) == []  # the clock was set back: nothing is old
+    assert gone(5.0, 1.0, None) == []  # the clock was set back: no file is old
 
 
 def test_a_clock_that_jumps_removes_no_segment() -> None:

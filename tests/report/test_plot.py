@@ -85,7 +85,7 @@ def look(ramp: Path) -> Recording:
     return load(ramp)
 
 
-# ---- what is read ----
+# ---- loading ----
 
 
 def test_series_have_every_value_and_every_miss(look: Recording) -> None:
@@ -151,14 +151,14 @@ def test_a_fault_without_a_name_and_one_of_flags_are_shown(tmp_path: Path) -> No
     ]
 
 
-# ---- what is worked out ----
+# ---- figures ----
 
 
 def test_the_response_delay_is_without_the_request(look: Recording) -> None:
     pump, fan = delays(look)
     assert pump.exact
     assert pump.seconds == pytest.approx(np.full(1000, 0.020 - REQUEST_9600))
-    assert not fan.exact  # nothing tells its settings
+    assert not fan.exact  # its settings are unknown
     assert fan.quantile(0.5) == pytest.approx(0.0165)
     assert fan.quantile(1.0) == pytest.approx(0.021)
 
@@ -401,7 +401,7 @@ def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None
 
 
 def test_no_line_and_no_state_leads_across_a_pause(tmp_path: Path) -> None:
-    """A process that stood still recorded nothing, not even a miss. A rate that changes is no pause."""
+    """A suspended process records no rows, not even misses. A changed rate is not a pause."""
     times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]
     rows = [row(at, "pump", name, 1.0) for at in times for name in ("output_frequency", "status")]
     about = {"drives": {"pump": {"registers": {"status": {"values": {"runs": 1}}}}}}
@@ -497,7 +497,7 @@ def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> No
 
 
 def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
-    """A panel of curves and one of states stand in one picture, under one legend of drives."""
+    """A panel of curves and a panel of states share one picture and one legend of drives."""
     from matplotlib.colors import to_hex
 
     from multidrop.report.style import line_style
@@ -705,7 +705,7 @@ ODD: list[Any] = [10**400, None, True, -1, 1e308, "", "x", [], [1], {}, {"a": {}
 
 
 def with_odd(about: Any, odd: Any) -> Iterator[Any]:
-    """The same metadata, with this in the place of each part of it in turn."""
+    """The same metadata, with each part in turn replaced by this."""
     yield odd
     for key, part in about.items() if isinstance(about, dict) else enumerate(about) if about else ():
         if isinstance(part, dict | list):
@@ -724,12 +724,12 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", usually(*ODD), ids=lambda odd: repr(odd)[:12])
 def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
-    """All parts of it are read before a picture is drawn."""
+    """All parts are read before a picture is drawn."""
     about = {"plant": "hall.toml", "planned": PLANNED, "drives": ABOUT["drives"]}
     rows = turns()[:30]
     for number, metadata in enumerate(with_odd(about, odd)):
         if not isinstance(metadata, dict):
-            continue  # is no recording
+            continue  # is not a recording
         look = load(record(tmp_path / f"{number}.arrows", rows, metadata, pieces=1))
         assert all(
             np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()

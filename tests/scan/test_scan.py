@@ -338,7 +338,7 @@ def test_a_drive_that_answers_late_is_found_all_the_same(delay: float) -> None:
 
 
 class Hesitant(SimulatedCHE):
-    """Answers what a scan asks first at once, and all else late: a converter, or a busy computer."""
+    """Answers a scan's first request at once and all others late, as a converter or a busy computer does."""
 
     hurried = 3  # tries of a probe, after the sweep's own question
 
@@ -522,7 +522,7 @@ def test_every_question_is_a_read_of_the_documents() -> None:
 
 
 class Bare(SimulatedIBD):
-    """An IBD of which only what examples of its manual show is there: the addresses above are inferred."""
+    """An IBD with only the registers in its manual's examples; the addresses above are inferred."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         if start >= 200:
@@ -555,7 +555,7 @@ def test_other_bits_than_an_ibd_s_terminals_exclude_it() -> None:
 
 
 class Anything(SimulatedDrive):
-    """Says 0 for whatever it is asked, as some gateways do."""
+    """Answers every read with 0, as some gateways do."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         return [0] * count

@@ -1,7 +1,7 @@
 """Read captures: pcap and pcapng files, from multidrop or other programs, as a stream of bytes per line.
 
 A capture is read in pieces, because it may be larger than memory. It is not mapped into memory: if the file
-were truncated meanwhile, a mapping would crash the process, whereas reading raises an error.
+were truncated during that, a mapping would crash the process, whereas reading raises an error.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Capture:
         return piece
 
     def _read_block(self, unpacker: Unpacker) -> bool:
-        """Read a block that is no enhanced packet; return False if the file ends within it."""
+        """Read a block other than an enhanced packet; return False if the file ends within it."""
         at = unpacker.at
         kind = self._read("I", at)
         if kind == SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:

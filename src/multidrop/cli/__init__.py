@@ -43,7 +43,7 @@ COMMANDS = {  # name: module in this package, and help
     "reset-fault": ("verbs", "reset a drive's fault; never starts the motor"),
     "set-frequency": ("verbs", "write a drive's frequency setpoint"),
     "release-control": ("verbs", "return control of a stopped motor to its panel and terminals"),
-    "ports": ("ports", "list this computer's serial ports, their adapters and who may open them"),
+    "ports": ("ports", "list this machine's ports, and who may open them"),
     "params": ("params", "save, compare and write the parameters of a drive"),
     "scan": ("scan", "find the drives on a line, by reading only"),
     "plan": ("plan", "predict the load of a plant file's lines; opens no port"),

@@ -30,11 +30,9 @@ from multidrop.cli.doctor_findings import (
 from multidrop.cli.support.arguments import (
     add_json_argument,
     add_line_arguments,
-    add_rs485_argument,
-    add_settle_argument,
+    add_opening_arguments,
+    opening_of,
     plant_at,
-    rs485_at,
-    settle_at,
     usual_settings,
     whole,
 )
@@ -83,8 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format", metavar="8N1", help="data bits, parity and stop bits; default: the family's, or 8N1"
     )
     parser.add_argument("--framing", metavar="rtu", help="default: the family's first")
-    add_rs485_argument(parser)
-    add_settle_argument(parser)
+    add_opening_arguments(parser)
     add_json_argument(parser)
 
 
@@ -127,20 +124,20 @@ def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
         if getattr(arguments, name) is not None:
             raise ValueError(f"--{name} is not for plant files: set it in {plant.path}")
     for line in plant.lines:
-        rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
+        rs485, settle = opening_of(arguments, line)
         if arguments.name in (None, line.name):
             drives = [polled.drive for polled in line.drives]
             yield _Target(line.port, drives, usual_settings(line), rs485, settle, line.name)
     if arguments.name not in {None, *(line.name for line in plant.lines)}:
         line, drive = plant.find_drive(arguments.name)
-        rs485, settle = rs485_at(arguments, line), settle_at(arguments, line)
+        rs485, settle = opening_of(arguments, line)
         yield _Target(line.port, [drive], drive.settings, rs485, settle, line.name)
 
 
 def _by_hand(arguments: argparse.Namespace) -> _Target:
     drive = _drive(arguments)
     settings = drive.settings if drive else _line_settings(arguments)
-    rs485, settle = rs485_at(arguments, None), settle_at(arguments, None)
+    rs485, settle = opening_of(arguments, None)
     return _Target(arguments.port, [drive] if drive else [], settings, rs485, settle)
 
 

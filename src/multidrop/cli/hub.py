@@ -6,15 +6,14 @@ import argparse
 import asyncio
 import json
 import logging
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.connection import URLS, add_nats_arguments, nats_options, nats_urls
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import require_extra
-from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
-from multidrop.cli.support.output import logging_by, print_text
+from multidrop.cli.support.log_thread import add_log_argument, logging_to_stderr
+from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import end_signals_cancel
 from multidrop.cli.support.values import counted
 from multidrop.supervisor import supervisor
@@ -55,8 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = {"name": "multidrop hub", **nats_options(arguments, arguments.servers)}
     sink = _sink(arguments)
     try:
-        log = LogThread(sys.stderr, FORMATTERS[arguments.log]())
-        with logging_by(log, LEVELS):
+        with logging_to_stderr(arguments.log, LEVELS):
             state = asyncio.run(_read_until_signal(arguments, sink, options))
     finally:
         sink.close()

@@ -19,6 +19,7 @@ from multidrop.cli.support.arguments import (
     add_json_argument,
     add_plant_argument,
     add_port_option,
+    argument,
     duration,
     plant_of,
 )
@@ -318,19 +319,19 @@ def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rotate",
         metavar="TIME",
-        type=_age,
+        type=argument(parse_age),
         help='start a new file at this interval, such as "1 h": run.00000001.arrows and so on',
     )
     parser.add_argument(
         "--keep",
         metavar="TIME",
-        type=_age,
+        type=argument(parse_age),
         help='with --rotate: remove files older than this, such as "30 days"',
     )
     parser.add_argument(
         "--most",
         metavar="SIZE",
-        type=_size,
+        type=argument(parse_size),
         help='with --rotate: remove the oldest files beyond this total size, such as "20 GB"',
     )
 
@@ -344,17 +345,3 @@ def rotation_of(arguments: argparse.Namespace) -> Rotation | None:
     if not arguments.out or arguments.out.suffix != ".arrows":
         raise ValueError("--rotate needs a name that ends in .arrows, such as --out run.arrows")
     return Rotation(arguments.rotate, arguments.keep, arguments.most)
-
-
-def _age(text: str) -> float:
-    try:
-        return parse_age(text)
-    except ValueError as mistake:
-        raise argparse.ArgumentTypeError(str(mistake)) from None
-
-
-def _size(text: str) -> int:
-    try:
-        return parse_size(text)
-    except ValueError as mistake:
-        raise argparse.ArgumentTypeError(str(mistake)) from None

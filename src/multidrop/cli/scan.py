@@ -13,12 +13,11 @@ from typing import Any
 from multidrop.cli.support.arguments import (
     add_json_argument,
     add_line_arguments,
-    add_rs485_argument,
-    add_settle_argument,
+    add_opening_arguments,
+    argument,
     line_of,
+    opening_of,
     plant_at,
-    rs485_at,
-    settle_at,
 )
 from multidrop.cli.support.files import check_writable, write_new
 from multidrop.cli.support.output import print_text
@@ -57,15 +56,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--addresses",
         metavar="1-31",
-        type=_addresses,
+        type=argument(_addresses),
         default=list(ADDRESSES),
         help=f"such as 1-247 or 1,5,9, on tcp:// 0-255; default: {ADDRESSES[0]}-{ADDRESSES[-1]}",
     )
     for name, metavar, parse in (("--baudrates", "N,N", _baudrates), ("--formats", "8N1,8E1", _formats)):
-        parser.add_argument(name, metavar=metavar, type=parse, default=[], help="only these; default: all")
+        kind = argument(parse)
+        parser.add_argument(name, metavar=metavar, type=kind, default=[], help="only these; default: all")
     parser.add_argument("--quick", action="store_true", help="skip the second pass for slow drives")
-    add_rs485_argument(parser)
-    add_settle_argument(parser)
+    add_opening_arguments(parser)
     parser.add_argument(
         "--out", metavar="PLANT.toml", type=Path, help="write a plant file of the drives found"
     )
@@ -78,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     plant = plant_at(arguments)
     declared = line_of(plant, arguments.name) if plant else None
     arguments.port = declared.port if declared else arguments.port
-    rs485, settle = rs485_at(arguments, declared), settle_at(arguments, declared)
+    rs485, settle = opening_of(arguments, declared)
     families = _families(arguments.model)
     planned = _planned(arguments, list(families.values()))
     begun = time.monotonic()
@@ -246,29 +245,13 @@ def _as_json(found: Sequence[Finding]) -> dict[str, Any]:
 
 
 def _record(finding: Finding) -> dict[str, Any]:
-    settings = finding.settings
-    record = {
-        "baudrate": settings.baudrate,
-        "format": settings.format,
-        "framing": str(finding.framing),
-    }
-    match finding:
-        case Found():
-            return {
-                "address": finding.address,
-                **record,
-                "models": list(finding.models),
-                "response_delay_ms": round(finding.response_delay * 1e3, 3),
-                "doubt": finding.doubt or None,
-            }
-        case Crowd():
-            return {"address": finding.address, **record, "reply": finding.reply or None}
-        case Noise():
-            return {**record, "garbled": finding.garbled, "asked": finding.asked}
-        case Untried():
-            return {**record, "reason": finding.reason}
-        case Progress():
-            return record
+    found: dict[str, Any] = {name: value if value != "" else None for name, value in vars(finding).items()}
+    settings, framing = found.pop("settings"), found.pop("framing")
+    place = {"address": found.pop("address")} if "address" in found else {}
+    if isinstance(finding, Found):
+        found["response_delay_ms"] = round(found.pop("response_delay") * 1e3, 3)
+    line = {"baudrate": settings.baudrate, "format": settings.format, "framing": str(framing)}
+    return place | line | found
 
 
 # ---- arguments ----
@@ -283,7 +266,7 @@ def _addresses(text: str) -> list[int]:
     except ValueError:
         spans = []
     if not spans or not all(0 <= first <= last <= UNIT_IDS[-1] for first, last in spans):
-        raise argparse.ArgumentTypeError(
+        raise ValueError(
             f"invalid addresses {text!r}: write 1 to 247 (0 to 255 on a tcp:// port), such as 1-31 or 1,5,9"
         )
     return list(dict.fromkeys(address for first, last in spans for address in range(first, last + 1)))
@@ -293,7 +276,7 @@ def _baudrates(text: str) -> list[int]:
     try:
         return [plain_whole(part) for part in text.split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"invalid baud rates {text!r}: write such as 9600,19200") from None
+        raise ValueError(f"invalid baud rates {text!r}: write such as 9600,19200") from None
 
 
 def _formats(text: str) -> list[str]:

@@ -83,7 +83,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove what a killed process left: incomplete files, and files that others replace."""
+    """Remove a killed process's leftovers: incomplete files, and files that others replace."""
     for directory in (folder / "rows", folder / "tens"):
         for path in directory.glob(".*.part"):
             path.unlink()

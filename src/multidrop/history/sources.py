@@ -1,4 +1,4 @@
-"""Read the files of a history, which may be replaced meanwhile: open segments, and Parquet by DuckDB."""
+"""Read the files of a history while they may be replaced: open segments, and Parquet by DuckDB."""
 
 from __future__ import annotations
 

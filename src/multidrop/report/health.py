@@ -204,7 +204,7 @@ MOST_FIGURE = 1e9  # sanity limit of a plan's figures
 
 @dataclass(frozen=True, eq=False)
 class LineUse:
-    """A line's answered exchanges: when they were, and how much line time each of them needed."""
+    """A line's answered exchanges: the time of each, and the line time that it needed."""
 
     line: str
     planned: Mapping[str, Any]

@@ -180,7 +180,7 @@ class Recording:
 
 
 def load(path: str | Path) -> Recording:
-    """Load a recording. Raises OSError; ValueError if it is no recording, empty, or too large."""
+    """Load a recording. Raises OSError; ValueError if it is not a recording, empty, or too large."""
     reader = open_recording(path)
     codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
     parts: list[list[Array]] = []

@@ -114,6 +114,14 @@ def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
         return run_loop(work())
 
 
+async def open_path(paths: Sequence[ServerPath]) -> ServerPath:
+    """Open the connections; return one that is open. Raises FleetError if no server answers."""
+    from multidrop.fleet.servers.setup import open_all
+
+    await open_all(paths)
+    return next(path for path in paths if path.is_open)
+
+
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
     """Run an action with three connections to the servers, and close them afterwards."""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -16,9 +18,9 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from tempfile import mkdtemp
 
-from multidrop.cli.fleet import demo_guard
-
-GUARD = [sys.executable, "-I", "-S", str(demo_guard.__file__)]
+PR_SET_PDEATHSIG = 1  # prctl(2)
+# Waits for the end of stdin; then processes that are being killed may still write into the folder.
+REMOVE = 'cat; for n in 1 2 3 4 5 6 7 8 9 10; do rm -rf "$0" && exit; sleep 1; done'
 ENDING_S = 10.0  # timeout for a process that was asked to exit
 NODES = ("n1", "n2", "n3")
 ATTEMPTS = 3  # retries, because another program may take a port that was just free
@@ -38,7 +40,7 @@ def temporary_folder() -> Iterator[Path]:
     """Create a folder that is removed when this process ends, even by SIGKILL."""
     folder = mkdtemp(prefix="multidrop-")
     with subprocess.Popen(
-        [*GUARD, "remove", folder], stdin=subprocess.PIPE, start_new_session=True
+        ["sh", "-c", REMOVE, folder], stdin=subprocess.PIPE, start_new_session=True
     ) as remover:
         try:
             yield Path(folder)
@@ -54,6 +56,13 @@ class Children:
         self._folder = folder
         self._environment = {**os.environ, **environment}
         self._running: dict[str, subprocess.Popen[str]] = {}
+        self._libc, self._parent = ctypes.CDLL(None), os.getpid()
+
+    def _die_with_parent(self) -> None:
+        """Let the kernel kill the new process when this one ends."""
+        self._libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != self._parent:
+            os._exit(1)
 
     def __getitem__(self, name: str) -> subprocess.Popen[str]:
         return self._running[name]
@@ -62,12 +71,13 @@ class Children:
         """Start a program; its stderr goes to its log."""
         with self._log(name).open("ab") as log:
             self._running[name] = subprocess.Popen(
-                [*GUARD, "exec", str(os.getpid()), *words],
+                words,
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=self._environment,
                 encoding="utf-8",
                 start_new_session=True,
+                preexec_fn=self._die_with_parent,
             )
         return self._running[name]
 

@@ -9,7 +9,7 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
-from multidrop.cli.fleet.connection import add_server_arguments, require_fleet, run_with_paths
+from multidrop.cli.fleet.connection import add_server_arguments, open_path, require_fleet, run_with_paths
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import counted
 
@@ -34,11 +34,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def _drain(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     from multidrop.fleet.gateway import ask_gateway
-    from multidrop.fleet.servers.setup import check_buckets, open_all
+    from multidrop.fleet.servers.setup import check_buckets
 
     name = arguments.gateway
-    await open_all(paths)
-    path = next(one for one in paths if one.is_open)
+    path = await open_path(paths)
     await check_buckets(path)
     said = await ask_gateway(path, name, "drain")
     ends = time.monotonic() + DRAIN_S

@@ -7,7 +7,7 @@ import json
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
+from multidrop.cli.fleet.connection import add_server_arguments, open_path, run_with_paths
 from multidrop.cli.fleet.tables import (
     count_sentence,
     failing_lines,
@@ -36,10 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def _seen(paths: list[ServerPath]) -> dict[str, Any]:
     from multidrop.fleet.overview import FleetView
-    from multidrop.fleet.servers.setup import open_all
 
-    await open_all(paths)
-    view = FleetView(next(one for one in paths if one.is_open))
+    view = FleetView(await open_path(paths))
     await view.look()
     return view.fleet()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from multidrop.cli.fleet.connection import (
     state_folder,
     urls_of,
 )
-from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
-from multidrop.cli.support.output import logging_by, print_text
+from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
+from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals, run_loop
 from multidrop.supervisor import supervisor
 
@@ -40,8 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
-    log = LogThread(sys.stderr, FORMATTERS[arguments.log]())
-    with logging_by(log, {"multidrop": logging.INFO, "asyncio": logging.WARNING}):
+    with logging_to_stderr(arguments.log, {"multidrop": logging.INFO, "asyncio": logging.WARNING}) as log:
         return run_loop(_serve(arguments, log))
 
 

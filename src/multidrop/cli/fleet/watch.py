@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.connection import add_server_arguments, run_with_paths
+from multidrop.cli.fleet.connection import add_server_arguments, open_path, run_with_paths
 from multidrop.cli.fleet.screen import picture
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.screen import Screen
@@ -37,13 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
 async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
     """Show the fleet until Ctrl-C. While no server answers, show the last view with its age."""
     from multidrop.fleet.overview import FleetView, FleetWatch
-    from multidrop.fleet.servers.setup import open_all
     from multidrop.supervisor import end_tasks
 
     if not is_json and not sys.stdout.isatty():
         raise ValueError("`multidrop fleet watch` needs a terminal; with --json it works without one")
-    await open_all(paths)
-    path = next(one for one in paths if one.is_open)
+    path = await open_path(paths)
     view = FleetView(path)
     await view.check()
     over = asyncio.Event()

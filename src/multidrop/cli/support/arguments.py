@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from multidrop.bus import Bus
 from multidrop.cli.support.output import command_line
@@ -19,6 +20,8 @@ from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.printable import plain_number, plain_whole
 from multidrop.toml_check import parse_duration
+
+T = TypeVar("T")
 
 
 def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True) -> None:
@@ -36,31 +39,29 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON for programs")
 
 
-def whole(text: str) -> int:
-    """Parse a whole number."""
-    try:
-        return plain_whole(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number such as 10") from None
+def argument(parse: Callable[[str], T], example: str = "") -> Callable[[str], T]:
+    """Return a type for argparse that fails with the message of `parse`, or with an example."""
+
+    def parsed(text: str) -> T:
+        try:
+            return parse(text)
+        except ValueError as mistake:
+            message = f"{text!r} is not {example}" if example else str(mistake)
+            raise argparse.ArgumentTypeError(message) from None
+
+    return parsed
 
 
-def number(text: str) -> float:
-    """Parse a number, with or without a decimal point."""
-    try:
-        return plain_number(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number such as 42.5") from None
-
-
-def duration(text: str) -> float:
-    """Parse a number of seconds above 0."""
-    try:
-        seconds = plain_number(text)
-    except ValueError:
-        seconds = 0.0
+def _seconds(text: str) -> float:
+    seconds = plain_number(text)
     if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
+        raise ValueError(text)
     return seconds
+
+
+whole = argument(plain_whole, "a whole number such as 10")
+number = argument(plain_number, "a number such as 42.5")
+duration = argument(_seconds, "a number of seconds above 0")
 
 
 def add_plant_argument(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +74,7 @@ def add_port_option(parser: argparse.ArgumentParser) -> None:
         "--port",
         metavar="LINE=PORT",
         dest="ports",
-        type=_named_port,
+        type=argument(_named_port),
         action="append",
         default=[],
         help="use another port for a line of the plant file, such as a simulated one; may be repeated",
@@ -115,29 +116,14 @@ def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", k
     add_port_option(parser)
 
 
-def add_rs485_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --rs485 for a port without a plant file; `rs485_at` returns its value."""
+def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --rs485 and --settle for a port without a plant file; see `opening_of`."""
     parser.add_argument(
         "--rs485",
         metavar="MODE",
         help="how to switch between sending and receiving, if the adapter does not by itself: "
         "kernel, rts-up or rts-down",
     )
-
-
-def rs485_at(arguments: argparse.Namespace, line: PlantLine | None) -> RS485:
-    """Return the RS-485 mode of this line, or of a port without a plant file. Raises ValueError."""
-    if line is None:
-        found = RS485(arguments.rs485 or "off")
-        found.check_port(arguments.port)
-        return found
-    if arguments.rs485 is not None:
-        raise ValueError("--rs485 is not for plant files: set rs485 in the line's table there")
-    return line.rs485
-
-
-def add_settle_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --settle for a port without a plant file; `settle_at` returns its value."""
     parser.add_argument(
         "--settle",
         metavar="TIME",
@@ -145,13 +131,19 @@ def add_settle_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def settle_at(arguments: argparse.Namespace, line: PlantLine | None) -> float:
-    """Return the pause in s after opening this line, or a port without a plant file. Raises ValueError."""
-    if line is not None:
-        if arguments.settle is not None:
-            raise ValueError("--settle is not for plant files: set settle in the line's table there")
-        return line.settle
-    return parse_duration(arguments.settle) if arguments.settle is not None else 0.0
+def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[RS485, float]:
+    """Return RS-485 mode and pause in s after opening: the line's, or those of a port without a plant file.
+
+    Raises ValueError for an invalid mode or pause, and for options beside a plant file.
+    """
+    if line is None:
+        rs485 = RS485(arguments.rs485 or "off")
+        rs485.check_port(arguments.port)
+        return rs485, 0.0 if arguments.settle is None else parse_duration(arguments.settle)
+    for name in ("rs485", "settle"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} is not for plant files: set {name} in the line's table there")
+    return line.rs485, line.settle
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:
@@ -194,7 +186,7 @@ def usual_settings(line: PlantLine | None) -> Settings:
 def _named_port(text: str) -> tuple[str, str]:
     name, equals, port = text.partition("=")
     if not (name and equals and port):
-        raise argparse.ArgumentTypeError(f"{text!r} is not LINE=PORT, such as hall-1=ports/hall-1")
+        raise ValueError(f"{text!r} is not LINE=PORT, such as hall-1=ports/hall-1")
     return name, port
 
 
@@ -244,7 +236,7 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
     parser.add_argument(
         "--option",
         metavar="NAME=VALUE",
-        type=_option,
+        type=argument(_option, "NAME=VALUE with a number as its value"),
         action="append",
         default=[],
         help="a fact about this drive; see `multidrop models MODEL`",
@@ -332,7 +324,4 @@ def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
 
 def _option(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
-    try:
-        return name.replace("-", "_"), plain_number(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number as its value") from None
+    return name.replace("-", "_"), plain_number(value)

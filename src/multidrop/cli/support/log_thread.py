@@ -7,11 +7,14 @@ import json
 import logging
 import os
 import queue
+import sys
 import threading
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import TextIO
 
+from multidrop.cli.support.output import logging_by
 from multidrop.printable import masked, printable
 
 MOST_WAITING = 10_000  # lines
@@ -102,6 +105,14 @@ def _time(record: logging.LogRecord) -> str:
 
 
 FORMATTERS = {"text": TextFormatter, "json": JsonFormatter}
+
+
+@contextmanager
+def logging_to_stderr(form: str, levels: Mapping[str, int]) -> Iterator[LogThread]:
+    """Write the loggers' messages, from the given levels up, to stderr."""
+    log = LogThread(sys.stderr, FORMATTERS[form]())
+    with logging_by(log, levels):
+        yield log
 
 
 def add_log_argument(parser: argparse.ArgumentParser) -> None:
