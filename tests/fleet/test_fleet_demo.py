@@ -18,7 +18,7 @@ from lines import PATIENCE, until
 from terminals import on_terminal
 
 from multidrop.cli.fleet import demo_processes
-from multidrop.cli.fleet.demo import Stage, gap_s, plant_file
+from multidrop.cli.fleet.demo import Stage, plant_file
 from multidrop.plant.loader import load_plant
 
 
@@ -38,20 +38,6 @@ async def test_the_fleet_is_calm_when_no_line_has_moved_between_two_views() -> N
     assert not waiting.done()
     await look("gw-2")
     await asyncio.wait_for(waiting, PATIENCE)
-
-
-def test_unsent_messages_are_counted_for_each_gateway() -> None:
-    stage = Stage()
-    says = [{"spool": {"behind": 0}}, {"spool": {"behind": 2}}, {"spool": {"behind": None}}, None]
-    stage.show({"gateways": {f"gw-{n}": {"says": one} for n, one in enumerate(says)}, "lines": {}})
-    assert stage.unsent() == [0, 2, None, None]
-
-
-def test_a_gap_is_measured_around_the_kill() -> None:
-    times = [1_000_000_000, 2_000_000_000, 5_000_000_000]
-    assert gap_s(times, 2_100_000_000) == 3.0
-    assert gap_s(times, 6_000_000_000) == float("inf")
-    assert gap_s([], 0) == float("inf")
 
 
 def test_the_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
@@ -114,9 +100,9 @@ def started() -> Iterator[tuple[subprocess.Popen[str], str]]:
         for line in demo.stdout:
             if found := re.search(r"in (/\S+)$", line):
                 folder = found[1]
-            if "a hub are started" in line:
+            if "gw-3 are started" in line:
                 break
-        assert len(processes_of(folder)) >= 8  # servers, gateways, lines, hub, and the cleanup
+        assert len(processes_of(folder)) >= 8  # servers, gateways, lines, and the cleanup
         yield demo, folder
 
 
@@ -133,8 +119,7 @@ def test_the_demo_shows_a_takeover() -> None:
         "again",
     ):
         assert word in said
-    assert int(re.search(r"stored (\d+) samples of 24 drives", said)[1]) > 100  # type: ignore[index]
-    assert re.search(r"unpolled for at most [0-9.]+ s\n$", said)
+    assert re.search(r"the lines of the killed gateway had other masters after [0-9.]+ s\n$", said)
     await_nothing_left(folder)
 
 
