@@ -15,6 +15,7 @@ from tables import table
 from multidrop import Drive, load_family
 from multidrop.core import NumberFormat
 from multidrop.drive import Kept
+from multidrop.drive.parameters import parameters_of
 from multidrop.drive.register import HOLDING, INPUT, Register
 from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import SECTIONS
@@ -459,6 +460,45 @@ def test_texts(tmp_path: Path) -> None:
 def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
     assert any(told in mistake for mistake in found), found
+
+
+# ---- parameters ----
+
+RULE = """[setting]
+ramp = { at = "0001H", unit = "s", step = 0.1 }
+[parameters]
+groups = [{ code = "P00.", at = "0000H", count = 3 }, { code = "P", at = "1000H", count = 2, digits = 3 }]
+"""
+
+
+def test_rule_of_parameters(tmp_path: Path) -> None:
+    more = 'line = ["P00.00"]\npasswords = ["P001"]\nnever = { "P00.02" = "it starts a test" }\n'
+    found = parameters_of(family(tmp_path, HEAD + RULE + more))
+    assert {code: (one.name, one.address) for code, one in found.items()} == {
+        "P00.00": ("P00.00", 0),
+        "P00.01": ("ramp", 1),
+        "P00.02": ("P00.02", 2),
+        "P000": ("P000", 0x1000),
+        "P001": ("P001", 0x1001),
+    }
+    assert [code for code, one in found.items() if one.never] == ["P00.00", "P00.02", "P001"]
+    assert [code for code, one in found.items() if one.is_line] == ["P00.00"]
+
+
+@pytest.mark.parametrize(
+    ("rule", "told"),
+    [
+        ("line = []", "[parameters]: 'groups' is missing; add groups = "),
+        ("groups = [{ code = 1 }]", "[parameters], group number 1: code = 1 is not right; write code = "),
+        ('groups = [{ code = "P", at = 0, count = 70000 }]', "count = 70000 is not right"),
+        ('groups = [{ code = "P", at = 0, count = 20000 }]', "groups have more than 10000 codes"),
+        ('groups = [{ code = "P", at = 0, count = 2 }]\nline = [1]', "line = [1] is not right"),
+        ('groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"', "firmware = 'x' is not a register"),
+    ],
+)
+def test_mistakes_of_parameters(tmp_path: Path, rule: str, told: str) -> None:
+    text = f"{HEAD}[reading]\na = {{ at = 1 }}\n[parameters]\n{rule}\n"
+    assert any(told in mistake for mistake in mistakes(tmp_path, text))
 
 
 def test_details_of_a_number(tmp_path: Path) -> None:

@@ -28,12 +28,21 @@ from multidrop.families.files.sections import (
     facts_of,
     identify_by,
     options_of,
+    parameter_space_of,
     proofs_of,
     texts_of,
 )
 from multidrop.toml_check import TomlPlace, parse_document
 
-SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", "identify")
+SECTIONS = (
+    "family",
+    "default",
+    *(access.value for access in Access),
+    "text",
+    "option",
+    "parameters",
+    "identify",
+)
 MOST_MISTAKES = 200
 MOST_CSV_FILES = 20
 
@@ -147,6 +156,9 @@ def _family(
         **declared.registers,
         **texts,
     }
+    if "parameters" in document:
+        rule = parameter_space_of(document["parameters"], counting, declared.places, place)
+        namespace["parameter_space"] = rule
     if "identify" in document:
         proofs = proofs_of(document["identify"], declared.registers, place)
         namespace["identity_proofs"], namespace["identify"] = proofs, identify_by(proofs)

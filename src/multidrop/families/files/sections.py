@@ -1,4 +1,4 @@
-"""Sections of a family file besides its registers: [family], [option], [text] and [[identify]]."""
+"""Sections of a family file besides its registers: [family], [option], [text], [parameters], [[identify]]."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
 from multidrop.drive.options import Option
+from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.drive.script import Script, read
@@ -293,6 +294,65 @@ def _text(good: dict[str, Any], counting: Counting, place: TomlPlace) -> Text | 
     return place.attempt(make)
 
 
+MOST_PARAMETERS = 10_000
+PARAMETER_KEYS = {
+    "groups": Key(list, 'groups = [{ code = "P00.", at = "0000H", count = 30 }]', needed=True),
+    "monitors": Key(list, 'monitors = ["P17.*"], codes of values that the drive changes itself'),
+    "line": Key(list, 'line = ["P14.02", "P14.01", "P14.00"], in the order of writing'),
+    "passwords": Key(list, 'passwords = ["P07.00"]'),
+    "never": Key(dict, 'never = { "P00.18" = "it restores the factory values" }'),
+    "firmware": Key(str, 'firmware = "software_version", a register'),
+}
+GROUP_KEYS = {
+    "code": Key(str, 'code = "P00.", the part of a code before its last digits', needed=True),
+    "at": Key((int, str), 'at = "0000H", the address of the index 0', needed=True),
+    "count": Key(int, "count = 30, the last index plus 1", needed=True),
+    "digits": Key(int, "digits = 2, of the index"),
+}
+
+
+def parameter_space_of(
+    section: Any, counting: Counting, registers: Collection[str], place: TomlPlace
+) -> ParameterSpace | None:
+    """Return the rule for parameters' addresses that [parameters] declares; None if it has a mistake."""
+    at = place.within("[parameters]")
+    good = at.check(section, PARAMETER_KEYS)
+    groups = [_group(table, counting, within) for table, within in at.inside("group", good.get("groups", []))]
+    kept = [group for group in groups if group is not None]
+    if sum(len(group.indices) for group in kept) > MOST_PARAMETERS:
+        at.wrong(f"groups have more than {MOST_PARAMETERS} codes")
+        return None
+    lists = {name: tuple(good.get(name, ())) for name in ("monitors", "line", "passwords")}
+    never = good.get("never", {})
+    for name, values in {**lists, "never": (*never, *never.values())}.items():
+        if not all(isinstance(value, str) for value in values):
+            at.wrong(f"{name} = {shown([*values])} is not right; write {PARAMETER_KEYS[name].example}")
+            return None
+    firmware = good.get("firmware", "")
+    if firmware and firmware not in registers:
+        at.wrong(f"firmware = {firmware!r} is not a register of this file")
+    return ParameterSpace(
+        tuple(kept),
+        monitors=lists["monitors"],
+        line=lists["line"],
+        passwords=lists["passwords"],
+        never=never,
+        firmware=firmware,
+    )
+
+
+def _group(table: Any, counting: Counting, place: TomlPlace) -> ParameterGroup | None:
+    good = place.check(table, GROUP_KEYS)
+    address = place.attempt(counting.address, good["at"], None, "holding") if "at" in good else None
+    if address is None or not {"code", "count"} <= good.keys():
+        return None
+    if not 1 <= good["count"] <= _ADDRESSES - address[0]:
+        place.wrong(f"count = {good['count']} is not right; write {GROUP_KEYS['count'].example}")
+        return None
+    return ParameterGroup(good["code"], address[0], range(good["count"]), good.get("digits", 2))
+
+
+_ADDRESSES = 0x10000
 MOST_PROOFS = 20
 PROOF_KEYS = {
     "register": Key(str, 'register = "device"', needed=True),
