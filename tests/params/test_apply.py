@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import pytest
 from parameter_drives import factory_reset, raw_of, set_at_random, with_parameters, writable
 from simulated_bus import SimulatedBus
 
-from multidrop import YD1000, DelixiModbus, DelixiNative, Drive, ErmanERG220, params
+from multidrop import (
+    YD1000,
+    DelixiModbus,
+    DelixiNative,
+    Drive,
+    ErmanERG220,
+    Unconfirmed,
+    WriteForbidden,
+    params,
+)
+from multidrop.control import Ledger, read_audit
+from multidrop.families.yd1000 import COMMAND
 from multidrop.sim import MotorDrive
+from multidrop.sim.memory import MemoryCell
+from multidrop.sim.protocol import Reason, Refusal
 
 EXTRA = {
     YD1000: ["F170", "F240", "F241", "F305"],
@@ -60,3 +74,171 @@ def test_saved_parameters_are_restored_after_a_factory_reset(
 
 def is_stop(drive: Drive, frame: str) -> bool:
     return isinstance(drive, DelixiModbus) and frame == "01 06 20 00 00 01 43 CA"
+
+
+# ---- what refuses all ----
+
+
+@pytest.mark.parametrize("family", EXTRA)
+def test_running_motor_refuses_all(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
+    line, drive, sim = attached(monkeypatch, family(1), EXTRA[family])
+    first = writable(drive, EXTRA[family])[0]
+    sim.motor.target = 50.0
+    sim.motor.run()
+    line.sleep(20)
+    with pytest.raises(WriteForbidden, match="only written while its motor stands"):
+        params.apply(drive, {first.code: raw_of(sim, first) + 1})
+    assert line.written == []
+
+
+def test_run_command_at_zero_speed_refuses_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, sim = attached(monkeypatch, YD1000(1), [])
+    sim.motor.target = 0.0
+    sim.motor.run()
+    with pytest.raises(WriteForbidden, match="run command"):
+        params.apply(drive, {"0009": 200})
+    assert line.written == []
+
+
+def test_drive_of_unknown_state_gets_a_stop_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = attached(monkeypatch, DelixiModbus(1), ["P01.00"])
+    assert params.apply(drive, {"P01.00": 5}).ok
+    assert line.written == ["01 06 20 00 00 01 43 CA", "01 06 00 64 00 05 08 16"]
+
+
+@pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
+def test_drive_that_obeys_its_panel_is_not_written(
+    monkeypatch: pytest.MonkeyPatch, family: type[Drive]
+) -> None:
+    line, drive, sim = attached(monkeypatch, family(1), ["P01.00"])
+    sim["run_source"] = 0
+    with pytest.raises(WriteForbidden, match=r"P00\.00 is KEYPAD"):
+        params.plan(drive, {"P01.00": 5})
+    assert all(is_stop(drive, frame) for frame in line.written)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"9999": 1}, "YD1000 has no parameter 9999"),
+        ({"0009": 65000}, r"0009: acceleration_time = 6500 is outside 0\.1 to 3600 s"),
+        ({"0009": 0, "0010": 1}, "values that are not written, and nothing was"),
+    ],
+)
+def test_one_mistake_refuses_the_whole_set(
+    monkeypatch: pytest.MonkeyPatch, values: dict[str, int], sentence: str
+) -> None:
+    line, drive, _ = attached(monkeypatch, YD1000(1), [])
+    with pytest.raises(ValueError, match=sentence):
+        params.apply(drive, values)
+    assert line.written == []
+
+
+def test_another_models_parameters_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+    other = params.ParameterSet("delixi-modbus", {"P01.00": 1}, source="other.toml")
+    with pytest.raises(ValueError, match=r"parameters of yd1000, and other\.toml of delixi-modbus"):
+        params.apply(drive, other)
+
+
+# ---- what is left out ----
+
+
+def test_parameters_of_the_line_are_written_only_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = attached(monkeypatch, YD1000(1), [])
+    left = params.apply(drive, {"F803": 30, "F801": 0, "F111": 3}, also=["F801"])
+    assert left.plan.left == {"F111": f"{COMMAND} (2 -> 3)"}
+    assert [change.parameter.code for change in left.plan.writes] == ["F803", "F801"]  # the line's last
+    with pytest.raises(ValueError, match="--also F803: it is not the drive's address"):
+        params.plan(drive, {"F803": 20}, also=["F803"])
+    assert list(params.plan(drive, {"F802": 5}).left) == ["F802"]
+    assert sim["communication_timeout"] == 30
+
+
+def test_missing_parameter_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+    assert params.plan(drive, {"F240": 5}).left == {"F240": "the drive does not have it"}
+
+
+@pytest.mark.parametrize(
+    ("values", "order"),
+    [
+        ({"0011": 6000, "0012": 5000, "0013": 1000}, ["0012", "0011", "0013"]),
+        ({"0011": 12000, "0012": 10000, "0013": 9000}, ["0011", "0012", "0013"]),
+    ],
+)
+def test_parameters_are_written_within_their_limits(
+    monkeypatch: pytest.MonkeyPatch, values: dict[str, int], order: list[str]
+) -> None:
+    _, drive, sim = attached(monkeypatch, YD1000(1), [])
+    done = params.apply(drive, values)
+    assert done.ok
+    assert [change.parameter.code for change in done.written] == order
+    assert sim["maximum_frequency"] == values["0011"] / 100
+
+
+def test_value_outside_all_limits_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+    left = params.plan(drive, {"0013": 9000}).left
+    assert left == {"0013": "90.00 Hz is outside its limits, which are upper_limit_frequency of yd1000@1"}
+
+
+# ---- the ledger and the journal ----
+
+
+def test_second_write_within_a_minute_needs_commissioning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    sim = with_parameters(YD1000(1))
+    line = SimulatedBus(monkeypatch, sim, audit=tmp_path / "audit.jsonl")
+    drive = line.attach(sim.drive)
+    assert params.apply(drive, {"0009": 200}).ok
+    again = params.apply(drive, {"0009": 300, "0010": 300})
+    assert [change.parameter.code for change in again.written] == ["0010"]
+    assert "params.apply(..., commissioning=True)" in again.refused["0009"]
+    assert params.apply(drive, {"0009": 300}, commissioning=True).ok
+    line.bus.close()
+    records = [*read_audit(tmp_path / "audit.jsonl")]
+    assert [record.get("commissioning") for record in records] == [None, None, True]
+    wear = Ledger(tmp_path / "multidrop" / "wear.sqlite").wear(1.7e9)
+    assert {one.cell.register: one.writes for one in wear} == {"acceleration_time": 2, "deceleration_time": 1}
+
+
+def test_refused_write_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = attached(monkeypatch, DelixiNative(1), ["P01.00", "P01.01"])
+    accept = type(sim).accept
+
+    def picky(self: Any, cell: MemoryCell, raw: int) -> int:
+        if cell.name == "P01.00":
+            raise Refusal(Reason.VALUE)
+        return accept(self, cell, raw)
+
+    monkeypatch.setattr(type(sim), "accept", picky)
+    done = params.apply(drive, {"P01.00": 5, "P01.01": 6})
+    assert [change.parameter.code for change in done.written] == ["P01.01"]
+    assert "value out of limits" in done.refused["P01.00"]
+
+
+def test_interrupted_application_is_reported_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = attached(monkeypatch, YD1000(1), [])
+    line.deafens = lambda request: request.function == 6 and request.start == 0x0010
+    first = params.apply(drive, {"0009": 200, "0010": 200, "0018": 100})
+    assert isinstance(first.failure, Unconfirmed)
+    line.deafens = lambda request: False
+    second = params.apply(drive, {"0009": 200, "0010": 200, "0018": 100}, commissioning=True)
+    assert second.ok
+    assert [change.parameter.code for change in second.written] == ["0010", "0018"]
+    assert second.earlier[1:] == ["0009: 100 -> 200: written", "0010: 100 -> 200: may have been sent"]
+    assert params.apply(drive, {"0009": 200}).earlier == []
+
+
+def test_motor_that_starts_ends_the_application(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = attached(monkeypatch, YD1000(1), [])
+
+    def start(number: int, total: int, change: params.ParameterChange, said: str) -> None:
+        sim.motor.target = 50.0
+        sim.motor.run()
+
+    done = params.apply(drive, {"0009": 200, "0010": 200}, report=start)
+    assert [change.parameter.code for change in done.written] == ["0009"]
+    assert isinstance(done.failure, WriteForbidden)

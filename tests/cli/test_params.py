@@ -1,0 +1,149 @@
+"""The command params, against a simulated drive."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from commands import MULTIDROP, Run
+from parameter_drives import with_parameters
+
+from multidrop import ErmanERG220
+from multidrop.sim import MotorDrive, Simulator, Wire
+
+
+@pytest.fixture
+def sim() -> MotorDrive:
+    return with_parameters(ErmanERG220(1))
+
+
+@pytest.fixture
+def drive(sim: MotorDrive, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[object, ...]]:
+    """The words that name the drive; the working directory is empty."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        yield simulator.wires[0].path, "erman-er-g-220", 1
+
+
+def edited(path: str, before: str, after: str) -> None:
+    text = Path(path).read_text()
+    assert before in text
+    Path(path).write_text(text.replace(before, after))
+
+
+def test_save_diff_and_apply(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+    assert run("params", "save", *drive, "pump.toml")[0] == 0
+    assert run("params", "diff", "pump.toml", *drive)[0] == 0
+    sim["acceleration_time"] = 25.0
+    status, out, _ = run("params", "diff", "pump.toml", *drive)
+    assert status == 1
+    assert out.splitlines()[1].split() == ["b.003", "acceleration_time", "10.0", "s", "25.0", "s"]
+    status, out, _ = run("params", "apply", "pump.toml", *drive, "--dry-run")
+    assert (status, sim["acceleration_time"]) == (0, 25.0)
+    assert "b.003 acceleration_time: 25.0 s -> 10.0 s" in out
+    status, out, _ = run("params", "apply", "pump.toml", *drive, "--yes")
+    assert (status, sim["acceleration_time"]) == (0, 10.0)
+    assert out.endswith("1 parameter written, 0 not\n")
+    assert "has these parameters already" in run("params", "apply", "pump.toml", *drive, "--yes")[1]
+
+
+def test_apply_asks_first(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+    run("params", "save", *drive, "pump.toml")
+    sim["acceleration_time"] = 25.0
+    status, _, err = run("params", "apply", "pump.toml", *drive)
+    assert (status, sim["acceleration_time"]) == (1, 25.0)
+    assert "Write 1 parameter to" in err
+
+
+def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+    run("params", "save", *drive, "pump.toml")
+    sim["acceleration_time"] = 25.0
+    words = ("params", "apply", "pump.toml", *drive, "--yes", "--commissioning", "--audit", "audit.jsonl")
+    status, _, err = run(*words)
+    assert status == 1
+    assert "--commissioning is for a person at a terminal" in err
+    ours, theirs = pty.openpty()
+    try:
+        done = subprocess.run([*MULTIDROP, *map(str, words)], stdin=theirs, capture_output=True, timeout=60)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    assert (done.returncode, sim["acceleration_time"]) == (0, 10.0)
+    assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
+
+
+def test_running_motor_refuses(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+    run("params", "save", *drive, "pump.toml")
+    sim["acceleration_time"] = 25.0
+    sim.motor.target = 40.0
+    sim.motor.run()
+    status, _, err = run("params", "apply", "pump.toml", *drive, "--yes")
+    assert status == 1
+    assert "run `multidrop stop` first" in err
+    assert sim["acceleration_time"] == 25.0
+
+
+def test_json(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+    saved = json.loads(run("params", "save", *drive, "pump.csv", "--json")[1])
+    assert saved["parameters"]["b.003"] == 100
+    sim["acceleration_time"] = 25.0
+    found = json.loads(run("params", "diff", "pump.csv", *drive, "--json")[1])["differences"]
+    assert [(each["code"], each["first"], each["second"]) for each in found] == [("b.003", 100, 250)]
+    planned = json.loads(run("params", "apply", "pump.csv", *drive, "--dry-run", "--json")[1])
+    assert planned["writes"] == [{"code": "b.003", "before": 250, "after": 100}]
+    done = json.loads(run("params", "apply", "pump.csv", *drive, "--yes", "--json")[1])
+    assert done["written"] == planned["writes"]
+    listed = json.loads(run("params", "list", *drive, "--json")[1])["parameters"]
+    assert {row["code"]: row["raw"] for row in listed}["b.003"] == 100
+
+
+def test_two_files_and_two_drives_are_compared(run: Run, drive: tuple[object, ...]) -> None:
+    run("params", "save", *drive, "a.toml")
+    run("params", "save", *drive, "b.csv")
+    assert run("params", "diff", "a.toml", "b.csv")[0] == 0
+    edited("a.toml", '"b.003" = 100', '"b.003" = 60')
+    assert run("params", "diff", "a.toml", "b.csv")[0] == 1
+    plant = (
+        "[[line]]\nname = 'hall'\nport = '{}'\n[[line.drive]]\nname = 'pump-1'\nmodel = '{}'\naddress = {}\n"
+    )
+    Path("plant.toml").write_text(plant.format(*drive))
+    assert run("params", "diff", "plant.toml", "pump-1", "plant.toml", "pump-1")[0] == 0
+    assert run("params", "diff", "plant.toml", "pump-1", "pump-1")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("apply", "gone.toml", "DRIVE"), "gone.toml: the parameter file cannot be read"),
+        (("apply", "plant.toml", "DRIVE"), "give a parameter file, and then the drive"),
+        (("apply", "other.toml", "DRIVE"), "of yd1000"),
+        (("apply", "newer.toml", "DRIVE"), "has format 9, and this version of multidrop reads format 1"),
+        (("apply", "unknown.toml", "DRIVE"), "has no parameter b.999"),
+        (("apply", "wide.toml", "DRIVE"), "does not fit"),
+        (("diff", "other.toml", "newest.toml"), "other.toml has parameters of yd1000, and newest.toml of"),
+        (("diff", "--defaults", "DRIVE"), "prints no factory values"),
+        (("save", "DRIVE", "other.toml"), "other.toml exists already, and is not replaced"),
+        (("save", "DRIVE"), "give the drive, and one file to write"),
+        (("list", "invt-che"), "follow no known rule"),
+    ],
+)
+def test_bad_input_gets_one_sentence(
+    run: Run, drive: tuple[object, ...], words: tuple[str, ...], sentence: str
+) -> None:
+    Path("plant.toml").write_text("[[line]]\nname = 'hall'\n")
+    Path("other.toml").write_text('model = "yd1000"\n[parameters]\n"0009" = 100\n')
+    Path("newer.toml").write_text("format = 9\n[parameters]\n'b.003' = 1\n")
+    Path("newest.toml").write_text('model = "erman-er-g-220"\n[parameters]\n"b.003" = 100\n')
+    Path("unknown.toml").write_text("[parameters]\n'b.999' = 1\n")
+    Path("wide.toml").write_text("[parameters]\n'b.003' = 99999\n")
+    given = [one for word in words for one in (drive if word == "DRIVE" else (word,))]
+    status, out, err = run("params", *given)
+    assert status in (1, 2)
+    assert sentence in err
+    assert (out, err.count("\n")) == ("", 1)

@@ -1,0 +1,76 @@
+"""Parameter files: what is written is read again, and a wrong file gets one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from multidrop import YD1000, params
+
+FOUND = params.ParameterSet(
+    "yd1000", {"0009": 100, "F240": 7}, source="pump-1", title="YD1000", firmware="104", saved="2026-11-29"
+)
+
+
+@pytest.mark.parametrize("name", ["pump.toml", "pump.csv"])
+def test_written_files_are_read_again(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    params.save(FOUND, path, YD1000)
+    found = params.load(path)
+    assert found.values == FOUND.values
+    assert (found.model, found.firmware, found.saved) == ("yd1000", "104", "2026-11-29")
+    assert found.source == str(path)
+    assert "acceleration_time" in path.read_text()
+    assert "10.0 s" in path.read_text()
+    assert params.is_parameter_file(path)
+
+
+def test_files_are_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "pump.toml").write_text("")
+    with pytest.raises(ValueError, match="exists already, and is not replaced"):
+        params.save(FOUND, tmp_path / "pump.toml")
+    with pytest.raises(ValueError, match=r"name ends in \.toml or \.csv"):
+        params.save(FOUND, tmp_path / "pump.txt")
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_backups_of_the_gd20_tool_are_read(tmp_path: Path, quote: str) -> None:
+    rows = [("CODIGO_FUNCAO", "GRUPO_PARAMETRO", "VALOR_PARAMETRO"), (3, 0, 5000), (12, 14, 3)]
+    text = "\r\n".join(";".join(f"{quote}{cell}{quote}" for cell in row) for row in rows)
+    (tmp_path / "bkp_result.csv").write_text(text)
+    found = params.load(tmp_path / "bkp_result.csv")
+    assert found.values == {"P00.03": 5000, "P14.12": 3}
+    assert found.model == "invt-goodrive"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("a.toml", "", r"is not a parameter file: it has no \[parameters\]"),
+        ("a.toml", '[[line]]\nname = "a"', "is a plant file, not a parameter file"),
+        ("a.toml", "format = 2\n[parameters]\nA = 1", "has format 2, and this version of multidrop reads"),
+        ("a.toml", 'format = "x"\n[parameters]\nA = 1', "format = 'x' is not 1"),
+        ("a.toml", "[parameters]\nA = 1.5", "A = 1.5 is not a raw count"),
+        ("a.toml", "[parameters]", "has no parameters"),
+        ("a.toml", "[parameters", "is not TOML"),
+        ("a.csv", "x;y\n1;2", "its first row has no code and raw"),
+        ("a.csv", "code;raw\nA;1\nA;2", "A is there twice"),
+        ("a.csv", "code;raw\nA;one", "'one' is no whole number"),
+        ("a.csv", "# format: 7\ncode;raw\nA;1", "has format 7"),
+        ("a.csv", "GRUPO_PARAMETRO;CODIGO_FUNCAO\n0;1", "lists parameters without values"),
+        ("a.csv", "", "is not a parameter file"),
+    ],
+)
+def test_wrong_files_get_one_sentence(tmp_path: Path, name: str, text: str, sentence: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=sentence) as raised:
+        params.load(tmp_path / name)
+    assert str(raised.value).startswith(str(tmp_path / name))
+    assert "\n" not in str(raised.value)
+
+
+def test_missing_file_gets_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        params.load(tmp_path / "a.toml")
+    assert not params.is_parameter_file(tmp_path / "a.toml")

@@ -1,0 +1,46 @@
+"""Apply a parameter file in a forked process that may be killed.
+
+Each line of standard input starts one: PORT FILE REPORT. It is forked from this process, which has imported
+everything; its id is printed, and at its end its exit status. An application that ends writes its own and
+earlier writes to REPORT.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from pathlib import Path
+
+from multidrop import Bus, DelixiNative, params
+
+DRIVE = {"address": 1, "baudrate": 38400}
+
+
+def apply(port: str, file: str, report: str) -> None:
+    with Bus(port) as bus:
+        drive = bus.attach(DelixiNative, **DRIVE)
+        result = params.apply(drive, params.load(file), commissioning=True)
+    if not result.ok:
+        raise SystemExit(f"{result.failure} {result.refused}")
+    own = [change.parameter.code for change in result.written]
+    Path(report).write_text("\n".join([*own, *result.earlier]))
+
+
+def main() -> None:
+    for line in sys.stdin:
+        process = os.fork()
+        if process == 0:
+            status = 1
+            try:
+                apply(*line.split())
+                status = 0
+            except BaseException:
+                traceback.print_exc()
+            os._exit(status)
+        print(process, flush=True)
+        print(os.waitpid(process, 0)[1], flush=True)
+
+
+if __name__ == "__main__":
+    main()
