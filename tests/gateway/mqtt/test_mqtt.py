@@ -6,7 +6,7 @@ import asyncio
 import json
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from enum import IntEnum
@@ -22,8 +22,8 @@ from brokers import (
     Published,
     Running,
     free_port,
+    has,
     inside,
-    mosquitto,
     publish,
     without_fan,
 )
@@ -47,39 +47,6 @@ from multidrop.plant import RESERVED_NAMES
 Start = Callable[..., tuple[Any, Running]]
 
 STOPS = ["coast", "emergency_stop", "stop"]
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with mosquitto(tmp_path) as broker:
-        yield broker
-
-
-@pytest.fixture
-def listener(broker: Broker) -> Iterator[Listener]:
-    listener = Listener(broker)
-    yield listener
-    listener.close()
-
-
-@pytest.fixture
-def start(broker: Broker, tmp_path: Path) -> Iterator[Start]:
-    require_module("paho.mqtt.client")
-    running: list[Running] = []
-
-    def start(**settings: Any) -> tuple[Any, Running]:
-        known = inside(tmp_path)
-        part = build(MqttSettings(broker.address, **settings), known)
-        running.append(Running(part))
-        return known, running[-1]
-
-    yield start
-    for one in running:
-        one.close()
-
-
-def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
-    return lambda received: received.topic == topic and payload in (None, received.payload)
 
 
 def json_of(received: Published) -> Any:

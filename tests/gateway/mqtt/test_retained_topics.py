@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -111,13 +110,6 @@ def test_a_broker_without_end_is_heard_for_a_while() -> None:
 
 
 # ---- through a broker ----
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    require_module("paho.mqtt.client")
-    with mosquitto(tmp_path) as broker:
-        yield broker
 
 
 def kept_at(broker: Broker) -> set[str]:

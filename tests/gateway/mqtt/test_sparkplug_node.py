@@ -17,7 +17,6 @@ from brokers import (
     Running,
     command,
     inside,
-    mosquitto,
     sparkplug_messages,
     without_fan,
 )
@@ -30,19 +29,6 @@ from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.mqtt.sparkplug import DataType, Metric, payload, read_command
 from multidrop.gateway.mqtt.sparkplug_node import STOP, SparkplugNode
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with mosquitto(tmp_path) as broker:
-        yield broker
-
-
-@pytest.fixture
-def host(broker: Broker) -> Iterator[Host]:
-    host = Host(broker)
-    yield host
-    host.close()
 
 
 @pytest.fixture

@@ -116,6 +116,11 @@ class Published(NamedTuple):
     payload: bytes
 
 
+def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
+    """Return a function that finds a message on this topic, with this payload unless that is None."""
+    return lambda received: received.topic == topic and payload in (None, received.payload)
+
+
 class Listener:
     """A mosquitto_sub process that records retained and new messages."""
 

@@ -1,0 +1,55 @@
+"""Fixtures: a broker, who listens to it, and parts of a gateway that are connected to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from brokers import FAN, PLAIN_FAN, Broker, Host, Listener, Running, inside, mosquitto
+from peers import require_module
+
+from multidrop.gateway.mqtt.part import build
+from multidrop.gateway.mqtt.settings import MqttSettings
+
+
+@pytest.fixture
+def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Broker]:
+    """A broker: mosquitto, or as the test's parameter makes it."""
+    require_module("paho.mqtt.client")
+    with getattr(request, "param", mosquitto)(tmp_path) as broker:
+        yield broker
+
+
+@pytest.fixture
+def listener(broker: Broker) -> Iterator[Listener]:
+    listener = Listener(broker)
+    yield listener
+    listener.close()
+
+
+@pytest.fixture
+def host(broker: Broker) -> Iterator[Host]:
+    """A host of Sparkplug."""
+    host = Host(broker)
+    yield host
+    host.close()
+
+
+@pytest.fixture
+def start(
+    request: pytest.FixtureRequest, broker: Broker, tmp_path: Path
+) -> Iterator[Callable[..., tuple[Any, Running]]]:
+    """Start a part with these settings; return what it knows of its gateway, and the part."""
+    running: list[Running] = []
+    fan = FAN if request.node.path.stem == "test_mqtt" else PLAIN_FAN
+
+    def start(**settings: Any) -> tuple[Any, Running]:
+        known = inside(tmp_path, fan)
+        running.append(Running(build(MqttSettings(broker.address, **settings), known)))
+        return known, running[-1]
+
+    yield start
+    for one in running:
+        one.close()
