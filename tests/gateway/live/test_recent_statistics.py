@@ -75,7 +75,15 @@ def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_a_reopened_line_counts_from_zero(recent: RecentStatistics) -> None:
+def test_a_reopened_line_has_figures_from_its_second_reading(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
-    recent.tick(101.0, 101_000, {"hall": replace(reading(1, per_s=20), epoch=2)})
-    assert recent.line("hall")["rate"] == 20.0
+    recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
+    assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
+    recent.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
+    assert recent.line("hall")["rate"] == 10.0
+
+
+def test_a_removed_drive_never_makes_a_rate_negative(recent: RecentStatistics) -> None:
+    recent.tick(100.0, 100_000, {"hall": reading(100)})
+    recent.tick(101.0, 101_000, {"hall": replace(reading(1), seconds=101.0)})
+    assert recent.line("hall")["rate"] == 0.0

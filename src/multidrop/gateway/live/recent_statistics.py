@@ -79,11 +79,14 @@ class RecentStatistics:
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
         """Return the used share of a line's time and its exchanges per second, over SECONDS."""
-        recent = self._since(self._recent[0][1], name) if self._recent else None
-        if recent is None:
+        before = self._recent[0][1].get(name) if self._recent else None
+        now = self.newest.get(name)
+        if before is None or now is None or before is now or before.epoch != now.epoch:
             return None, None
-        seconds = max(recent.seconds, 1e-9)
-        return round(recent.used_s / seconds, 4), round(recent.exchanges / seconds, 1)
+        seconds = max(now.seconds - before.seconds, 1e-9)
+        used_s = (now.counters.ideal_ns - before.counters.ideal_ns) / 1e9
+        exchanges = now.exchanges - before.exchanges  # less than 0 after a reload that removed a drive
+        return round(max(0.0, used_s / seconds), 4), round(max(0.0, exchanges / seconds), 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
         """Return a drive's share of misses in the last minute, and its response delay."""
