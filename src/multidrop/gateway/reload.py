@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Batch, Plant, PlantError, Poller
 from multidrop.gateway.clock import utc_ms
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.parts import PARTS
 from multidrop.gateway.settings import AUDIT_S, check_writable
 from multidrop.supervisor import Hung, supervisor
@@ -150,9 +151,8 @@ class Reload:
         """Use the plant that is polled now, and its settings that need no restart."""
         gateway, plant = self._gateway, poller.plant
         gateway.hand_out(poller)  # remaining rows of the previous plant
-        there = {polled.drive.name for line in plant.lines for polled in line.drives}
         lines = {line.name for line in gateway.plant.lines} - {line.name for line in plant.lines}
-        for name in {*gateway.hub.drives} - there | lines:
+        for name in {*gateway.hub.drives} - drives_of(plant).keys() | lines:
             gateway.alarms.forget(name, utc_ms())
         gateway.plant = plant
         gateway.revision += 1

@@ -15,7 +15,6 @@ from multidrop.gateway.mqtt.sparkplug import DataType, Given, Metric, payload, r
 
 SPANS: dict[DataType, st.SearchStrategy[Any]] = {
     DataType.INT64: st.integers(-(2**63), 2**63 - 1),
-    DataType.UINT64: st.integers(0, 2**64 - 1),
     DataType.DOUBLE: st.floats(),
     DataType.BOOLEAN: st.booleans(),
     DataType.STRING: st.text(),

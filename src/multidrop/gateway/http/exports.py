@@ -10,7 +10,7 @@ import re
 from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
 from starlette.responses import Response, StreamingResponse
@@ -18,6 +18,9 @@ from starlette.types import Receive, Scope, Send
 
 from multidrop.gateway.http.messages import Denied
 from multidrop.supervisor import supervisor
+
+if TYPE_CHECKING:
+    from multidrop.gateway.historian import Historian
 
 MOST_EXPORTS = 8  # concurrent exports
 PIECE_S = 600.0  # time limit of a piece; before the first piece of Parquet the whole file is made
@@ -27,13 +30,6 @@ FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # signs that some systems 
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 
 
-class ExportingPart(Protocol):
-    """The method of the historian that exports use."""
-
-    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return a file in pieces; called and iterated in threads."""
-
-
 class Exports:
     """The exports in progress."""
 
@@ -41,7 +37,7 @@ class Exports:
         self.under_way = 0
 
     async def respond(
-        self, part: ExportingPart, names: Sequence[str], begin: int, end: int, kind: str
+        self, part: Historian, names: Sequence[str], begin: int, end: int, kind: str
     ) -> Response:
         """Return a file of these series. Raises Denied for wrong arguments or too many exports, and Hung."""
         if kind not in KINDS:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import parse_qs
 
@@ -17,9 +20,8 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import WriteForbidden
-from multidrop.control import CommandResult
+from multidrop.control import CommandResult, read_audit
 from multidrop.exposition import expose_metrics
-from multidrop.gateway.audit import MOST_RECORDS, newest_records, time_asked
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import STOPPING, Admit
 from multidrop.gateway.http.exports import Exports
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 MOST_QUERIES = 2  # concurrent queries of the audit log
 AUDIT_S = 20.0  # time limit of one such query
 COOKIE_S = 30 * 24 * 3600
+MOST_RECORDS = 200  # entries of the audit log in one answer
 MOST_NOTE = 500  # characters of an acknowledgement's note
 HEAD_S = 0.5  # the head of a stop's answer is sent after this time; it confirms that the stop was accepted
 UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head immediately
@@ -71,6 +74,7 @@ NEEDED: Mapping[str, Needed] = {
     "/api/forget": Needed("POST", None),
 }
 
+_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # or a prefix, as of a day
 R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 _PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
@@ -155,6 +159,27 @@ def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
     return JsonResponse({name: {"done": done, "text": text} for name, (done, text) in results.items()})
 
 
+def _time_asked(query: Mapping[str, str]) -> str:
+    """Return the `before` of a query, "" without one. Raises Denied if it is not a UTC time."""
+    if "before" in query and not _UTC.fullmatch(query["before"]):
+        wrong = query["before"][:40]
+        raise Denied(400, f"before = {wrong!r} is not a time in UTC, such as 2026-11-22 or 2026-11-22T09:30")
+    return query.get("before", "")
+
+
+def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
+    """Return `count` entries before this time (ISO 8601, UTC; "" for all), the newest first.
+
+    `more` is True if there are older entries. Raises OSError.
+    """
+    count = max(1, min(count, MOST_RECORDS))
+    found: deque[dict[str, Any]] = deque(maxlen=count + 1)
+    if path is not None and path.exists():
+        found += (record for record in read_audit(path) if not before or str(record.get("time", "")) < before)
+    newest = list(reversed(found))
+    return {"entries": newest[:count], "more": len(newest) > count}
+
+
 async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Response]) -> Response:
     """Return the answer to a stop, which continues even if its client disconnects.
 
@@ -212,7 +237,7 @@ class _Pages:
 
     async def audit(self, request: Request) -> Response:
         query = request.query_params
-        before, count = time_asked(query), number_in(query.get("count", str(MOST_RECORDS)), "count")
+        before, count = _time_asked(query), number_in(query.get("count", str(MOST_RECORDS)), "count")
         work = partial(newest_records, self._gateway.settings.audit, before, count)
         return JsonResponse(await supervisor().within("audit queries", AUDIT_S, work, most=MOST_QUERIES))
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 from multidrop import Plant, PolledDrive, Register
 from multidrop.drive import Carrier
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.modbus_server.common_block import CommonBlock
 from multidrop.gateway.modbus_server.protocol import WriteRequest
 from multidrop.gateway.modbus_server.words import DriveWords, reading_function
@@ -202,7 +203,7 @@ def _overlap(unit: Unit, settings: UnitSettings) -> Iterator[str]:
 
 
 def _unknown_names(plant: Plant, settings: UnitSettings) -> Iterator[str]:
-    drives = [polled.drive.name for line in plant.lines for polled in line.drives]
+    drives = drives_of(plant)
     lines = [line.name for line in plant.lines]
     for key, kind, given, known in (
         ("units", "drive", settings.units, drives),

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from multidrop import Plant
 from multidrop.control import CommandResult
-from multidrop.gateway.commands import STOPPING
+from multidrop.gateway.commands import STOPPING, drives_of
 from multidrop.gateway.live.hub import SILENT
 from multidrop.gateway.mqtt.broker import Publication
 from multidrop.gateway.mqtt.broker_commands import BrokerCommands
@@ -123,7 +123,7 @@ class JsonTopics:
         self._context = context
         self._hub = context.hub
         self._plant = context.plant
-        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
+        self._commands = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._available: dict[str, bytes] = {}
         self._left: set[str] = set()  # removed drives whose retained messages must be deleted
         self._retained_topics = RetainedTopics(settings.prefix, home_assistant=settings.home_assistant)
@@ -167,54 +167,54 @@ class JsonTopics:
         elif not self._settings.commands:
             _log.warning("the broker sent a command, but commands are off: %.100r", topic)
         elif is_stop:
-            self._orders.stop(None if levels == ["stop"] else [levels[0]])
+            self._commands.stop(None if levels == ["stop"] else [levels[0]])
         else:
-            self._order(levels, payload, is_retained=is_retained)
+            self._command(levels, payload, is_retained=is_retained)
 
     def _look_back(self, topic: str, payload: bytes) -> None:
         """Delete retained messages of removed drives."""
-        for left in self._retained_topics.hear(topic, payload, _drives(self._plant)):
+        for left in self._retained_topics.hear(topic, payload, drives_of(self._plant)):
             self.outbox.put(self._kept(left, NOTHING))
 
-    def _order(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
+    def _command(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
         drive, *what = levels
         try:
             given = _read(payload)
         except ValueError as mistake:
             if what[0] == "act" and any(f'"{verb}"'.encode() in payload for verb in STOPPING):
-                self._orders.stop([drive])  # an invalid message must not prevent a stop
+                self._commands.stop([drive])  # an invalid message must not prevent a stop
             else:
                 self._refuse(drive, what, mistake)
             return
         try:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
-                    self._orders.stop_by(one, given["verb"], {})  # wrong options must not prevent a stop
+                    self._commands.stop_by(one, given["verb"], {})  # wrong options must not prevent a stop
             elif is_retained:  # it would be carried out again on every connection
                 kept = "it was retained; publish it without retain"
-                self._orders.refuse(drive, "/".join(what), kept)
+                self._commands.refuse(drive, "/".join(what), kept)
             elif what[0] == "set":
-                self._orders.write(drive, what[1], *_read_write(given))
+                self._commands.write(drive, what[1], *_read_write(given))
             else:
-                self._orders.act(drive, *_read_act(drive, given))
+                self._commands.act(drive, *_read_act(drive, given))
         except ValueError as mistake:
             self._refuse(drive, what, mistake)
 
     def _refuse(self, drive: str, what: list[str], mistake: ValueError) -> None:
-        self._orders.refuse(drive, "/".join(what), f"it is not {EXAMPLES[what[0]]}: {mistake}")
+        self._commands.refuse(drive, "/".join(what), f"it is not {EXAMPLES[what[0]]}: {mistake}")
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
         """Return the topic's drive, and the drive named in the stop if it is another one.
 
         Stopping too many drives is harmless, stopping none is not.
         """
-        named, there = given.get("drive"), _drives(self._plant)
+        named, there = given.get("drive"), drives_of(self._plant).keys()
         other = drive_meant(named, there) if isinstance(named, str) else drive
         return [drive, other] if other in there - {drive_meant(drive, there)} else [drive]
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant, and delete the retained messages of removed drives."""
-        self._left = (self._left | _drives(self._plant)) - _drives(plant)
+        self._left = (self._left | drives_of(self._plant).keys()) - drives_of(plant).keys()
         self._plant = plant
         self._take_back()
 
@@ -286,10 +286,6 @@ class JsonTopics:
             page=self._context.page,
         )
         self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
-
-
-def _drives(plant: Plant) -> set[str]:
-    return {polled.drive.name for line in plant.lines for polled in line.drives}
 
 
 def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:

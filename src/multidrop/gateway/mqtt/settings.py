@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, Register
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.mqtt.broker import Login, parse_broker
@@ -74,7 +75,7 @@ class MqttSettings:
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each missing file, and each drive name that cannot be a topic."""
-        names = [polled.drive.name for line in plant.lines for polled in line.drives]
+        names = [*drives_of(plant)]
         files = (("password", self.password), ("authorities", self.authorities))
         return (
             [

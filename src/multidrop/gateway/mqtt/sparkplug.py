@@ -34,7 +34,6 @@ class DataType(IntEnum):
     """Sparkplug's numbers of the data types used here (section 6.4.16)."""
 
     INT64 = 4
-    UINT64 = 8
     DOUBLE = 10
     BOOLEAN = 11
     STRING = 12

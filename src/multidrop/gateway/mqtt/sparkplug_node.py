@@ -8,6 +8,7 @@ from typing import Any
 
 from multidrop import Plant, Register
 from multidrop.control import CommandResult
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.live.hub import SILENT
 from multidrop.gateway.mqtt.broker import Publication
 from multidrop.gateway.mqtt.broker_commands import BrokerCommands
@@ -45,7 +46,7 @@ class SparkplugNode:
         self._plant = context.plant
         self._utc_ms = utc_ms
         self._node = settings.node or context.plant.path.stem
-        self._orders = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
+        self._commands = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._birth = -1  # bdSeq
         self._seq = 0
         self._said: dict[str, dict[str, Value]] = {}  # last values of drives whose birth was sent
@@ -81,20 +82,19 @@ class SparkplugNode:
         except ValueError as mistake:
             _log.warning("a command on %s is not a Sparkplug payload: %s", topic, mistake)
             if levels[2] == "DCMD" and STOP.encode() in payload:  # an invalid message must not prevent a stop
-                self._orders.stop([levels[-1]])
+                self._commands.stop([levels[-1]])
             return
         if levels[2] == "NCMD":
             if any(given.name == REBIRTH and given.value for given in metrics):
                 self.connected()
             return
         for given in metrics:
-            self._order(levels[-1], given, sent_ms, is_retained=is_retained)
+            self._command(levels[-1], given, sent_ms, is_retained=is_retained)
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant, and send deaths of removed devices."""
         self._plant = plant
-        there = {polled.drive.name for line in plant.lines for polled in line.drives}
-        for drive in [drive for drive in self._said if drive not in there]:
+        for drive in self._said.keys() - drives_of(plant).keys():
             del self._said[drive]
             self._replace_pending(drive, "DDEATH", self._device_death)
 
@@ -151,13 +151,12 @@ class SparkplugNode:
         now, values = self._utc_ms(), self._values(drive)
         self._said[drive] = values
         self._changed.pop(drive, None)
-        metrics = [
-            Metric(
-                *(self._datatype(drive, name), value, now, name, self._alias(drive, name)),
-                unit=self._unit(drive, name),
-            )
-            for name, value in values.items()
-        ]
+        metrics = []
+        for name, value in values.items():
+            register = self._register(drive, name)
+            unit = register.value_unit if register and register.values is None else ""
+            alias = self._alias(drive, name)
+            metrics.append(Metric(_datatype(register), value, now, name, alias, unit))
         if self._settings.commands:
             metrics.append(Metric(DataType.BOOLEAN, False, now, STOP, self._alias(drive, STOP)))
         return payload(now, metrics, self._next())
@@ -168,7 +167,7 @@ class SparkplugNode:
     def _data(self, drive: str) -> bytes:
         now = self._utc_ms()
         metrics = [
-            Metric(self._datatype(drive, name), value, now, alias=self._alias(drive, name))
+            Metric(_datatype(self._register(drive, name)), value, now, alias=self._alias(drive, name))
             for name, value in self._changed.pop(drive, {}).items()
         ]
         return payload(now, metrics, self._next())
@@ -188,16 +187,8 @@ class SparkplugNode:
         return [name for name in self._registers(drive) if f"{drive}.{name}" in listed]
 
     def _registers(self, drive: str) -> dict[str, Register[Any]]:
-        drives = [polled.drive for line in self._plant.lines for polled in line.drives]
-        return next((dict(one.registers) for one in drives if one.name == drive), {})
-
-    def _datatype(self, drive: str, name: str) -> DataType:
-        register = self._register(drive, name)
-        return DataType.DOUBLE if register and register.values is None else DataType.STRING
-
-    def _unit(self, drive: str, name: str) -> str:
-        register = self._register(drive, name)
-        return register.value_unit if register and register.values is None else ""
+        known = drives_of(self._plant).get(drive)
+        return {} if known is None else dict(known.registers)
 
     def _register(self, drive: str, name: str) -> Register[Any] | None:
         """Return the register of a metric; None for "state" and "fault", which every drive has."""
@@ -208,18 +199,18 @@ class SparkplugNode:
 
     # ---- commands ----
 
-    def _order(self, drive: str, given: Given, sent_ms: int, *, is_retained: bool) -> None:
+    def _command(self, drive: str, given: Given, sent_ms: int, *, is_retained: bool) -> None:
         name = given.name or self._name_of(drive, given.alias)
         register = name.removeprefix(REGISTERS)
         is_writable = name not in OWN and register in self._writable(drive)
         if name == STOP and given.value:
-            self._orders.stop([drive])
+            self._commands.stop([drive])
         elif is_retained:
-            self._orders.refuse(drive, name, "it was retained; publish it without retain")
+            self._commands.refuse(drive, name, "it was retained; publish it without retain")
         elif not is_writable or not isinstance(given.value, (int, float)):
-            self._orders.refuse(drive, name, "it must be a register listed in [serve.may], with a number")
+            self._commands.refuse(drive, name, "it must be a register listed in [serve.may], with a number")
         else:
-            self._orders.write(drive, register, float(given.value), sent_ms)
+            self._commands.write(drive, register, float(given.value), sent_ms)
 
     def _name_of(self, drive: str, alias: int | None) -> str:
         known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
@@ -227,6 +218,10 @@ class SparkplugNode:
 
     def _report(self, drive: str, what: str, result: CommandResult) -> None:
         (_log.info if result.ok else _log.warning)("%s of %s: %s", what, drive, result.text)
+
+
+def _datatype(register: Register[Any] | None) -> DataType:
+    return DataType.DOUBLE if register and register.values is None else DataType.STRING
 
 
 def _metric_of(register: str) -> str:
