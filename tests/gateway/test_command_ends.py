@@ -5,19 +5,17 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from lines import PATIENCE
 from modbus_gateway import plant_of
 from simulated_bus import one
 from tables import table
 
-from multidrop import Bus, InvtCHE, Plant, Stopped, Unconfirmed
-from multidrop.control import CommandOutcome, CommandResult, Ledger, Seen
+from multidrop import Bus, InvtCHE, Plant
+from multidrop.control import CommandResult, Ledger
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.live.views import drive_view
@@ -144,58 +142,6 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
         assert told.ok, told.text
     assert line.written
     assert commands.stopped_ns(fan) is not None
-
-
-FAN, PUMP = (InvtCHE(address, name=name) for address, name in ((1, "fan"), (2, "pump")))
-HALLS = plant_of(("hall-1", FAN), ("hall-2", PUMP))
-
-
-class MovingLines(UnopenedLines):
-    """A plant whose drives are on their way to another one; the stops of a line are noted."""
-
-    plant = HALLS
-    plant_coming: Plant | None = None  # type: ignore[assignment]
-
-    def __init__(self, sent: list[str], plant_coming: Plant) -> None:
-        self.sent = sent
-        self.plant_coming = plant_coming
-
-    def bus(self, line: str) -> Bus:
-        (drive,) = (polled.drive for one in self.plant.lines if one.name == line for polled in one.drives)
-
-        def stop_all(**limit: object) -> dict[str, Stopped]:
-            self.sent.append(f"{drive.name}.stop")
-            self.plant_coming = None
-            return {drive.name: Stopped(drive.name, Seen.SENT, 1.0, "no reply")}
-
-        found: Any = SimpleNamespace(stop_all=stop_all)
-        return found  # type: ignore[no-any-return]
-
-
-@pytest.mark.parametrize("listed", [["fan"], ["fan", "pump"]])
-def test_a_coast_of_a_name_on_its_way_to_another_drive_stops_both(
-    monkeypatch: pytest.MonkeyPatch, listed: list[str]
-) -> None:
-    """Nobody knows which was meant. The other one is stopped on its ramp, unless it may be coasted too."""
-    sent: list[str] = []
-    lines = MovingLines(sent, plant_of(("hall-2", InvtCHE(2, name="fan"))))
-
-    def coast(name: str, **limit: object) -> CommandResult:
-        sent.append(f"{name}.coast")
-        if name == "pump":
-            lines.plant_coming = None
-            raise Unconfirmed("pump", "coast", "no reply")
-        return CommandResult(CommandOutcome.DONE, "stopped")
-
-    for drive in (FAN, PUMP):
-        monkeypatch.setattr(drive, "coast", partial(coast, drive.name), raising=False)
-    may = May(verbs=frozenset(f"{name}.coast" for name in listed))
-    coasting = asyncio.wait_for(Commands(lines, may).act("fan", "coast", {}, CALLER), PATIENCE)
-    told = asyncio.run(coasting)
-    assert sorted(sent) == ["fan.coast", "pump.coast" if "pump" in listed else "pump.stop"]
-    assert not told.ok  # what became of the other one is told as well
-    assert told.text.startswith("fan: stopped; pump: ")
-    assert "no reply" in told.text
 
 
 def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from multidrop.control.audit_log import AuditLog as AuditLog
 from multidrop.control.audit_log import read_audit as read_audit
 from multidrop.control.author import noted_first as noted_first
 from multidrop.control.author import written_by as written_by
-from multidrop.control.command_results import in_one_text as in_one_text
 from multidrop.control.command_results import result_of_failure as result_of_failure
 from multidrop.control.command_results import with_name as with_name
 from multidrop.control.eeprom_ledger import Ledger as Ledger

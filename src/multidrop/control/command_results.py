@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from multidrop.control.outcome import Effect, Outcome, Seen, Stopped
 from multidrop.drive.command_result import CommandOutcome, CommandResult
 from multidrop.errors import (
@@ -74,11 +72,6 @@ def result_of_write(outcome: Outcome) -> CommandResult:
     if outcome.effect is Effect.DONE:
         return CommandResult(CommandOutcome.DONE, text, held=held)
     return CommandResult(CommandOutcome.FAILED, text, BusError(text), held)
-
-
-def in_one_text(results: Mapping[str, CommandResult]) -> str:
-    """Return one sentence for the results of several drives, each with its drive's name."""
-    return "; ".join(with_name(name, result.text) for name, result in results.items())
 
 
 def with_name(drive: str, text: str) -> str:

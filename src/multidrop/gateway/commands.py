@@ -10,7 +10,7 @@ import asyncio
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from math import inf
@@ -20,7 +20,6 @@ from multidrop import Bus, BusError, Drive, Plant, WriteForbidden
 from multidrop.control import (
     CommandOutcome,
     CommandResult,
-    in_one_text,
     noted_first,
     result_of_failure,
     written_by,
@@ -223,7 +222,7 @@ class Commands:
         if rule.is_listed and what not in self.may.verbs:
             return _refused(not_listed(what, "verbs"))
         if verb == "stop":
-            return as_one(await self.stop([drive], caller))
+            return (await self.stop([drive], caller))[drive]
         try:
             arguments = verb_arguments(verb, options)
         except ValueError as mistake:
@@ -249,24 +248,15 @@ class Commands:
         return found is not None and found.commands
 
     async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> CommandResult:
-        """Carry out a verb that stops the motor; neither writes under way nor other stops delay it.
-
-        If, because of a reload, the name also means another drive, that drive is stopped by this verb if the
-        plant file lists it there, else on its ramp.
-        """
+        """Carry out a verb that stops the motor; neither writes under way nor other stops delay it."""
         self.called += 1
         _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
 
         async def stop(plant: Plant, names: list[str]) -> dict[str, CommandResult]:
-            there = drives_of(plant)
-            listed = {drive} | {name for name in names if f"{name}.{verb}" in self.may.verbs}
-            here = [name for name in names if name in there and name in listed]
-            by_verb = self._stop_by(verb, [LineStop([there[name] for name in here])], here, caller)
-            rest = self._stop(plant, [name for name in names if name not in here], caller)
-            ends = await asyncio.gather(by_verb, rest)
-            return {name: result for end in ends for name, result in end.items()}
+            here = [known for name, known in drives_of(plant).items() if name in names]
+            return await self._stop_by(verb, [LineStop(here)], names, caller)
 
-        return as_one(await stop_meant(self._lines, [drive], stop))
+        return (await stop_meant(self._lines, [drive], stop))[drive]
 
     async def _carry_out(
         self, drive: str, caller: Caller, what: str, work: Callable[[Drive], CommandResult], admit: Admit
@@ -338,10 +328,9 @@ def drives_of(plant: Plant) -> dict[str, Drive]:
     return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
 
 
-def names_of(lines: PolledLines) -> dict[str, None]:
+def names_of(lines: PolledLines) -> set[str]:
     """Return the names of all drives of the present plant, and of the new plant during a reload."""
-    plants = (lines.plant_now, lines.plant_coming or lines.plant_now)
-    return dict.fromkeys(name for plant in plants for name in drives_of(plant))
+    return {*drives_of(lines.plant_now), *drives_of(lines.plant_coming or lines.plant_now)}
 
 
 async def stop_meant(
@@ -357,15 +346,13 @@ async def stop_meant(
     """
     known = names_of(lines)
     meant = {name: drive_meant(name, known) for name in drives or ()}
-    others = _also_meant(lines, meant.values())
-    names = None if drives is None else dict.fromkeys([*meant.values(), *others])
     before = lines.plant_now.lines
     sent: dict[str, Drive | None] = {}
     begun: list[asyncio.Task[dict[str, T]]] = []
     while True:
         is_settled, plant = lines.plant_coming is None, lines.plant_now
         there = drives_of(plant)
-        wanted = there if names is None else names
+        wanted = there if drives is None else dict.fromkeys(meant.values())
         left = [one for one in wanted if one not in sent or there.get(one, sent[one]) is not sent[one]]
         pending = [stopping for stopping in begun if not stopping.done()]
         if left:
@@ -381,38 +368,10 @@ async def stop_meant(
     failed = [name for name, end in results.items() if not end.ok]
     if failed and plant.lines != before:
         results |= await stop(plant, failed)
-    return results if drives is None else {one: results[meant.get(one, one)] for one in (*meant, *others)}
-
-
-def _also_meant(lines: PolledLines, names: Collection[str]) -> list[str]:
-    """Return the present names of drives that have one of these names in the new plant.
-
-    A stop by such a name may mean either drive. A drive is left out if the new plant has another family at
-    its address, because the same stop frame may mean something else there.
-    """
-    coming = {} if lines.plant_coming is None else _by_place(lines.plant_coming)
-    wanted = {place: type(drive) for place, drive in coming.items() if drive.name in names}
-    return [
-        drive.name
-        for place, drive in _by_place(lines.plant_now).items()
-        if wanted.get(place) is type(drive) and drive.name not in names
-    ]
-
-
-def _by_place(plant: Plant) -> dict[tuple[str, int], Drive]:
-    return {(line.port, polled.drive.address): polled.drive for line in plant.lines for polled in line.drives}
+    return results if drives is None else {name: results[one] for name, one in meant.items()}
 
 
 # ---- results ----
-
-
-def as_one(results: Mapping[str, CommandResult]) -> CommandResult:
-    """Return one result for a stop whose drive name was ambiguous, so that several drives were stopped."""
-    if len(results) == 1:
-        return next(iter(results.values()))
-    failed = [result for result in results.values() if not result.ok]
-    outcome = failed[0].outcome if failed else CommandOutcome.DONE
-    return CommandResult(outcome, in_one_text(results), failed[0].error if failed else None)
 
 
 def denied(caller: Caller, role: Right, what: str) -> CommandResult:
