@@ -10,7 +10,7 @@ import re
 from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 from starlette.responses import Response, StreamingResponse
@@ -18,9 +18,6 @@ from starlette.types import Receive, Scope, Send
 
 from multidrop.gateway.http.messages import Denied
 from multidrop.supervisor import supervisor
-
-if TYPE_CHECKING:
-    from multidrop.gateway.historian import Historian
 
 MOST_EXPORTS = 8  # concurrent exports
 PIECE_S = 600.0  # time limit of a piece; before the first piece of Parquet the whole file is made
@@ -36,10 +33,8 @@ class Exports:
     def __init__(self) -> None:
         self.under_way = 0
 
-    async def respond(
-        self, part: Historian, names: Sequence[str], begin: int, end: int, kind: str
-    ) -> Response:
-        """Return a file of these series. Raises Denied for wrong arguments or too many exports, and Hung."""
+    async def respond(self, part: Any, names: Sequence[str], begin: int, end: int, kind: str) -> Response:
+        """Return a file of these series from the historian. Raises Denied for wrong arguments or too many exports, and Hung."""
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
         if self.under_way >= MOST_EXPORTS:
