@@ -88,9 +88,7 @@ def test_a_drive_that_left_its_line_is_named_in_the_result(
     ids=["huge", "huge below 0", "inf", "nan", "1.5"],
 )
 @pytest.mark.parametrize("register", ["setpoint", "control"])
-def test_a_number_that_is_none_is_told_of(
-    register: str, value: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """JSON has whole numbers that no float holds."""
     line, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
     lines = UnopenedLines()
@@ -144,7 +142,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     assert commands.stopped_ns(fan) is not None
 
 
-def test_a_look_finds_its_drive_by_another_spelling(tmp_path: Path) -> None:
+def test_a_drive_s_view_is_found_by_another_spelling(tmp_path: Path) -> None:
     gateway: Any = SimpleNamespace(
         plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
         ledger=Ledger(tmp_path / "wear.sqlite"),

@@ -67,7 +67,7 @@ def test_a_port_that_is_lost_later_says_why_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_no_port_at_all_is_told_and_waited_for(tmp_path: Path) -> None:
+def test_missing_ports_are_reported_and_retried(tmp_path: Path) -> None:
     plant = written(tmp_path, SERVE, port=str(tmp_path / "nosuch"))
     gateway = Gateway(plant, read_settings(plant, {}))
     with running(gateway):

@@ -203,7 +203,7 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_promtool_finds_nothing_to_say_of_the_metrics(tmp_path: Path) -> None:
+def test_promtool_accepts_the_metrics(tmp_path: Path) -> None:
     program = require_program("promtool")
     with served(tmp_path, '[serve.history]\nfolder = "history"\n', "pump-1", 'the \\"old\\" fan') as gateway:
         gateway.await_state("pump-1", "stands")

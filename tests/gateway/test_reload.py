@@ -176,7 +176,7 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_port_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_port_is_reported(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, _):
         roof = gateway.gateway.plant.lines[1].port
         edit(gateway, roof, str(tmp_path / "nosuch"))
@@ -235,7 +235,7 @@ def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: P
         ]
 
 
-def test_a_token_that_is_taken_away_counts_no_more_after_a_reload(tmp_path: Path) -> None:
+def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
     secrets, known = tokens()
     newer, newcomer = new_token("bert", Right.LOOK)
     file = tmp_path / "tokens"
@@ -321,7 +321,7 @@ def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_start_of_before_a_reload_does_not_go_to_what_has_its_drive_s_name_now(tmp_path: Path) -> None:
+def test_a_start_from_before_a_reload_does_not_reach_a_new_drive_of_that_name(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame()["n"]
         path = gateway.gateway.plant.path
@@ -517,9 +517,7 @@ def test_a_stop_that_is_under_way_goes_on(tmp_path: Path) -> None:
         assert gateway.gateway.revision == revision + 1
 
 
-def test_a_part_that_does_not_take_it_and_a_failure_nobody_thought_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reload_survives_unexpected_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Deaf(BrokenFeed):
         def adopt(self, plant: Plant) -> None:
             raise RuntimeError("no plant")

@@ -61,7 +61,7 @@ def test_service_manager_gets_ready_alive_and_stopping(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_sighup_reloads_and_systemd_is_told(tmp_path: Path) -> None:
+def test_sighup_reloads_and_notifies_systemd(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(PATIENCE)
@@ -239,9 +239,7 @@ def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_demo_for_browsers_leaves_nothing_out_without_a_word(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_web_demo_warns_about_ignored_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serve_command, "serve_demo", lambda **_: 0)
     assert run("demo", "--web") == (0, "", "")
     why = "multidrop: --web serves until Ctrl-C and records nothing: remove"

@@ -63,7 +63,7 @@ verbs = ["pump-1.start", "pump-2.reset_fault"]
     assert settings.may.without_token(is_loopback=False) is None
 
 
-def test_fourteen_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
+def test_fourteen_mistakes_are_reported_in_one_run(tmp_path: Path) -> None:
     (tmp_path / "tokens").write_text("anna stop 1234\nanna look\n")
     (tmp_path / "key.pem").write_text("no key\n")
     serve = """
@@ -108,7 +108,7 @@ verbs = ["pump-1.fly"]
     assert sorted(found) == sorted(expected)
 
 
-def test_mistakes_in_the_lines_hide_none_of_the_table(tmp_path: Path) -> None:
+def test_mistakes_in_lines_and_serve_table_are_reported_together(tmp_path: Path) -> None:
     serve = """
 [serve]
 listen = 80
@@ -214,7 +214,7 @@ def test_what_a_service_manager_gives(tmp_path: Path) -> None:
     assert settings.audit == state / "audit.jsonl"
 
 
-def test_nobody_could_look(tmp_path: Path) -> None:
+def test_a_token_to_look_is_required(tmp_path: Path) -> None:
     (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
     assert only == ('[serve]: look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
 

@@ -72,7 +72,9 @@ NEW_FAN = InvtCHE(2, name="fan")
 
 
 @pytest.mark.parametrize("names", [["fan"], None])
-def test_what_joins_is_stopped_though_the_stop_of_what_had_its_name_goes_on(names: list[str] | None) -> None:
+def test_a_joining_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
+    names: list[str] | None,
+) -> None:
     """Such as of a drive that is silent: that one takes half a minute."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
@@ -118,7 +120,7 @@ async def test_a_stop_by_a_name_of_the_new_plant_is_sent_when_its_drive_is_attac
     assert lines.begun == [None, new]
 
 
-def test_without_a_reload_nothing_else_is_stopped() -> None:
+def test_without_a_reload_only_the_named_drives_are_stopped() -> None:
     lines = Lines(plant_of(PUMP, FAN))
     assert told(asyncio.run(stop_meant(lines, ["fan", "nobody"], lines.stop))) == {"fan": FAN}
     assert lines.begun == [FAN, None]

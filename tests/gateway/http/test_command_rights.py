@@ -53,7 +53,7 @@ def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_look_right_sends_nothing(way: str) -> None:
+def test_the_role_look_sends_no_command(way: str) -> None:
     by_verb = NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED
     expected = dict.fromkeys(VERBS, by_verb) | {"write": NOT_ALLOWED, "stop all": NOT_ALLOWED}
     assert rules_of(ALL, way, Right.LOOK) == expected

@@ -71,7 +71,7 @@ TABLE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("serve", "address"), TABLE)
-def test_each_caller_may_what_the_table_says(tmp_path: Path, serve: str, address: str) -> None:
+def test_each_caller_has_the_rights_of_the_table(tmp_path: Path, serve: str, address: str) -> None:
     with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         for right, look, acts in TABLE[serve, address]:
@@ -317,7 +317,7 @@ def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) ->
         assert gateway.get("/api/plant", **anna | {"x_forwarded_for": "10.0.0.66"}).status == 429
 
 
-def test_revoked_token_blocks_nobody(tmp_path: Path) -> None:
+def test_a_revoked_token_blocks_no_stop(tmp_path: Path) -> None:
     """A browser goes on sending its cookie with every frame."""
     with served(tmp_path, CLOSED) as gateway:
         old = {"cookie": "multidrop=taken-away"}

@@ -165,7 +165,7 @@ def test_motor_that_stops_without_a_command_is_an_alarm(standing: Shown) -> None
     assert seen(events) == told
 
 
-def test_a_fault_is_no_stop_of_its_own() -> None:
+def test_a_fault_raises_no_alarm_of_a_stopped_motor() -> None:
     events = Alarms()
     for time, shown in enumerate((RUNS, Shown("silent", "no reply"), Shown("fault", "a"), STANDS), 1):
         events.look(time, "pump-1", shown, 0)
@@ -291,7 +291,7 @@ def test_a_line_that_is_no_alarm_is_left_out(change: Mapping[str, object]) -> No
         assert alarm_in(line) is None
 
 
-def test_a_long_file_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("multidrop.gateway.live.alarm_file.MOST_BYTES", 2000)
     path = tmp_path / "alarms.jsonl"
     kept = started(path)

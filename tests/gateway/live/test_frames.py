@@ -107,7 +107,7 @@ async def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: 
     assert second.n == 2
 
 
-def test_nothing_is_made_for_nobody(frames: Frames, clock: Clock, made: list[int]) -> None:
+def test_no_frame_is_made_without_viewers(frames: Frames, clock: Clock, made: list[int]) -> None:
     for _ in range(100):
         clock.now += 1.0
         frames.note_news()
@@ -211,7 +211,7 @@ async def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.
     assert await frames.after(first.n) is None
 
 
-async def test_a_viewer_too_many_is_told_so(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_VIEWERS", 0)
     sent: list[Any] = []
 

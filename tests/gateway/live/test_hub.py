@@ -70,7 +70,7 @@ def is_fresh(hub: Hub) -> bool:
     return next(current for one, _, _, current in hub.known("pump-1") if one.name == "output_frequency")
 
 
-def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
+def test_registers_are_unknown_before_their_first_request(hub: Hub) -> None:
     assert hub.newest("pump-1", "status") is None
     assert {good for _, _, good, _ in hub.known("pump-1")} == {None}
     assert hub.state("pump-1") == "unknown"
@@ -150,7 +150,7 @@ def test_line_is_lost_if_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -
     assert hub.seen("pump-1") == Shown("silent", "port lost")
 
 
-def test_values_grow_old_where_nothing_comes(hub: Hub, clock: HubClock) -> None:
+def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None:
     """Neither a row, nor a turn of the gateway's loop: the process may have stood still until just now."""
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns += SECOND

@@ -129,7 +129,7 @@ def test_a_silent_drives_values_are_said_to_be_old(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_a_fault_is_told_in_the_drives_words(gateway: Served) -> None:
+def test_a_fault_has_the_text_of_its_drive(gateway: Served) -> None:
     gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
     gateway.await_state("pump-1", "fault")
     until(lambda: gateway.frame()["drives"]["pump-1"]["fault"] == "overcurrent while accelerating (OC1)")
@@ -173,7 +173,7 @@ def test_viewing_does_not_read_a_silent_drive(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_lines_show_what_each_drive_costs(gateway: Served) -> None:
+def test_lines_show_the_delays_of_each_drive(gateway: Served) -> None:
     until(lambda: gateway.get("/api/lines").json["hall"]["minutes"])
     line = gateway.get("/api/lines").json["hall"]
     assert line["lost"] is None

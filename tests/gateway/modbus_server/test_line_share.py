@@ -58,7 +58,7 @@ async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seconds", usually(0.03, 0.005, 0.7))
-async def test_a_flood_has_a_fifth_of_the_line_s_time_and_all_of_it(seconds: float) -> None:
+async def test_a_flood_gets_exactly_a_fifth_of_the_line_s_time(seconds: float) -> None:
     loop = asyncio.get_running_loop()
     begun = loop.time()
     share, line = LineShare(), PacedLine(seconds)
@@ -122,7 +122,7 @@ async def test_a_greedy_client_makes_place_for_one_that_asks_for_less() -> None:
     assert await modest
 
 
-async def test_a_client_that_is_gone_waits_no_more_and_what_is_under_way_ends_first() -> None:
+async def test_requests_of_a_disconnected_client_are_dropped_but_the_current_one_ends() -> None:
     share, line = LineShare(), PacedLine(0.1)
     gone = [share.ask("gone", line.ask) for _ in range(3)]
     stays = share.ask("stays", line.ask)
@@ -145,7 +145,7 @@ async def test_a_failure_is_the_asker_s_and_the_next_has_its_turn() -> None:
     assert await second == [1]
 
 
-async def test_closing_refuses_what_waits() -> None:
+async def test_closing_refuses_waiting_requests() -> None:
     share, line = LineShare(), PacedLine(0.1)
     share.ask("one", line.ask)
     waits = share.ask("one", line.ask)

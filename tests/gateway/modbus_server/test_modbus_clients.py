@@ -95,7 +95,7 @@ async def test_answers_come_under_their_own_ids_in_the_order_in_which_they_are_d
     assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
 
 
-async def test_a_failure_of_ours_is_answered_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_internal_failure_is_answered(caplog: pytest.LogCaptureFixture) -> None:
     async def fails(found: MbapRequest) -> bytes:
         raise RuntimeError("a mistake of ours")
 
@@ -106,7 +106,7 @@ async def test_a_failure_of_ours_is_answered_all_the_same(caplog: pytest.LogCapt
     assert "a mistake of ours" in caplog.text
 
 
-async def test_a_client_s_flood_lets_others_have_their_turn() -> None:
+async def test_a_flooding_client_does_not_delay_others() -> None:
     port = port_of()
     flood, flooded = connected(port)
     other, answered = connected(port)
@@ -161,7 +161,7 @@ async def test_garbage_closes_its_client_after_the_answers_before_it() -> None:
     assert (transport.ended, other.ended) == ("closed", "")
 
 
-async def test_a_client_that_takes_no_answers_is_cut_after_a_while() -> None:
+async def test_a_client_that_reads_no_answers_is_disconnected() -> None:
     port = port_of()
     client, transport = connected(port)
     client.pause_writing()
@@ -192,7 +192,7 @@ def writes(first: int, end: int) -> bytes:
 
 
 @pytest.mark.parametrize("is_stalled", [False, True])
-async def test_writes_are_begun_as_they_come_and_in_their_order(is_stalled: bool) -> None:
+async def test_writes_start_on_arrival_in_their_order(is_stalled: bool) -> None:
     begun: list[int] = []
 
     def noted(found: MbapRequest, _: ModbusClient) -> bytes:
@@ -210,7 +210,7 @@ async def test_writes_are_begun_as_they_come_and_in_their_order(is_stalled: bool
     assert begun == transactions(transport.written) == [500, 501, *range(500)]
 
 
-async def test_what_came_is_looked_at_for_a_while_before_others_have_their_turn() -> None:
+async def test_received_writes_are_parsed_for_one_slice_at_a_time() -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(writes(0, 100))
     assert len(transactions(transport.written)) < 10
@@ -254,7 +254,7 @@ def test_client_that_reads_no_answers_is_still_read_within_bounds(
     assert caplog.text.count("does not read its answers") == 1
 
 
-async def test_a_client_that_asks_for_more_than_can_wait_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_requests_beyond_the_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
     client, transport = connected(port_of())
     client.data_received(reads(0, 1002))
@@ -264,7 +264,7 @@ async def test_a_client_that_asks_for_more_than_can_wait_is_told_so(monkeypatch:
     assert transactions(rest) == list(range(1000))
 
 
-async def test_an_idle_client_is_let_go_and_one_that_waits_for_an_answer_is_not() -> None:
+async def test_an_idle_client_is_closed_unless_it_waits_for_an_answer() -> None:
     never = asyncio.get_running_loop().create_future()
     port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
     connections = [connected(port) for _ in range(3)]
@@ -277,7 +277,7 @@ async def test_an_idle_client_is_let_go_and_one_that_waits_for_an_answer_is_not(
     never.cancel()
 
 
-async def test_a_client_too_many_takes_the_place_of_the_one_that_is_idle_longest() -> None:
+async def test_a_client_beyond_the_limit_replaces_the_longest_idle_one() -> None:
     port = port_of()
     found = []
     for _ in range(modbus_clients.MOST_CLIENTS):
@@ -292,13 +292,13 @@ async def test_a_client_too_many_takes_the_place_of_the_one_that_is_idle_longest
     assert port.refused == 1
 
 
-async def test_who_is_not_named_is_refused() -> None:
+async def test_a_client_outside_the_list_is_refused() -> None:
     port = port_of()
     assert connected(port, "10.0.0.1")[1].ended == "aborted"
     assert not port.clients
 
 
-async def test_what_is_under_way_for_a_client_that_is_gone_is_cancelled_once_it_began() -> None:
+async def test_answers_for_a_disconnected_client_are_cancelled_after_their_start() -> None:
     happened = []
 
     async def slow(found: MbapRequest) -> bytes:
@@ -319,7 +319,7 @@ async def test_what_is_under_way_for_a_client_that_is_gone_is_cancelled_once_it_
     assert (transport.written, port.clients) == (b"", set())
 
 
-async def test_a_client_that_sends_no_more_still_gets_its_answers() -> None:
+async def test_a_client_that_closed_its_sending_side_gets_its_answers() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(1)
         return found.reply(b"")
@@ -336,7 +336,7 @@ async def test_a_client_that_sends_no_more_still_gets_its_answers() -> None:
 # ---- over real sockets ----
 
 
-def test_garbage_of_one_client_is_nothing_to_another() -> None:
+def test_garbage_of_one_client_does_not_affect_another() -> None:
     plant = plant_of(("hall", InvtCHE(1, name="mill")))
     with serving(plant, ModbusSettings(listen="127.0.0.1:0")) as gateway, gateway.client() as good:
         gateway.hub.values["mill", "output_voltage"] = 231.0
@@ -363,7 +363,7 @@ def test_a_reset_connection_is_only_gone() -> None:
         assert good.ask(1, 3, 0x3003, 1).words == [231]
 
 
-def test_a_port_that_is_taken_is_told_in_one_sentence() -> None:
+def test_a_port_in_use_is_reported_in_one_sentence() -> None:
     plant = plant_of(("hall", InvtCHE(1, name="mill")))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = cast(int, taken.getsockname()[1])

@@ -80,7 +80,7 @@ def code(gateway: Gateway, unit: int, function: int, *words: int, data: bytes = 
 # ---- reads ----
 
 
-def test_a_polled_value_costs_the_line_nothing(gateway: Gateway) -> None:
+def test_a_polled_value_needs_no_request_on_the_line(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
         assert client.ask(2, 3, 0, 1).words == [125]
@@ -89,7 +89,7 @@ def test_a_polled_value_costs_the_line_nothing(gateway: Gateway) -> None:
 
 
 @pytest.mark.parametrize("why", ["a miss", "old", "never asked", "from before the machine slept"])
-def test_what_is_not_fresh_is_asked_of_the_drive(gateway: Gateway, why: str) -> None:
+def test_stale_values_are_requested_from_the_drive(gateway: Gateway, why: str) -> None:
     key = "mill", "output_voltage"
     if why == "a miss":
         gateway.hub.values[key] = None
@@ -112,7 +112,7 @@ def test_bits_that_are_passed_are_packed_the_first_one_lowest() -> None:
         assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])  # odd addresses are 1
 
 
-def test_only_what_is_declared_is_passed(gateway: Gateway) -> None:
+def test_only_declared_addresses_are_passed(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
     assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # another table
     assert code(gateway, 4, 3, 0, 1) == 2  # no Modbus behind this one
@@ -287,7 +287,7 @@ def test_a_write_goes_through_commands_and_is_echoed(gateway: Gateway) -> None:
         (15, (5, 1), b"\2\0\0", 3),
     ],
 )
-def test_what_no_write_can_say_goes_nowhere(
+def test_invalid_writes_are_refused(
     gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
 ) -> None:
     assert code(gateway, 2, function, *words, data=data) == expected
@@ -313,7 +313,7 @@ OUTCOMES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
-def test_what_became_of_a_write_has_its_code(gateway: Gateway, failure: Any, expected: int) -> None:
+def test_each_result_of_a_write_has_its_code(gateway: Gateway, failure: Any, expected: int) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
@@ -330,7 +330,7 @@ def test_a_read_only_gateway_says_so() -> None:
         assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_clients_that_may_stop_may_do_nothing_else() -> None:
+def test_clients_with_the_role_stop_can_only_stop() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
         for address, value in ((CHE_SETPOINT, 5000), (CHE_CONTROL, 1), (0x7000, 1)):
             assert code(gateway, 1, 6, address, value) == 1
@@ -393,7 +393,7 @@ MIXED = {  # addresses, and words as the manuals and the common block have them
 
 @pytest.mark.parametrize("mixed", MIXED)
 @pytest.mark.parametrize("may", ["stop", "write"])
-def test_a_stop_among_other_words_is_sent_and_nothing_else(mixed: str, may: str) -> None:
+def test_a_stop_among_other_words_is_sent_without_the_others(mixed: str, may: str) -> None:
     unit, address, words = MIXED[mixed]
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
@@ -405,7 +405,7 @@ def test_a_stop_among_other_words_is_sent_and_nothing_else(mixed: str, may: str)
         assert gateway.commands.written == []
 
 
-def test_a_stop_among_other_coils_is_sent_and_nothing_else() -> None:
+def test_a_stop_among_other_coils_is_sent_without_the_others() -> None:
     """Start off, stop on, emergency stop off: the ER-G-220's coils 0 to 2 (section 10)."""
     drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
     with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
@@ -420,9 +420,7 @@ def test_a_stop_among_other_coils_is_sent_and_nothing_else() -> None:
 @pytest.mark.parametrize(
     ("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))]
 )
-def test_words_of_which_none_is_a_stop_go_nowhere(
-    gateway: Gateway, address: int, words: tuple[int, ...]
-) -> None:
+def test_words_without_a_stop_are_refused(gateway: Gateway, address: int, words: tuple[int, ...]) -> None:
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     assert code(gateway, 1, 16, address, len(words), data=data) in (2, 3)
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
@@ -464,7 +462,7 @@ def test_a_stop_is_carried_out_though_its_client_is_gone(gateway: Gateway) -> No
     assert ended.wait(30)
 
 
-def test_a_stop_waits_for_nothing_that_its_client_asked_before(gateway: Gateway) -> None:
+def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gateway) -> None:
     """Sixteen writes hang; the stop behind them is called at once."""
     stopped = threading.Event()
     hang = threading.Event()
@@ -521,7 +519,7 @@ def test_a_stop_that_failed_says_so(gateway: Gateway, failure: BusError, expecte
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
-def test_a_stop_that_fails_beyond_all_rules_is_told_too(
+def test_an_unexpected_failure_of_a_stop_is_reported(
     gateway: Gateway, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def fails() -> CommandResult:
@@ -572,7 +570,7 @@ def test_large_numbers_have_both_words(gateway: Gateway) -> None:
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
 
 
-def test_what_is_not_known_is_never_0(gateway: Gateway) -> None:
+def test_an_unknown_value_is_never_0(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
     gateway.hub.states["mill"] = "silent"
@@ -583,7 +581,7 @@ def test_what_is_not_known_is_never_0(gateway: Gateway) -> None:
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_what_was_read_before_the_machine_slept_is_not_known(gateway: Gateway) -> None:
+def test_values_from_before_a_sleep_are_unknown(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
@@ -598,7 +596,7 @@ def test_a_fault_has_the_drive_s_number(gateway: Gateway, number: float | None, 
     assert block(gateway)[:2] == [3, expected]
 
 
-def test_a_part_of_the_block_may_be_read_and_nothing_across_its_ends(gateway: Gateway) -> None:
+def test_reads_across_the_ends_of_the_common_block_are_refused(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "stands"
     with gateway.client() as client:
         assert client.ask(1, 3, BLOCK, 1).words == [1]

@@ -26,13 +26,13 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
         ({"common": 0xFFF8}, "is not an address"),
     ],
 )
-def test_a_mistake_in_the_settings_is_told_in_a_sentence(settings: dict[str, object], sentence: str) -> None:
+def test_a_mistake_in_the_settings_is_one_sentence(settings: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=r"^\w+") as mistake:
         ModbusSettings(**settings)  # type: ignore[arg-type]
     assert sentence in str(mistake.value)
 
 
-def test_all_mistakes_are_told_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     with pytest.raises(ValueError, match="listen") as mistake:
         ModbusSettings(listen="x", passing="all", may="root", clients=("y",))
     assert len(str(mistake.value).splitlines()) == 4

@@ -132,7 +132,7 @@ def test_a_plant_file_s_drives_are_read_written_and_stopped(tmp_path: Path) -> N
     assert any("modbus from 127.0.0.1" in str(entry) and "setpoint" in str(entry) for entry in audit)
 
 
-def test_a_port_that_is_taken_is_told_before_anything_is_polled(tmp_path: Path) -> None:
+def test_a_port_in_use_is_reported_before_polling(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         path.write_text(path.read_text().replace(':0"\nmay', f':{number}"\nmay'))
@@ -141,7 +141,7 @@ def test_a_port_that_is_taken_is_told_before_anything_is_polled(tmp_path: Path) 
         assert drive.counters.requests == 0
 
 
-def test_mistakes_in_the_table_are_told_with_their_place(tmp_path: Path) -> None:
+def test_mistakes_in_the_table_are_reported_with_their_place(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (_, path):
         text = path.read_text()
         path.write_text(

@@ -36,7 +36,7 @@ def test_a_unit_is_the_drive_s_address() -> None:
     assert units.find("yard", 9) is None
 
 
-def test_all_clashes_are_told_at_once_with_the_numbers_that_are_free() -> None:
+def test_all_clashes_are_reported_with_the_free_numbers() -> None:
     plant = plant_of(
         ("hall", InnovertIBD(1, name="pump")),
         ("hall", InnovertIBD(2, name="fan")),
@@ -53,7 +53,7 @@ def test_all_clashes_are_told_at_once_with_the_numbers_that_are_free() -> None:
     assert last.endswith("free numbers: 3 to 4, 6 to 247")
 
 
-def test_a_number_of_its_own_and_a_port_of_its_own_end_a_clash() -> None:
+def test_a_unit_id_or_a_port_of_its_own_ends_a_clash() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
     assert numbers(Units(plant, ModbusSettings(units={"mill": 21}))) == {
         (MAIN, 1): "pump",
@@ -69,7 +69,7 @@ def test_a_number_that_is_given_may_clash_too() -> None:
         Units(plant, ModbusSettings(units={"mill": 1}))
 
 
-def test_what_the_settings_name_must_be_there() -> None:
+def test_files_in_the_settings_must_exist() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")))
     with pytest.raises(ValueError, match="units: there is no drive 'pumb'") as mistake:
         Units(plant, ModbusSettings(units={"pumb": 3}, ports={"hal": 1503}))
@@ -138,7 +138,7 @@ def test_a_unit_knows_its_family_s_own_ways_to_stop(stop: Stop) -> None:
     assert StopWrite(stop.register, stop.raw) in unit.stops
 
 
-def test_what_does_nothing_is_no_stop() -> None:
+def test_a_count_without_effect_is_not_a_stop() -> None:
     unit = Unit("hall", PolledDrive(InnovertIBD(1), ()))
     assert unit.stops == {StopWrite("control", 1)}  # and not 0, "no command"
 

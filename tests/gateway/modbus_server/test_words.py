@@ -142,7 +142,7 @@ def test_a_value_that_no_count_has_is_not_rounded(value: float) -> None:
         {"invalid": 5},  # the count that means no value
     ],
 )
-def test_what_leaves_bits_open_has_no_words(details: dict[str, Any]) -> None:
+def test_a_format_that_leaves_bits_open_has_no_words(details: dict[str, Any]) -> None:
     assert exact_data(declared(**details), 5.0) is None
 
 

@@ -55,7 +55,7 @@ def said(topic: str, text: bytes = b"") -> Publication:
     return Publication(topic, lambda: text)
 
 
-def test_no_more_than_the_bound_is_under_way_and_the_newest_of_a_topic_is_sent() -> None:
+def test_unacknowledged_messages_are_limited_and_the_newest_of_a_topic_is_sent() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for round in range(100):
@@ -116,7 +116,7 @@ def test_messages_that_arrive_together_make_room_at_once() -> None:
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
 
 
-def test_no_more_topics_wait_than_the_bound_and_the_others_are_counted() -> None:
+def test_messages_beyond_the_limit_are_dropped_and_counted() -> None:
     """The senders of commands name the topics of the answers."""
     wire = BreakableConnection()
     outbox = Outbox(wire.send)

@@ -125,7 +125,7 @@ def test_messages_without_a_connection_are_counted(tmp_path: Path) -> None:
         running.close()
 
 
-def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> None:
+def test_closing_publishes_offline(broker: Broker, listener: Listener, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -194,7 +194,9 @@ def test_frozen_broker_delays_nothing(broker: Broker, listener: Listener, start:
 
 
 @pytest.mark.slow
-def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listener, start: Start) -> None:
+def test_everything_is_published_again_to_a_restarted_broker(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     broker.kill()
@@ -272,7 +274,7 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     ],
     ids=range(5),
 )
-def test_no_payload_keeps_a_stop_back(
+def test_no_payload_prevents_a_stop(
     broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
 ) -> None:
     """The payloads are long, truncated, or not text."""
@@ -427,7 +429,7 @@ def test_a_verb_names_its_drive_again(broker: Broker, listener: Listener, start:
         (b'{"value": 25, "time": 1}' + b" " * 70_000, "it has 70024 bytes"),
     ],
 )
-def test_what_is_no_command_is_told(
+def test_invalid_commands_are_reported(
     broker: Broker, listener: Listener, start: Start, payload: bytes, why: str
 ) -> None:
     known, _ = start(commands=True)
@@ -438,7 +440,7 @@ def test_what_is_no_command_is_told(
 
 
 @pytest.mark.parametrize(("drive", "verb"), [("pump-1", "\ud800"), ("x" * 65_521, "")])
-def test_an_answer_that_cannot_be_sent_costs_the_others_nothing(
+def test_an_unsendable_answer_does_not_affect_other_messages(
     broker: Broker, listener: Listener, start: Start, drive: str, verb: str
 ) -> None:
     """A verb that is no UTF-8, and a topic whose answer's would be too long: 65,536 bytes."""
@@ -456,7 +458,7 @@ def test_an_answer_that_cannot_be_sent_costs_the_others_nothing(
     )
 
 
-def test_a_number_without_end_is_null(listener: Listener, start: Start) -> None:
+def test_an_infinite_number_is_null(listener: Listener, start: Start) -> None:
     """JSON has none: who reads the message would lose all other values with it."""
     known, running = start()
     listener.wait_for(has("multidrop/pump-1"))
@@ -466,7 +468,7 @@ def test_a_number_without_end_is_null(listener: Listener, start: Start) -> None:
     assert b'"output_frequency": null' in said.payload
 
 
-def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listener, start: Start) -> None:
+def test_commands_are_not_subscribed_unless_enabled(broker: Broker, listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, "multidrop/stop", b"stop", "-q", "1")
@@ -476,7 +478,7 @@ def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listen
     assert known.commands.noted == []
 
 
-def test_without_the_key_only_a_rebirth_is_asked_for(tmp_path: Path) -> None:
+def test_without_the_key_only_rebirth_is_subscribed(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [speaker.topics() for speaker in part._speakers] == [
@@ -510,7 +512,7 @@ async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: 
 # ---- Home Assistant ----
 
 
-def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
+def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
     start(home_assistant=True, commands=True, every="2 s")
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
     found = json_of(said)
@@ -729,7 +731,7 @@ def test_drive_name_that_cannot_be_a_topic_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "topics", [{"prefix": "homeassistant/x"}, {"prefix": "spBv1.0"}, {"sparkplug": "STATE"}]
 )
-def test_topics_of_others_are_refused(topics: dict[str, str]) -> None:
+def test_reserved_topics_are_refused(topics: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=r"reserved topic|another group"):
         MqttSettings(**topics)
 
@@ -757,7 +759,7 @@ def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
+def test_metrics_count_sent_messages(broker: Broker, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with served(tmp_path, f'[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
 
@@ -772,7 +774,7 @@ def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
         until(lambda: figures()["connected"] == 0.0)
 
 
-def test_metrics_say_in_words_what_they_count(broker: Broker, tmp_path: Path) -> None:
+def test_metrics_have_help_texts(broker: Broker, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with served(tmp_path, f'[serve.history]\n[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
         lines = gateway.get("/metrics").body.decode().splitlines()
@@ -803,7 +805,7 @@ class PutMessages:
         return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
 
 
-def test_a_drive_that_left_while_the_broker_was_away_is_taken_back_when_it_is_there(tmp_path: Path) -> None:
+def test_topics_of_a_drive_removed_without_a_connection_are_deleted_on_the_next(tmp_path: Path) -> None:
     """Messages that wait are dropped when a connection breaks; the topics would say old values for ever."""
     known = inside(tmp_path)
     whole = known.plant

@@ -58,7 +58,7 @@ def test_retained_messages_of_present_drives_stay() -> None:
     assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # it was adopted meanwhile
 
 
-def test_while_another_gateway_has_this_prefix_nothing_is_taken_back() -> None:
+def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
     old = ("works/old/available", b"online")
     assert heard(("works/gateway", b"online"), old) == []
     assert heard(old) == []

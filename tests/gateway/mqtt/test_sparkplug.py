@@ -41,7 +41,7 @@ def value_of(metric: Any) -> object:
 
 @pytest.mark.long
 @given(st.integers(0, 2**63), st.lists(metrics, max_size=5), st.none() | st.integers(0, 255))
-def test_a_host_reads_what_was_said(time_ms: int, said: list[Metric], seq: int | None) -> None:
+def test_a_host_can_decode_all_payloads(time_ms: int, said: list[Metric], seq: int | None) -> None:
     received = sparkplug_messages().Payload.FromString(payload(time_ms, said, seq))
     assert received.timestamp == time_ms
     assert (received.seq if received.HasField("seq") else None) == seq

@@ -111,7 +111,7 @@ def test_a_birth_says_units(host: Host, node: tuple[Any, Running]) -> None:
     assert not host.wait_for("DDATA", "pump-1").metrics[0].HasField("properties")
 
 
-def test_what_did_not_change_is_not_said(host: Host, node: tuple[Any, Running]) -> None:
+def test_unchanged_values_are_not_sent(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)
     for _ in range(5):
@@ -153,7 +153,7 @@ def test_a_lost_connection_is_a_death_and_a_birth_of_the_next_number(
     host.wait_for("DBIRTH", "pump-1")
 
 
-def test_a_drive_that_died_again_while_nothing_was_sent_is_dead_in_the_end(tmp_path: Path) -> None:
+def test_a_drive_that_died_again_before_its_messages_were_sent_is_dead(tmp_path: Path) -> None:
     known, sent, is_open = inside(tmp_path), [], [True]
 
     def send(message: Publication) -> int | None:

@@ -45,7 +45,7 @@ def violations(page: Any) -> list[str]:
 
 
 @pytest.mark.parametrize(("size", "theme"), LOOKS)
-def test_axe_finds_nothing(
+def test_axe_finds_no_violation(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, request: pytest.FixtureRequest
 ) -> None:
     if size == "tablet":  # the long list of all drives is looked at on a larger and on a smaller screen

@@ -109,7 +109,7 @@ def test_of_very_many_lines_the_first_are_drawn(opened: Opener, gateway: FakeGat
     assert note == "1000 lines, 1 without a master; the first 200 are shown"
 
 
-def test_without_a_fleet_there_is_no_such_view(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_is_hidden_without_a_fleet(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"fleet": False}
     page = opened()
     assert page.locator("nav a:visible").all_inner_texts()[-1] == "Log"
@@ -126,7 +126,7 @@ def test_it_is_reached_by_its_key(opened: Opener) -> None:
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
 
 
-def test_stop_all_names_what_it_stops(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_names_its_drives(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     stopall = page.locator("#stopall")
     assert stopall.inner_text() == "Stop this plant"
@@ -156,7 +156,7 @@ def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway:
     assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
 
 
-def test_what_became_of_each_part_is_told(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_state_of_each_part_is_reported(opened: Opener, gateway: FakeGateway) -> None:
     """The fleet's servers are gone: the gateway's own drives were stopped all the same."""
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"the fleet": {"done": False, "text": "the stop was NOT sent"}}

@@ -57,7 +57,7 @@ def test_a_stop_asks_for_the_token_that_the_gateway_wants(page: Any, tmp_path: P
         until(page, "document.querySelector('#role').textContent === 'may stop'")
 
 
-def test_a_killed_gateway_is_told(page: Any) -> None:
+def test_a_killed_gateway_is_reported(page: Any) -> None:
     command = [sys.executable, "-m", "multidrop", "serve", "--demo", "--no-browser"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:

@@ -35,7 +35,7 @@ def test_all_drives_are_live(opened: Opener, gateway: FakeGateway) -> None:
     until_met(page, lambda: old.count() == 2)  # frequency and current of the silent drive
 
 
-def test_a_killed_gateway_is_told(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     gateway.kill()
     until(page, STALE)
@@ -50,7 +50,7 @@ def test_a_killed_gateway_is_told(opened: Opener, gateway: FakeGateway) -> None:
     assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 
-def test_a_gateway_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_hanging_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.is_silent = True
     until(page, STALE)
@@ -61,7 +61,7 @@ def test_a_gateway_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -
     page.locator("#notice").wait_for(state="hidden")
 
 
-def test_a_viewer_s_clock_that_is_set_back_makes_nothing_live(
+def test_a_viewer_s_clock_that_is_set_back_makes_no_old_value_live(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer tells of the gateway's clock

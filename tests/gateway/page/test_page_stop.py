@@ -143,7 +143,7 @@ def test_an_outcome_takes_no_question_away(opened: Opener, gateway: FakeGateway)
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
-def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_stop_does_not_depend_on_other_parts(opened: Opener, gateway: FakeGateway) -> None:
     """A view that cannot be loaded takes all views with it, and no stop."""
     page = opened(live=False)
     page.route("**/page/table.js", lambda route: route.abort())
@@ -158,7 +158,7 @@ def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGa
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_plots_that_cannot_be_loaded_take_nothing_else_with_them(opened: Opener) -> None:
+def test_the_page_works_without_its_plot_library(opened: Opener) -> None:
     page = opened(live=False)
     page.route("**/page/vendor/*.js", lambda route: route.abort())
     page.goto(page.url.partition("#")[0] + "#/drives/pump-1")
@@ -333,7 +333,7 @@ def test_a_stop_waits_for_no_other_tab(
 
 
 @pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
-def test_nothing_that_comes_later_takes_the_place_of_a_stop_s_question(
+def test_no_later_dialog_replaces_the_question_of_a_stop(
     opened: Opener, gateway: FakeGateway, case: str
 ) -> None:
     """The answer to an earlier request arrives while the user is about to confirm the stop."""

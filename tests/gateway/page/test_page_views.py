@@ -154,7 +154,7 @@ def test_no_word_of_a_state_is_cut(opened: Opener, size: tuple[int, int]) -> Non
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (768, 1024)])
-def test_why_a_port_is_lost_is_shown_whole(
+def test_the_reason_of_a_lost_port_is_shown_completely(
     opened: Opener, gateway: FakeGateway, size: tuple[int, int]
 ) -> None:
     lines = fake_plant.lines()

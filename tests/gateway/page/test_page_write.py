@@ -276,7 +276,7 @@ def test_no_button_moves_when_values_grow_old(opened: Opener, gateway: FakeGatew
     assert start.bounding_box() == before
 
 
-def test_what_may_not_be_done_is_not_offered(opened: Opener) -> None:
+def test_forbidden_commands_are_not_offered(opened: Opener) -> None:
     page = opened("#/drives/pump-2")
     page.locator(".registers").wait_for()
     assert page.locator(".verbs button, .change").count() == 0
