@@ -34,7 +34,10 @@ class Exports:
         self.under_way = 0
 
     async def respond(self, part: Any, names: Sequence[str], begin: int, end: int, kind: str) -> Response:
-        """Return a file of these series from the historian. Raises Denied for wrong arguments or too many exports, and Hung."""
+        """Return a file of series from the historian `part`.
+
+        Raises Hung, and Denied for wrong arguments or too many exports.
+        """
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
         if self.under_way >= MOST_EXPORTS:
