@@ -83,6 +83,8 @@ def _retried_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polled_line, "RETRY_NS", 50_000_000)
     monkeypatch.setattr(polled_line, "STANDBY_NS", 10_000_000)
     monkeypatch.setattr(polled_line, "LONGEST_RETRY_NS", 100_000_000)
+    for name in ("LEARN_NS", "RELEARN_NS"):
+        monkeypatch.setattr(polled_line, name, 10_000_000)
 
 
 def of_line(name: str, method: Callable[..., Any], failure: BaseException) -> Callable[..., Any]:
