@@ -174,7 +174,7 @@ def check(cell: Cell, situation: str, verb: str, fault: str, outcome: str) -> No
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=["-".join(cell[:3]) for cell in CELLS])
-@table("family", FAMILIES)
+@table("family", [*MAKE, *PROFILES])
 def test_outcome_of_a_verb_during_a_fault(family: str, cell: tuple[str, str, str, str]) -> None:
     situation, verb, fault, expected = cell
     if fault == "exception" and family == NO_EXCEPTIONS:
