@@ -13,7 +13,14 @@ author = "multidrop developers"
 copyright = "multidrop developers"
 release = version = version_of("multidrop")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "plain_docstrings", "public_names", "command_help"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "plain_docstrings",
+    "plain_pages",
+    "public_names",
+    "command_help",
+]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"multidrop {release}"

@@ -1,38 +1,43 @@
-"""Take the picture of the gateway's page: `python docs/pictures/page.py`.
+"""Take the picture of the page of `multidrop demo --web`: `python docs/pictures/page.py`.
 
-It shows the plant of the page's tests, with invented values, after a minute. Needs `pip install '.[test]'`
-and Chromium.
+It takes more than a minute, because the last minute is in the picture. With a file name, a width and a height
+it takes the picture of another window. Needs `pip install '.[serve]' playwright` and Chromium.
 """
 
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
 HERE = Path(__file__).parent
-sys.path.append(str(HERE.parents[1] / "tests" / "page"))
-WIDTH, HEIGHT = 1440, 900
-MINUTE_MS = 62_000  # until the one-minute plots are full
+COMMAND = [str(Path(sys.executable).with_name("multidrop")), "demo", "--web", "--no-browser"]
+MINUTE_S = 62.0  # until the gateway has kept a whole minute
+SHOWN_MS = 5_000  # of the page, until its plots are drawn
 
 
-def main() -> None:
-    from fake_gateway import FakeGateway
-
-    gateway = FakeGateway()
-    gateway.has_history = False
-    with sync_playwright() as playwright:
+def main(out: Path = HERE / "page.png", width: int = 1440, height: int = 900, place: str = "") -> None:
+    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True) as demo, sync_playwright() as playwright:
+        assert demo.stdout is not None
+        url = demo.stdout.readline().split()[1]
+        time.sleep(MINUTE_S)
         chromium = shutil.which("chromium") or shutil.which("google-chrome")
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
-        page.goto(f"{gateway.url}#/drives/filler-2")
-        page.wait_for_timeout(MINUTE_MS)
-        page.screenshot(path=HERE / "page.png")
+        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
+        page.goto(url + place)
+        page.wait_for_timeout(SHOWN_MS)
+        page.screenshot(path=out)
         browser.close()
-    gateway.kill()
+        demo.terminate()
 
 
 if __name__ == "__main__":
-    main()
+    given = sys.argv[1:]
+    if given:
+        main(Path(given[0]), int(given[1]), int(given[2]), *given[3:])
+    else:
+        main(place="#/drives/fan-1")

@@ -342,13 +342,29 @@ def test_every_public_name_is_in_the_reference(package: str, monkeypatch: pytest
     pytest.importorskip("sphinx")
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     public = importlib.import_module("public_names").public
-    pages = "\n".join(page.read_text("utf-8") for page in (DOCS / "reference").glob("*.md"))
+    with_names = importlib.import_module("plain_pages").with_names
+    pages = "\n".join(with_names(page.read_text("utf-8")) for page in (DOCS / "reference").glob("*.md"))
     given = re.findall(
         rf"^```{{public-names}} {re.escape(package)}\n(.*?)^```", pages, re.DOTALL | re.MULTILINE
     )
     assert any(":rest:" in names for names in given)
     names = " ".join(given).replace(":rest:", "").split()
     assert set(names) <= set(public(importlib.import_module(package)))
+
+
+@pytest.mark.parametrize("page", ["index.md", "reference/api.md"])
+def test_entry_pages_are_plain_markdown(page: str) -> None:
+    """A code host shows directives and definition lists as raw text."""
+    text = (DOCS / page).read_text("utf-8")
+    assert re.findall(r"^```\{.*|^: .*|^:::.*", text, re.MULTILINE) == []
+
+
+def test_every_page_is_in_the_contents() -> None:
+    text = (DOCS / "index.md").read_text("utf-8")
+    linked = set(re.findall(r"\(([\w/-]+\.md)\)", text))
+    included = {"explanation/speed-table.md", "reference/line-states.md"}  # parts of other pages
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} - {"index.md"}
+    assert {page for page in pages - included - linked if "/walk-" not in page} == set()
 
 
 def test_every_status_is_in_the_reference() -> None:
