@@ -21,12 +21,12 @@ SHOWN_MS = 5_000  # of the page, until its plots are drawn
 
 
 def main(out: Path = HERE / "page.png", width: int = 1440, height: int = 900, place: str = "") -> None:
-    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True) as demo, sync_playwright() as playwright:
+    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True) as demo, sync_playwright() as player:
         assert demo.stdout is not None
         url = demo.stdout.readline().split()[1]
         time.sleep(MINUTE_S)
         chromium = shutil.which("chromium") or shutil.which("google-chrome")
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        browser = player.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
         page.goto(url + place)
         page.wait_for_timeout(SHOWN_MS)
