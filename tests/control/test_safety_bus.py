@@ -344,8 +344,8 @@ def test_noise_at_the_start_spoils_only_the_identity_check(monkeypatch: pytest.M
 def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
-    control = sim.obeys[3, 0x1000]
-    trips = {(3, 0x1000): lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
+    control = sim.obeys["control"]
+    trips = {"control": lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
     monkeypatch.setattr(type(sim), "obeys", trips)
     with pytest.raises(NotVerified, match=r"tripped: overcurrent while accelerating .OC1"):
         drive.start()

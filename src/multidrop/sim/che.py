@@ -69,19 +69,6 @@ class SimulatedCHE(MotorDrive):
         self._modbus_fault = _MODBUS_FAULTS.get(code, 0)
         return super().refused(request, code)
 
-    def _control(self, command: int) -> None:
-        actions = {
-            1: lambda: self.motor.run(1),
-            2: lambda: self.motor.run(-1),
-            3: lambda: self.motor.jog(1),
-            4: lambda: self.motor.jog(-1),
-            5: self.motor.stop,
-            6: self.motor.coast,
-            7: self.motor.reset,
-            8: self.motor.stop,
-        }
-        actions[command]()
-
     def _state(self) -> int:
         if self.motor.fault:
             return 4
@@ -89,11 +76,11 @@ class SimulatedCHE(MotorDrive):
             return 3
         return 2 if self.motor.frequency < 0 else 1
 
-    obeys = {(0x03, CONTROL): _control}
+    obeys = {"control": MotorDrive.carry_out_named}
     shows = {
-        (0x03, 0x1001): _state,
-        (0x03, 0x3006): lambda self: round(self.motor.power * 100),
-        (0x03, 0x3016): lambda self: DEVICE_CODE,
-        (0x03, 0x5000): lambda self: self.motor.fault,
-        (0x03, 0x5001): lambda self: self._modbus_fault,
+        "status": _state,
+        "output_power": lambda self: round(self.motor.power * 100),
+        "device": lambda self: DEVICE_CODE,
+        "fault": lambda self: self.motor.fault,
+        "communication_fault": lambda self: self._modbus_fault,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from multidrop.core import Message
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
-from multidrop.sim.protocol import COMMAND, QUERY, SET, STATE, STORE, Reason, Refusal
+from multidrop.sim.protocol import COMMAND, SET, STORE, Reason, Refusal
 
 MOST_GAP = 10e-3  # s between two bytes; from part 3, the only one that states a gap
 UNDER_VOLTAGE = 7  # fault number, POFF
@@ -16,7 +16,6 @@ NATIVE_FORMATS = ("8N1", "8E1", "8O1")
 COMMANDS, STARTS = range(1, 5), (2, 3)  # values of the run command (K = 02)
 RUN_SOURCE, FREQUENCY_SOURCE = 0, 1  # P00.00 and P00.01
 BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
-RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28
 
 
 class SimulatedDelixi(MotorDrive):
@@ -50,11 +49,11 @@ class SimulatedDelixi(MotorDrive):
     def _format(self) -> int:
         return MODBUS_FORMATS.index(self.drive.settings.format)
 
-    obeys = {(0x03, 0x2000): _control}
+    obeys = {"control": _control}
     shows = {
-        (0x03, 428): lambda self: BAUDRATES.index(self.drive.settings.baudrate),
-        (0x03, 429): _format,
-        (0x03, 430): lambda self: self.drive.address,
+        "baudrate_setting": lambda self: BAUDRATES.index(self.drive.settings.baudrate),
+        "format_setting": _format,
+        "address_setting": lambda self: self.drive.address,
     }
 
 
@@ -89,15 +88,6 @@ class SimulatedDelixiNative(MotorDrive):
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
 
-    def _command(self, number: int) -> None:
-        actions = {
-            1: self.motor.stop,
-            2: lambda: self.motor.run(1),
-            3: lambda: self.motor.run(-1),
-            4: self.motor.reset,
-        }
-        actions[number]()
-
     def _state(self) -> int:
         if self.motor.fault:
             return 5 if self.motor.fault == UNDER_VOLTAGE else 4
@@ -105,16 +95,16 @@ class SimulatedDelixiNative(MotorDrive):
             return 1
         return 3 if self.motor.frequency < 0 else 2
 
-    obeys = {(COMMAND, 0): _command}
+    obeys = {"control": MotorDrive.carry_out_named}
     shows = {
-        (STATE, 0): _state,
-        (QUERY, 428): lambda self: BAUDRATES.index(self.drive.settings.baudrate),
-        (QUERY, 429): lambda self: NATIVE_FORMATS.index(self.drive.settings.format),
-        (QUERY, 430): lambda self: self.drive.address,
-        (QUERY, 0x0213): lambda self: _printed(self.motor.fault),
+        "status": _state,
+        "baudrate_setting": lambda self: BAUDRATES.index(self.drive.settings.baudrate),
+        "format_setting": lambda self: NATIVE_FORMATS.index(self.drive.settings.format),
+        "address_setting": lambda self: self.drive.address,
+        "fault": lambda self: _printed(self.motor.fault),
     } | {
-        (QUERY, address): lambda self, number=number: _printed(self.motor.fault_record(number))
-        for number, address in enumerate(RECORDS, start=1)
+        f"fault_record_{number}": lambda self, number=number: _printed(self.motor.fault_record(number))
+        for number in range(1, 5)
     }
 
 

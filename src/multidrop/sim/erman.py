@@ -9,7 +9,7 @@ from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason
 
 COILS = range(13)  # including reserved coils, 3 to 8 and 10 to 12
-START, STOP, EMERGENCY_STOP, FAULT_RESET = 0, 1, 2, 9
+STOP, EMERGENCY_STOP = 1, 2
 EMERGENCY_STOPPED = 1 << 0  # bit of the last fault
 OVERLOADED = 1 << 5  # bit of the state
 _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
@@ -66,12 +66,12 @@ class SimulatedERMAN(MotorDrive):
         return _STATES[self.motor.phase] | (OVERLOADED if overloaded else 0)
 
     obeys = {
-        (0x01, START): _start,
-        (0x01, STOP): _stop,
-        (0x01, EMERGENCY_STOP): _emergency_stop,
-        (0x01, FAULT_RESET): _reset,
+        "start_coil": _start,
+        "stop_coil": _stop,
+        "emergency_stop_coil": _emergency_stop,
+        "fault_reset_coil": _reset,
     }
     shows = {
-        (0x04, 0x0400): _state,
-        (0x04, 0x0402): lambda self: self.motor.fault_record(1),  # kept after a reset
+        "status": _state,
+        "last_fault": lambda self: self.motor.fault_record(1),  # kept after a reset
     }

@@ -7,7 +7,7 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import MotorDrive
 
-CONTROL, SETPOINT = 0x2000, 0x2001
+SETPOINT = 0x2001
 STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # Prb.00, .01, .02
 BY_PARAMETER, BY_LINE, RUN_BY_LINE = 0, 5, 2
 STOP, RUN, JOG = 1, 2, 3  # bits 1 and 0 of 2000H
@@ -84,10 +84,10 @@ class SimulatedIBD(MotorDrive):
         first_rtu = 0 if self.drive.framing is Framing.ASCII else len(FORMATS)
         return first_rtu + FORMATS.index(self.drive.settings.format)
 
-    obeys = {(0x03, CONTROL): _control}
+    obeys = {"control": _control}
     shows = {
-        (0x03, 22): _terminals,
-        (0x03, 700): lambda self: BAUDRATES.index(self.drive.settings.baudrate),
-        (0x03, 701): _format,
-        (0x03, 702): lambda self: self.drive.address,
+        "terminals": _terminals,
+        "baudrate_setting": lambda self: BAUDRATES.index(self.drive.settings.baudrate),
+        "format_setting": _format,
+        "address_setting": lambda self: self.drive.address,
     }

@@ -1,8 +1,8 @@
 """MotorDrive: a simulated drive with a motor behind its registers.
 
 Settings with common names configure the motor, and monitors with common names show its state. A family's own
-registers are in two tables: `obeys` has functions that carry out writes, and `shows` has functions that
-return the count to read. The keys are (function code that reads the table, address).
+registers are in two tables by name: `obeys` has functions that carry out writes, and `shows` has functions
+that return the count to read.
 """
 
 from __future__ import annotations
@@ -17,14 +17,24 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import MONITORS, RATED, Motor, Rating
 from multidrop.sim.protocol import Reason, Refusal
 
+COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # by name of a control word
+    "FORWARD": lambda motor: motor.run(1),
+    "REVERSE": lambda motor: motor.run(-1),
+    "JOG_FORWARD": lambda motor: motor.jog(1),
+    "JOG_REVERSE": lambda motor: motor.jog(-1),
+    "STOP": lambda motor: motor.stop(),
+    "STOP_JOG": lambda motor: motor.stop(),
+    "COAST": lambda motor: motor.coast(),
+    "RESET_FAULT": lambda motor: motor.reset(),
+}
 _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
     """A drive with a motor. If a monitor is set from outside, it keeps that value."""
 
-    obeys: ClassVar[Mapping[tuple[int, int], Callable[[Any, int], None]]] = {}
-    shows: ClassVar[Mapping[tuple[int, int], Callable[[Any], int]]] = {}  # raw counts
+    obeys: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
+    shows: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # raw counts
     begins: ClassVar[Mapping[int, int]] = {}  # raw counts by the address that function 06 writes
 
     def __init__(
@@ -90,6 +100,10 @@ class MotorDrive(SimulatedDrive):
         elif direction is not None:
             self.motor.direction = direction
 
+    def carry_out_named(self, raw: int) -> None:
+        """Carry out a control word that has one of the names in COMMANDS."""
+        COMMANDS[self.drive.register("control").decode(raw).name](self.motor)
+
     def word(self, address: int) -> int:
         """Return the holding register at this address; 0 if the class has none."""
         cell = self.memory.writable(0x06, address)
@@ -103,17 +117,15 @@ class MotorDrive(SimulatedDrive):
 
     def changed(self, cell: MemoryCell) -> None:
         self.set_up()
-        command = self.obeys.get((cell.table.read or cell.table.write or 0, cell.address))
-        if command is not None:
-            command(self, cell.raw)
+        if cell.name in self.obeys:
+            self.obeys[cell.name](self, cell.raw)
 
     def refresh(self, cell: MemoryCell) -> None:
         register = cell.register
         if register is None or register in self._held:
             return
-        show = self.shows.get((register.table.read or 0, register.address))
-        if show is not None:
-            self.memory.set_raw(register, show(self))
+        if register.name in self.shows:
+            self.memory.set_raw(register, self.shows[register.name](self))
         elif register.name in MONITORS and not register.writable:
             value = MONITORS[register.name](self.motor)
             if register.unit == "%":
@@ -124,13 +136,9 @@ class MotorDrive(SimulatedDrive):
 class ProfileDrive(MotorDrive):
     """A drive of a profile, whose registers have the names of their roles.
 
-    `heeds` maps a role to the function that carries out a write, `tells` maps a role to the function that
-    returns the count to read. While `is_local` is set, the keypad is in control and the line's commands are
-    ignored. `power_cycle` loses everything except settings in EEPROM.
+    While `is_local` is set, the keypad is in control and the line's commands are ignored. `power_cycle` loses
+    everything except settings in EEPROM.
     """
-
-    heeds: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
-    tells: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # raw counts
 
     def prepare(self) -> None:
         self.is_local = False
@@ -148,22 +156,15 @@ class ProfileDrive(MotorDrive):
         return held / 100 * self.motor.maximum_frequency
 
     def changed(self, cell: MemoryCell) -> None:
-        self.set_up()
-        if cell.register is not None and cell.register.name in self.heeds:
-            self.heeds[cell.register.name](self, cell.raw)
-            if cell.register.name == "control":
-                self.word_before = cell.raw
+        super().changed(cell)
+        if cell.name == "control":
+            self.word_before = cell.raw
 
     def refresh(self, cell: MemoryCell) -> None:
+        super().refresh(cell)
         register = cell.register
-        if register is None or register in self._held:
-            return
-        if register.name in self.tells:
-            self.memory.set_raw(register, self.tells[register.name](self))
-        elif register.name == "reference_in_force":
+        if register and register.name == "reference_in_force" and register not in self._held:
             self.memory.set(register, self.memory.get(self.drive.register("reference")))
-        else:
-            super().refresh(cell)
 
     def rises(self, word: int, bits: int) -> bool:
         """Return True if one of the bits is set in this word and none was set in the previous word."""

@@ -20,7 +20,7 @@ from multidrop.families.profiles.optidrive import OptidriveControl, OptidriveSta
 from multidrop.families.profiles.profidrive import ProfidriveControl, ProfidriveStatus
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import Phase
-from multidrop.sim.motor_drive import ProfileDrive
+from multidrop.sim.motor_drive import COMMANDS, ProfileDrive
 from multidrop.sim.protocol import Reason, Refusal
 
 _NO_OFF = ProfidriveControl.NO_OFF2 | ProfidriveControl.NO_OFF3
@@ -106,8 +106,8 @@ class SimulatedProfidrive(ProfileDrive):
     def _last(self, bit: int) -> bool:
         return bool(self.word_before & bit)
 
-    heeds = {"control": _control}
-    tells = {"status": _state}
+    obeys = {"control": _control}
+    shows = {"status": _state}
 
 
 _COMMANDS = 0x8F  # bits 7 and 3 to 0
@@ -173,8 +173,8 @@ class SimulatedCiA402(ProfileDrive):
     def _remote(self) -> int:
         return 0 if self.is_local else CiA402Status.REMOTE
 
-    heeds = {"control": _control}
-    tells = {"status": _status}
+    obeys = {"control": _control}
+    shows = {"status": _status}
 
 
 class SimulatedDanfossFC(ProfileDrive):
@@ -218,8 +218,8 @@ class SimulatedDanfossFC(ProfileDrive):
         }
         return sum(bit for bit, is_set in bits.items() if is_set)
 
-    heeds = {"control": _control}
-    tells = {"status": _state}
+    obeys = {"control": _control}
+    shows = {"status": _state}
 
 
 EXTERNAL_FAULT = 49  # EF
@@ -256,8 +256,8 @@ class SimulatedDelta(ProfileDrive):
         by_line = 0 if self.is_local else DeltaStatus.COMMANDED_BY_LINE | DeltaStatus.REFERENCE_BY_LINE
         return lamps | side << 3 | by_line
 
-    heeds = {"control": _control, "reset": _reset}
-    tells = {"status": _state}
+    obeys = {"control": _control, "reset": _reset}
+    shows = {"status": _state}
 
 
 _STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
@@ -289,17 +289,7 @@ class SimulatedInvt(ProfileDrive):
             or (word == InvtControl.STOP and self._jogs and self.jog_needs_own_stop)
         ):
             return
-        actions = {
-            InvtControl.FORWARD: lambda: self.motor.run(1),
-            InvtControl.REVERSE: lambda: self.motor.run(-1),
-            InvtControl.JOG_FORWARD: lambda: self.motor.jog(1),
-            InvtControl.JOG_REVERSE: lambda: self.motor.jog(-1),
-            InvtControl.STOP: self.motor.stop,
-            InvtControl.COAST: self.motor.coast,
-            InvtControl.RESET_FAULT: self.motor.reset,
-            InvtControl.STOP_JOG: self.motor.stop,
-        }
-        actions[word]()
+        COMMANDS[word.name](self.motor)
         self._jogs = word in (InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
 
     def _state(self) -> int:
@@ -309,8 +299,8 @@ class SimulatedInvt(ProfileDrive):
             return InvtStatus.STANDBY
         return InvtStatus.REVERSE if self.motor.frequency < 0 else InvtStatus.FORWARD
 
-    heeds = {"control": _control}
-    tells = {"status": _state}
+    obeys = {"control": _control}
+    shows = {"status": _state}
 
 
 class SimulatedOptidrive(ProfileDrive):
@@ -348,5 +338,5 @@ class SimulatedOptidrive(ProfileDrive):
         }
         return fault << 8 | sum(bit for bit, is_set in bits.items() if is_set)
 
-    heeds = {"control": _control}
-    tells = {"status": _state}
+    obeys = {"control": _control}
+    shows = {"status": _state}

@@ -147,11 +147,11 @@ class SimulatedYD1000(MotorDrive):
             return bits
         return bits | RUN | self._in_force & (JOG | DC_BRAKE)  # braking is run too (8.2, table 2)
 
-    obeys = {(0x03, CONTROL): _control}
+    obeys = {"control": _control}
     shows = {
-        (0x03, 0x0800): lambda self: BAUDRATES.index(self.drive.settings.baudrate),
-        (0x03, 0x0801): lambda self: "NEO".index(self.drive.settings.parity),
-        (0x03, 0x0802): lambda self: self.drive.address,
-        (0x03, 0x1200): lambda self: round(abs(self.motor.frequency) * 100),
-        (0x03, 0x1201): _state,
+        "baudrate_setting": lambda self: BAUDRATES.index(self.drive.settings.baudrate),
+        "parity_setting": lambda self: "NEO".index(self.drive.settings.parity),
+        "address_setting": lambda self: self.drive.address,
+        "held_frequency": lambda self: round(abs(self.motor.frequency) * 100),
+        "status": _state,
     }
