@@ -94,7 +94,7 @@ def test_a_line_is_an_interface_with_its_name(tmp_path: Path) -> None:
 # ---- we read ours, and others' ----
 
 
-def test_what_was_written_is_read(tmp_path: Path) -> None:
+def test_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
     exchanges = [*RTU, *TEXT]
     (found,) = spans(write(tmp_path / "a.pcapng", exchanges)).values()
     assert [(span.kind, span.time_ns, span.raw) for span in found] == [
@@ -104,7 +104,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     ]
 
 
-def test_junk_is_read_as_junk(tmp_path: Path) -> None:
+def test_noise_is_read_as_noise(tmp_path: Path) -> None:
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(b"\xff\x00\xff", Side.EITHER, BEGIN, "hall-1")
         capture.write(RTU[0].frame[:-1], Side.ANSWERING, BEGIN, "hall-1")
@@ -122,7 +122,7 @@ def hexdump(packets: Iterable[bytes]) -> str:
 
 @pytest.mark.parametrize("format", ["pcap", "pcapng", "nsecpcap"])
 @pytest.mark.parametrize("link", [147, 162, 250])
-def test_captures_that_wireshark_s_tools_wrote_are_read(tmp_path: Path, format: str, link: int) -> None:
+def test_captures_of_wireshark_s_tools_are_read(tmp_path: Path, format: str, link: int) -> None:
     frames = [frame for each in (*RTU, *TEXT) for frame in (each.request_frame, each.frame)]
     rtac = struct.pack(">IIBBH", 0, 0, 2, 0, 0) if link == 250 else b""
     path = tmp_path / f"other.{format}"

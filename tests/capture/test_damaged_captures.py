@@ -67,7 +67,7 @@ def test_an_empty_resolution_is_the_default(tmp_path: Path) -> None:
     assert spans(tmp_path / "a.pcapng") == {"a-0": []}
 
 
-def test_a_clock_that_is_off_by_ages_is_refused(tmp_path: Path) -> None:
+def test_a_clock_with_a_huge_offset_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
     with pytest.raises(CaptureError, match=r"byte 28: its clock is 1099511627776 s off"):
         spans(tmp_path / "a.pcapng")
@@ -119,7 +119,7 @@ def test_an_unreadable_pcapng_file_is_one_sentence(tmp_path: Path, content: byte
     assert str(mistake.value) == f"{path}{sentence}"
 
 
-def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_capture_cut_within_an_interface_is_read_up_to_it(tmp_path: Path) -> None:
     path = tmp_path / "a.pcapng"
     path.write_bytes(described()[:-6])
     with Capture(path) as capture:
@@ -142,7 +142,7 @@ def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes
 @pytest.mark.slow
 @pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, STREAM_ROOM // 700 + 1)])
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
-def test_a_capture_may_hold_more_than_is_heard_at_once(
+def test_a_capture_may_exceed_the_room_of_a_stream(
     tmp_path: Path, format: str, content: bytes, count: int
 ) -> None:
     """More packets than there is room for, or more bytes."""
@@ -158,7 +158,7 @@ def test_a_capture_may_hold_more_than_is_heard_at_once(
 
 
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
-def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) -> None:
+def test_a_cut_capture_is_read_up_to_the_last_whole_packet(tmp_path: Path, format: str) -> None:
     path = write(tmp_path / "a.pcapng", RTU)
     if format == "pcap":
         whole = tmp_path / "a.pcap"
@@ -198,7 +198,7 @@ OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024
 
 
 @pytest.mark.slow
-def test_a_capture_that_is_cut_short_while_it_is_read_is_a_sentence(tmp_path: Path) -> None:
+def test_a_capture_truncated_during_reading_is_a_sentence(tmp_path: Path) -> None:
     """In a separate process: if the file were mapped, reading past its new end would kill the process."""
     path = write(tmp_path / "it.pcapng", RTU * 20)
     code = (

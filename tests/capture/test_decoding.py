@@ -141,7 +141,7 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
 
 @pytest.mark.long
 @pytest.mark.parametrize(("data", "end"), usually((b"\0\7", (7, "ok")), (b"", (None, "no reply"))))
-def test_more_requests_than_are_remembered_are_decoded_all_the_same(
+def test_more_requests_than_are_cached_are_decoded(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:
     """Three quarters of 16384 places are taken; long before, two requests come to want the same."""

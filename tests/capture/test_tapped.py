@@ -246,7 +246,7 @@ def test_uncollected_bytes_are_counted() -> None:
     ]
 
 
-def test_a_capture_has_the_bytes_behind_a_reply_in_noise() -> None:
+def test_a_capture_has_the_noise_around_a_reply() -> None:
     """More than the line keeps: noise, the reply, and noise again in one piece with that."""
     driver, tap = LineDriver(), Tap()
     peer = Peer(least_timeout=0.02, most_timeout=0.2)
@@ -270,7 +270,7 @@ def times_of(packets: bytes) -> list[int]:
     return found
 
 
-def test_frames_have_the_time_of_their_exchange_though_the_clock_was_set_or_the_machine_slept() -> None:
+def test_frames_have_the_times_of_their_exchange_after_clock_changes() -> None:
     driver, tap = LineDriver(), Tap()
     peer = Peer(least_timeout=0.02, most_timeout=0.2)
     asked = []
@@ -341,9 +341,7 @@ def test_an_anomaly_writes_the_minutes_before_and_after_it(
     assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
 
 
-def test_two_that_write_into_one_directory_in_the_same_second_both_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(2):
         one_flight = Flight(tmp_path, monkeypatch)  # both clocks start at the same time
         one_flight.pass_(10, "hall-1: pump-1: bad checksum")
@@ -366,7 +364,7 @@ def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("most_files", [0, -1])
-def test_a_recorder_that_may_keep_no_file_is_refused(tmp_path: Path, most_files: int) -> None:
+def test_a_flight_recorder_without_files_is_refused(tmp_path: Path, most_files: int) -> None:
     with pytest.raises(ValueError, match=f"most_files = {most_files} would keep no capture"):
         FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
 
@@ -381,9 +379,7 @@ def test_memory_stays_within_its_limit(tmp_path: Path, monkeypatch: pytest.Monke
     assert seconds == list(range(seconds[0], 1201))
 
 
-def test_trouble_that_is_not_written_yet_is_written_at_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pending_anomalies_are_written_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch)
     one_flight.pass_(3)
     one_flight.recorder.close()
@@ -435,7 +431,7 @@ class Watched:
         return list(self.watch.check())
 
 
-def test_damaged_and_late_replies_are_trouble() -> None:
+def test_damaged_and_late_replies_are_anomalies() -> None:
     pump = Watched()
     assert pump.told(GOOD) == []
     assert pump.told(GOOD[:-1]) == ["hall-1: pump-1: reply cut short"]
@@ -448,7 +444,7 @@ def test_damaged_and_late_replies_are_trouble() -> None:
     assert pump.told(GOOD) == ["hall-1: pump-1: late reply"]
 
 
-def test_a_drive_that_falls_silent_is_trouble_once() -> None:
+def test_a_drive_that_falls_silent_is_one_anomaly() -> None:
     pump = Watched()
     assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # it was never there
     assert pump.told(GOOD) == []
@@ -456,7 +452,7 @@ def test_a_drive_that_falls_silent_is_trouble_once() -> None:
     assert pump.told(GOOD) == []
 
 
-def test_a_lost_port_is_trouble_once() -> None:
+def test_a_lost_port_is_one_anomaly() -> None:
     pump = Watched()
     open_port = pump.port
     for lost in (SimpleNamespace(lost=True), None):

@@ -74,7 +74,7 @@ def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Pat
 
 
 @pytest.mark.long
-def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> None:
+def test_wireshark_decodes_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> None:
     _, path, rows = captured
     fields = [word for field in FIELDS for word in ("-e", field)]
     command = [require_program("tshark"), "-n", "-r", str(path), "-T", "fields", "-e", "_ws.col.Info"]
@@ -91,7 +91,7 @@ def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> No
 
 
 @pytest.mark.slow
-def test_our_own_reader_has_the_poll_s_values(captured: tuple[Path, Path, list[Row]]) -> None:
+def test_our_reader_has_the_poll_s_values(captured: tuple[Path, Path, list[Row]]) -> None:
     plant, path, polled = captured
     known = load_plant(plant)
     with Capture(path) as capture:

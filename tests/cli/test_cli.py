@@ -30,7 +30,7 @@ def test_help_lists_every_command(run: Run) -> None:
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_no_command_is_a_mistake_that_gets_the_help(run: Run) -> None:
+def test_no_command_prints_the_help(run: Run) -> None:
     assert run()[0] == 2
 
 
@@ -156,7 +156,7 @@ def test_a_mistake_is_a_sentence_and_status_2(run: Run, words: list[str], senten
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_its_version_is_the_package_s(run: Run) -> None:
+def test_the_version_is_the_package_s(run: Run) -> None:
     assert run("--version") == (0, f"multidrop {version('multidrop')}\n", "")
 
 
@@ -173,7 +173,7 @@ def test_a_report_is_a_page_by_its_name(run: Run, tmp_path: Path) -> None:
     assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name must end in .html\n")
 
 
-def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_path: Path) -> None:
+def test_a_line_name_with_a_slash_is_not_simulated(run: Run, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(
         '[[line]]\nname = "hall/1"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
@@ -315,7 +315,7 @@ def test_advice_for_a_program_becomes_a_command_s() -> None:
     assert WriteForbidden("use emergency_stop()").for_command_line() == "use emergency_stop()"
 
 
-def test_a_family_s_advice_stands_in_its_sentence() -> None:
+def test_advice_is_part_of_its_sentence() -> None:
     """Otherwise the command line could not replace its parts."""
     erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
@@ -576,7 +576,7 @@ def test_a_closed_standard_stream_is_not_a_failure(closed: int, words: list[str]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [0, 1, 2])
-def test_no_file_is_opened_in_the_place_of_a_closed_stream(closed: int) -> None:
+def test_no_file_gets_the_descriptor_of_a_closed_stream(closed: int) -> None:
     """A serial port with that descriptor would receive the printed output."""
     code = (
         "import os, multidrop.cli as cli; cli.main(['--version']); os._exit(os.open(os.devnull, os.O_RDONLY))"

@@ -109,9 +109,7 @@ def test_read_as_json(run: Run, port: str) -> None:
     }
 
 
-def test_a_number_that_the_document_does_not_name_is_shown_as_such(
-    run: Run, port: str, toy: SimulatedDrive
-) -> None:
+def test_an_unnamed_number_is_shown_as_a_number(run: Run, port: str, toy: SimulatedDrive) -> None:
     for cell in toy.memory.of(Toy.fault):
         cell.raw = 99
     assert run("read", port, TOY, 1, "fault")[1] == "fault  99  (no name in the manual)\n"
@@ -120,9 +118,7 @@ def test_a_number_that_the_document_does_not_name_is_shown_as_such(
     }
 
 
-def test_a_bit_that_the_document_does_not_name_is_shown_by_its_number(
-    run: Run, port: str, toy: SimulatedDrive
-) -> None:
+def test_an_unnamed_bit_is_shown_by_its_number(run: Run, port: str, toy: SimulatedDrive) -> None:
     for cell in toy.memory.of(Toy.status):
         cell.raw = 0x1101
     assert run("read", port, TOY, 1, "status")[1] == "status  RUNNING, bit 8, bit 12\n"
@@ -156,7 +152,7 @@ class Mute(Drive):
 """
 
 
-def test_a_family_that_cannot_say_its_state_is_stopped_all_the_same(
+def test_a_family_without_a_state_is_stopped(
     run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
 ) -> None:
     (tmp_path / "mute.py").write_text(MUTE)
@@ -333,7 +329,7 @@ def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("log", ["none/audit.jsonl", "."])
-def test_no_log_that_cannot_be_opened_keeps_a_stop_back(
+def test_a_stop_is_sent_if_its_log_cannot_be_opened(
     run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, log: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -586,7 +582,7 @@ def test_a_mistake_beside_the_drive_does_not_prevent_a_stop(
 
 
 @patient
-def test_the_value_of_an_unknown_option_names_no_drive(run: Run, che: Che) -> None:
+def test_the_value_of_an_unknown_option_is_not_a_drive(run: Run, che: Che) -> None:
     received, (port, model, address, option) = che
     status, out, err = run("stop", port, model, "--secnds", 5, address, option)
     assert status == 2

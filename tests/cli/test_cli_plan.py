@@ -210,7 +210,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
 
 
 @pytest.mark.slow
-def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
+def test_poll_prints_both_as_text(run: Run, plant: Path) -> None:
     lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     heading = next(
         at for at, line in enumerate(lines) if line.split() == ["PREDICTED", "WITH", "DELAYS", "MEASURED"]

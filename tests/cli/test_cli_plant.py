@@ -197,9 +197,7 @@ def test_a_start_by_plant_asks_first(run: Run, plant: Path, at: str, toy: Simula
     assert not toy.counters.writes
 
 
-def test_a_drive_that_cannot_identify_itself_is_commanded_only_when_the_plant_says_confirmed(
-    run: Run, plant: Path, at: str
-) -> None:
+def test_an_unidentifiable_drive_is_commanded_only_if_confirmed(run: Run, plant: Path, at: str) -> None:
     start = ("start", plant, "fan-1", at, "--yes")
     status, _, err = run(*start)
     assert (status, "declare confirmed = 1" in err or "confirmed" in err) == (1, True)
@@ -321,7 +319,7 @@ def test_a_simulated_plant_of_another_family_resolves_models_from_the_plant_file
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_every_guard_is_the_one_of_port_model_address(run: Run, plant: Path, at: str, port: str) -> None:
+def test_guards_are_the_same_by_plant_file_and_by_port(run: Run, plant: Path, at: str, port: str) -> None:
     """Both ways to name a drive have the same guards."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),

@@ -198,7 +198,7 @@ def test_poll_ended_by_a_signal_keeps_its_recording(plant: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_poll_tells_a_person_the_same(run: Run, plant: Path) -> None:
+def test_poll_prints_its_summary_as_text(run: Run, plant: Path) -> None:
     lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     assert lines[0].startswith("hall-1: ")
     assert lines[1].split() == ["DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES"]
@@ -252,7 +252,7 @@ def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
         ("none/out.arrows", 1, "cannot be written: No such file or directory"),
     ],
 )
-def test_a_place_that_takes_no_recording_is_a_sentence(
+def test_an_unwritable_recording_is_a_sentence(
     run: Run, plant: Path, tmp_path: Path, out: str, status: int, sentence: str
 ) -> None:
     done, _, err = run("poll", plant, "--seconds", 1, "--out", tmp_path / out)
@@ -368,7 +368,7 @@ def test_the_operator_of_a_demo_never_undoes_a_stop() -> None:
             assert not stopped.energised
 
 
-def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:
+def test_a_demo_replaces_only_the_recording_of_a_demo(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with open_writer(out, {"drives": {"pump-1": {}}}):
         pass

@@ -124,7 +124,7 @@ def test_an_unanswered_request_is_printed_during_silence() -> None:
     os.close(slave)
 
 
-def test_bytes_that_came_while_the_machine_was_busy_are_no_silence(
+def test_late_received_bytes_are_not_silence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The listener had to wait for a processor before it had the request; the reply comes next."""
@@ -212,7 +212,7 @@ def test_a_url_s_port_has_no_write() -> None:
     assert far.close() == b""
 
 
-def test_a_network_that_goes_away_ends_it_with_a_sentence(run: Run) -> None:
+def test_a_lost_network_ends_sniffing_with_a_sentence(run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = f"socket://127.0.0.1:{server.getsockname()[1]}"
         threading.Thread(target=lambda: server.accept()[0].close(), daemon=True).start()
@@ -444,7 +444,7 @@ def test_invalid_arguments_are_one_sentence(
         assert (found, err) == (status, f"multidrop: {sentence}\n")
 
 
-def test_a_port_that_vanishes_ends_it_with_a_sentence(run: Run) -> None:
+def test_a_lost_port_ends_sniffing_with_a_sentence(run: Run) -> None:
     master, slave = pty.openpty()
     threading.Timer(0.3, os.close, [master]).start()
     port = os.ttyname(slave)

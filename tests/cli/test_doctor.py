@@ -287,7 +287,7 @@ def test_a_socket_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
     assert "at the far end" in told
 
 
-def test_who_switches_the_transceiver_is_said_of_a_device_only(run: Run, port: str) -> None:
+def test_rs485_modes_apply_to_devices_only(run: Run, port: str) -> None:
     status, out, err = run("doctor", port, "--rs485", "rts-up")
     assert (status, err) == (0, "")  # a pseudo-terminal has none, and goes without
     for words, sentence in (
@@ -381,7 +381,7 @@ def test_no_delay_is_negative_on_ports_without_bits(run: Run, port: str) -> None
     assert "after its request was handed over (a wire at 9600 8N1 takes 9.4 ms of it)" in told
 
 
-def test_an_echo_is_looked_for_with_the_line_s_settings(run: Run, port: str) -> None:
+def test_the_echo_test_uses_the_line_s_settings(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port, "--baudrate", "19200", "--format", "8E1")
     assert status == 0
     assert "none at 19200 8E1" in out
@@ -469,7 +469,7 @@ def test_a_gateway_s_exception_is_not_the_drive_s_answer(run: Run, responder: An
 
 
 @pytest.mark.slow
-def test_a_gateway_that_says_that_a_drive_is_silent_speaks_its_framing(run: Run) -> None:
+def test_a_gateway_s_exception_proves_its_framing(run: Run) -> None:
     """Nor do bytes without a frame in them prove that it speaks the other one."""
 
     def answered(request: bytes) -> bytes:

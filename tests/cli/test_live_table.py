@@ -49,9 +49,7 @@ def test_a_cut_line_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
     assert narrow.endswith(f"{WIDE_NAME}        1       0  output_freque~\n")
 
 
-def test_a_table_that_a_narrower_terminal_wrapped_is_drawn_over_whole(
-    tmp_path: Path, size: list[int]
-) -> None:
+def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, size: list[int]) -> None:
     """On 40 columns, 51 columns of values take two rows, and 38 columns of the head take one."""
     again = [text[: text.index("J") + 1] for text in drawings(tmp_path, "utf-8", size, 80, 80, 40)[1:]]
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]

@@ -132,7 +132,7 @@ def test_states_come_from_polled_registers(watched: LivePlant) -> None:
     assert [drive.so_far.misses.total() for drive in watched.drives] == [12, 0, 0]
 
 
-def test_a_rested_drive_tells_why_it_is_rested(watched: LivePlant) -> None:
+def test_a_silent_drive_keeps_its_reason(watched: LivePlant) -> None:
     watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
     assert watched.drives[2].why_silent == "no reply"
 
@@ -145,7 +145,7 @@ def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
     assert live.drives[0].state == "turns"
 
 
-def test_flags_of_which_none_is_set_are_no_state(tmp_path: Path) -> None:
+def test_flags_without_a_set_bit_name_no_state(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(
         '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
@@ -195,7 +195,7 @@ def test_history_is_one_register_s(tmp_path: Path) -> None:
 # ---- how it looks ----
 
 
-def test_the_overview_says_it_in_words(watched: LivePlant) -> None:
+def test_the_overview_shows_states_in_words(watched: LivePlant) -> None:
     lines = texts(overview(watched, Position(), (80, 24), NOW, BLOCKS))
     assert lines[0].startswith(" multidrop monitor  hall.toml")
     assert lines[0].endswith("09:30:00 UTC ")
@@ -237,7 +237,7 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
     ]
 
 
-def test_side_reads_take_spare_time_and_hardly_any_of_a_full_line(tmp_path: Path) -> None:
+def test_side_reads_take_little_time_of_a_full_line(tmp_path: Path) -> None:
     for utilisation, share in ((0.2, 0.05), (0.97, 0.03), (1.0, 0.01), (3.0, 0.01)):
         assert 0.03 / (0.03 + pause_s(0.03, utilisation)) == pytest.approx(share)
     assert pause_s(0.001, 0.2) == 0.1  # a fast line
@@ -268,7 +268,7 @@ def test_a_picture_is_drawn_over_the_last_one_and_removed(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @pytest.mark.parametrize("drives", [1, 31, 247])
-def test_it_fills_every_size_exactly(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
+def test_a_picture_fills_every_size(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
     live = LivePlant(a_plant(tmp_path, min(drives, 247)))
     live.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     live.tick(1.0, told(1, 1, 1.0, drives))
@@ -353,7 +353,7 @@ def test_a_wide_overview_has_the_delays(watched: LivePlant) -> None:
     assert " ms " not in lines[4]
 
 
-def test_the_page_says_how_the_drive_answers(watched: LivePlant) -> None:
+def test_the_page_shows_a_drive_s_response_delays(watched: LivePlant) -> None:
     lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
     assert lines[1] == " running      12 missed: bad checksum 9, no reply 3"
     assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
@@ -361,7 +361,7 @@ def test_the_page_says_how_the_drive_answers(watched: LivePlant) -> None:
     assert silent[2] == " 0.0 exchanges/s"
 
 
-def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> None:
+def test_the_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
     at = Position(0, page=True, scrolled=1000)
     lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
     assert lines[9].strip()
@@ -476,9 +476,7 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert poller.asked == asked
 
 
-def test_a_stop_is_sent_where_the_system_gives_no_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_is_sent_if_no_thread_can_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(thread: object) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -585,9 +583,7 @@ def test_a_stop_that_fails_in_any_way_is_seen(
     assert f"stopping drive-1 failed: {words}" in seen(monitor)
 
 
-def test_a_stop_that_has_failed_is_not_said_to_be_repeated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_stop_is_not_reported_as_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
 
     def fail(*details: object) -> None:
@@ -600,7 +596,7 @@ def test_a_stop_that_has_failed_is_not_said_to_be_repeated(
     assert monitor._at.message == "stopping drive-1 failed"
 
 
-def test_leaving_under_a_stop_needs_a_yes_and_waits_for_it(
+def test_leaving_during_a_stop_asks_and_waits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
@@ -646,7 +642,7 @@ def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 # ---- on a terminal ----
 
 
-def test_a_terminal_that_is_gone_is_not_read_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its reads return at once, without bytes or with an error; there may be no signal."""
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)

@@ -20,7 +20,7 @@ ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", 
 
 
 @pytest.mark.parametrize("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
-def test_other_digits_are_no_number(text: str) -> None:
+def test_other_digits_are_not_numbers(text: str) -> None:
     for parse in (plain_number, plain_whole):
         with pytest.raises(ValueError, match="in decimal digits"):
             parse(text)

@@ -37,7 +37,7 @@ def hang_up() -> None:
     signal.raise_signal(signal.SIGHUP)
 
 
-def test_a_closed_terminal_is_noted_and_no_impatience(hangup_is_deadly: None) -> None:
+def test_a_closed_terminal_is_noted_but_does_not_interrupt(hangup_is_deadly: None) -> None:
     with noting_signals() as interruption:
         for _ in range(2):  # a shell and the system send one each
             hang_up()
@@ -55,7 +55,7 @@ def test_a_closed_terminal_interrupts_a_command_once(hangup_is_deadly: None) -> 
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
 
-def test_nohup_goes_on_being_obeyed() -> None:
+def test_nohup_is_respected() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with end_signals_interrupt(), noting_signals() as interruption:

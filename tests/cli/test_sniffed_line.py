@@ -117,7 +117,7 @@ def told_as_said(told: dict[str, Any]) -> Said:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_every_exchange_of_a_mixed_line_is_heard() -> None:
+def test_every_exchange_of_a_mixed_line_is_sniffed() -> None:
     said, told = mastered()
     assert [told_as_said(record) for record in told[:-1]] == said
     assert told[-1]["summary"] == {
@@ -175,7 +175,7 @@ def frames(pair: tuple[FrameSpan, ...]) -> tuple[str, ...]:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
+def test_exchanges_between_damage_are_sniffed() -> None:
     damage = Damage()
     said, told = mastered(damage)
     exchanges = damage.exchanges()

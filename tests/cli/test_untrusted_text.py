@@ -41,7 +41,7 @@ def test_printable_text_stays_unchanged() -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_gateway_s_log_has_one_line_for_whoever_asks(capfd: pytest.CaptureFixture[str], form: str) -> None:
+def test_a_gateway_s_log_escapes_names_of_callers(capfd: pytest.CaptureFixture[str], form: str) -> None:
     """A caller's address may come from a proxy, and a drive's name from an MQTT topic."""
     with _logging(form, logging.INFO):
         logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")

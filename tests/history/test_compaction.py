@@ -52,7 +52,7 @@ def check(folder: Path, rows: list[Row]) -> None:
 
 
 @pytest.mark.slow
-def test_a_parquet_file_has_the_rows_of_its_segment_by_drive_and_time(tmp_path: Path) -> None:
+def test_a_parquet_file_has_its_segment_s_rows(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 500)
     record(tmp_path, [rows, random_rows(2, NOON + DAY, 5)])
     compact(tmp_path, 2)
@@ -90,7 +90,7 @@ def test_tens_equal_those_of_plain_python(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_hours_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
+def test_past_hours_become_one_file_of_tens(tmp_path: Path) -> None:
     begins = [NOON + 1200 * SECOND * number for number in range(5)]
     record(tmp_path, [random_rows(number, begin, 20) for number, begin in enumerate(begins)])
     compact(tmp_path, 6)
@@ -103,7 +103,7 @@ def test_hours_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
+def test_past_days_become_one_file_of_tens(tmp_path: Path) -> None:
     rows = segments()
     record(tmp_path, rows)
     compact(tmp_path, 6)
@@ -114,9 +114,7 @@ def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_one_database_compacts_all_and_none_is_opened_without_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_database_is_opened_only_for_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
 
     def noted(memory: str, spill: Path) -> Any:
@@ -154,7 +152,9 @@ class Breaker:
 # Those that are always tried, 23 apart, are other ones in each, and of a merge.
 @pytest.mark.long
 @pytest.mark.parametrize("apart", usually(23, 3))
-def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: int) -> None:
+def test_compaction_interrupted_before_each_step_loses_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: int
+) -> None:
     rows = segments()
     expected = [row for some in rows for row in some]
     for calls in range(0, 200, apart):
@@ -183,7 +183,7 @@ def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_killed_in_the_middle(tmp_path: Path) -> None:
+def test_compaction_killed_at_any_step_loses_no_row(tmp_path: Path) -> None:
     rows = segments()
     record(tmp_path, rows)
     expected = [row for some in rows for row in some]
@@ -214,7 +214,7 @@ def test_one_process_compacts_at_a_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_damaged_segment_is_read_as_far_as_it_can_be_and_kept(
+def test_the_readable_part_of_a_damaged_segment_is_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = segments()
@@ -279,7 +279,7 @@ def test_a_full_disk_leaves_the_segment(tmp_path: Path) -> None:
     check(tmp_path, [row for some in rows for row in some])
 
 
-def test_it_asks_for_the_lowest_priority_and_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compaction_runs_at_the_lowest_priority_if_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[object] = []
 
     def forbidden(*given: object) -> None:

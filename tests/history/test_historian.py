@@ -35,7 +35,7 @@ def test_all_mistakes_of_its_table_at_once() -> None:
     HistorySettings()
 
 
-def test_a_folder_that_cannot_be_is_one_sentence(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_one_sentence(tmp_path: Path) -> None:
     """Not even root may create a folder in /sys."""
     inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
     with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
@@ -49,7 +49,7 @@ def test_a_number_without_end_is_null() -> None:
     assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
 
 
-def test_a_great_answer_is_refused_and_none_is_made_in_the_loop(
+def test_large_answers_are_refused_and_made_outside_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stop comes through the loop: it would wait for whatever is reckoned there."""
@@ -78,7 +78,7 @@ def test_a_great_answer_is_refused_and_none_is_made_in_the_loop(
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_no_export_is_begun_in_the_loop(tmp_path: Path, kind: str) -> None:
+def test_no_export_starts_in_the_loop(tmp_path: Path, kind: str) -> None:
     """Reading the metadata of thousands of files takes seconds."""
     readers: list[int] = []
 
@@ -114,7 +114,7 @@ def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_it_records_and_answers(tmp_path: Path) -> None:
+def test_the_historian_records_and_answers(tmp_path: Path) -> None:
     async def live() -> None:
         inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
         part = build(HistorySettings(folder="kept"), inside)
@@ -151,7 +151,7 @@ def test_it_records_and_answers(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_duckdb_is_loaded_before_anybody_asks(tmp_path: Path) -> None:
+def test_duckdb_is_loaded_before_the_first_query(tmp_path: Path) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     serve = "[serve]\nlisten = '127.0.0.1:0'\n[serve.history]\n"
     with simulated_plant(tmp_path, serve) as path, serving(path) as (process, _):

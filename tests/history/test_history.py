@@ -56,7 +56,7 @@ def flat(rows: list[list[Row]]) -> list[Row]:
 
 @pytest.mark.slow
 @COMPACTED
-def test_all_rows_in_the_order_of_recording(folder: Path, rows: list[list[Row]]) -> None:
+def test_rows_come_in_the_order_of_recording(folder: Path, rows: list[list[Row]]) -> None:
     with History(folder) as history:
         found = history.read()
         assert found.metadata == METADATA
@@ -102,7 +102,7 @@ def test_buckets_equal_those_of_plain_python(folder: Path, rows: list[list[Row]]
 
 @pytest.mark.slow
 @COMPACTED
-def test_gaps_are_gaps(folder: Path) -> None:
+def test_buckets_without_rows_are_gaps(folder: Path) -> None:
     with History(folder) as history:
         found = history.buckets("pump-1.speed", NOON - 600 * SECOND, NOON + DAY, 10_000)["pump-1.speed"]
         nothing = history.buckets("pump-9.speed", NOON, NOON + DAY, 10)["pump-9.speed"]
@@ -148,7 +148,7 @@ def test_a_table(folder: Path, rows: list[list[Row]]) -> None:
     assert frame.value.dropna().tolist() == [row.value for row in mine if row.value is not None]
 
 
-def test_moments(tmp_path: Path) -> None:
+def test_moments_are_ns_or_datetimes(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 300)
     record(tmp_path, [rows])
     moment = datetime(2026, 11, 21, 12, 0, 20, tzinfo=UTC)
@@ -162,7 +162,7 @@ def test_moments(tmp_path: Path) -> None:
             history.read(None, 1.5)  # type: ignore[arg-type]
 
 
-def test_mistakes(tmp_path: Path) -> None:
+def test_invalid_queries_are_errors(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         History(tmp_path / "none")
     with History(tmp_path) as history:
@@ -224,7 +224,7 @@ def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_files_that_are_replaced_under_a_reader(tmp_path: Path) -> None:
+def test_replaced_files_lose_no_row_for_a_reader(tmp_path: Path) -> None:
     """Compacted between its listing and its reading: each row comes once all the same."""
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(4)]
@@ -244,7 +244,7 @@ def test_files_that_are_replaced_under_a_reader(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_names_that_come_later(tmp_path: Path) -> None:
+def test_later_names_are_found(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 60)
     later = [row._replace(drive="насос, «новый»", register="torque") for row in random_rows(2, NOON, 60)]
     record(tmp_path, [[*rows, *later], later])
@@ -266,7 +266,7 @@ def test_a_recording_in_segments_of_poll(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
+def test_a_damaged_segment_hides_no_other(tmp_path: Path) -> None:
     rows = [
         random_rows(number, NOON + number * 60 * SECOND, count) for number, count in enumerate((20, 120, 20))
     ]
@@ -301,7 +301,7 @@ def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> No
             assert history.damage == told
 
 
-def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(2)]
     record(tmp_path, rows)
@@ -326,7 +326,7 @@ def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [0, 150, 100_000], ids="{} rows are kept".format)
-def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
+def test_plots_of_a_growing_segment_have_all_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     """Repeated queries for other series and ranges; some start earlier or much later."""
@@ -348,7 +348,7 @@ def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
-def test_unknown_names_fill_no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_names_are_not_cached_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))

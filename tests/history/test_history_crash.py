@@ -65,7 +65,7 @@ def total_of_tens(history: History, runs: int) -> int:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", usually(3, 8, 200))
-def test_kills_at_any_moment(tmp_path: Path, kills: int) -> None:
+def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int) -> None:
     dice = random.Random(kills)
     written: dict[str, int] = {}
     for run in range(kills):

@@ -57,9 +57,7 @@ def some(number: int, drive: int = 0) -> object:
     return batch(NAMES, drive, range(number * 20, number * 20 + 20), NOON, SECOND)
 
 
-def test_all_that_it_took_is_there_after_it_closed(
-    tmp_path: Path, writers: Callable[..., HistoryWriter]
-) -> None:
+def test_closing_writes_all_rows(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
     writer = writers(tmp_path / "new" / "history")
     taken = [some(number, number % 2) for number in range(50)]
     for one in taken:
@@ -74,7 +72,7 @@ def test_all_that_it_took_is_there_after_it_closed(
     assert writer.state().dropped == 20
 
 
-def test_batches_of_two_pollers(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
     """The two pollers use the same codes for different names."""
     writer = writers(tmp_path)
     taken = [
@@ -103,7 +101,7 @@ def test_the_writer_keeps_no_memory_of_the_core(
         assert rows_in(history) == expected
 
 
-def test_another_plant_begins_a_segment(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_another_plant_starts_a_segment(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
     writer = writers(tmp_path)
     writer.take(some(0))
     until(lambda: writer.state().rows == 20)
@@ -172,7 +170,7 @@ def test_a_hanging_disk_delays_no_polling(
 
 
 @pytest.mark.long
-def test_polling_and_stops_go_on_beside_a_full_disk(
+def test_a_full_disk_delays_neither_polling_nor_stops(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:
     writer = writers(tmp_path / "history")
@@ -201,7 +199,7 @@ def test_one_process_records_at_a_time(tmp_path: Path, writers: Callable[..., Hi
         HistoryWriter(tmp_path, METADATA)
 
 
-def test_a_mistake_of_ours_does_not_end_the_recording(
+def test_an_exception_does_not_end_the_recording(
     tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrong(*_: object) -> object:
@@ -237,7 +235,7 @@ def test_closed_segments_are_compacted_and_old_files_removed(
     until(lambda: {file.first for file in parquet_files(tmp_path / "tens")} == {4})
 
 
-def test_the_oldest_of_all_kinds_go_when_all_take_too_much(
+def test_the_oldest_files_beyond_the_size_are_removed(
     tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("rows", "tens", "damaged"):
@@ -294,7 +292,7 @@ def test_a_child_may_say_any_bytes(
     until(is_told)
 
 
-def test_names_of_files() -> None:
+def test_file_names_have_numbers_and_times() -> None:
     name = file_name(7, 7, NOON + 1, NOON + 600 * SECOND)
     assert name == "00000007.20261121T120000Z-20261121T121000Z.parquet"
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"

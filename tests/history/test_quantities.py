@@ -75,7 +75,7 @@ def of(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [300, 30])
-def test_two_units_are_no_series(tmp_path: Path, how: str, points: int) -> None:
+def test_a_series_has_one_unit(tmp_path: Path, how: str, points: int) -> None:
     recorded(tmp_path, AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path, how, 4)
     found, other = of(tmp_path, points)
@@ -85,7 +85,7 @@ def test_two_units_are_no_series(tmp_path: Path, how: str, points: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_range_of_one_unit_has_that(tmp_path: Path, how: str) -> None:
+def test_a_range_with_one_unit_has_that_unit(tmp_path: Path, how: str) -> None:
     recorded(tmp_path, AMPERE, PERCENT)
     kept(tmp_path, how, 2)
     before, _ = of(tmp_path, 40, end=NOON + 40 * SECOND)
@@ -104,7 +104,7 @@ def test_a_range_of_one_unit_has_that(tmp_path: Path, how: str) -> None:
         ({}, AMPERE, ("A", 30, ("",))),
     ],
 )
-def test_what_is_one_quantity(
+def test_equal_units_or_names_are_one_quantity(
     tmp_path: Path, first: dict[str, Any], second: dict[str, Any], told: tuple[str, int, tuple[str, ...]]
 ) -> None:
     recorded(tmp_path, first, second)
@@ -126,7 +126,7 @@ def test_empty_metadata_separates_no_quantities() -> None:
     }
 
 
-def test_rows_that_were_taken_before_another_plant_are_in_the_segment_before(tmp_path: Path) -> None:
+def test_rows_before_a_changed_plant_are_in_the_earlier_segment(tmp_path: Path) -> None:
     writer = HistoryWriter(tmp_path, {"drives": {"pump-1": {"registers": {"speed": AMPERE}}}})
     names = Names(["pump-1"])
     for first, unit in ((0, PERCENT), (10, AMPERE), (20, AMPERE)):
@@ -152,7 +152,7 @@ PARTED = {SERIES: {10.0, 1000.0}, f"{SERIES} [A]": {1.0, 100.0}, OTHER: {1.0, 10
 
 
 @pytest.mark.long
-def test_two_units_are_no_column(tmp_path: Path, how: str) -> None:
+def test_a_column_has_one_unit(tmp_path: Path, how: str) -> None:
     """Rows of another quantity are in a column that says so, wherever they are read or written to."""
     (tmp_path / "h").mkdir()
     recorded(tmp_path / "h", AMPERE, PERCENT, AMPERE, PERCENT)

@@ -119,7 +119,7 @@ def test_a_file_that_is_not_a_recording_is_an_error(tmp_path: Path) -> None:
         multidrop.open_recording(3)  # type: ignore[arg-type]
 
 
-def test_steps_of_a_script_are_in_a_module_of_their_own() -> None:
+def test_script_steps_are_public() -> None:
     assert next(steps.read(Toy.output_current)) == Read(Toy.output_current)
     assert next(steps.wait(2.0)) == Wait(2.0)
 

@@ -58,7 +58,7 @@ def rows(reader: RecordingReader) -> list[Row]:
 
 
 @every_format
-def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
+def test_rows_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None:
     reader = open_recording(record(tmp_path / f"a{suffix}"))
     assert reader.metadata == METADATA
     assert reader.truncated == 0
@@ -67,7 +67,7 @@ def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
 
 
 @every_format
-def test_empty_recording(tmp_path: Path, suffix: str) -> None:
+def test_an_empty_recording_is_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     open_writer(path, {}).close()
     assert rows(open_recording(path)) == []
@@ -88,7 +88,7 @@ def test_batches_that_are_read_are_arrow_too(tmp_path: Path, suffix: str) -> Non
 
 @pytest.mark.slow
 @every_format
-def test_a_recording_never_takes_the_place_of_another(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_never_replaces_another(tmp_path: Path, suffix: str) -> None:
     path = record(tmp_path / f"a{suffix}")
     sentence = rf"a{suffix} exists already: name another file, or remove it first$"
     with pytest.raises(ValueError, match=sentence):
@@ -236,7 +236,7 @@ def test_csv_text_is_exact(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "a.csv.json").read_text(encoding="utf-8")) == METADATA
 
 
-def test_csv_without_its_metadata_is_read_all_the_same(tmp_path: Path) -> None:
+def test_csv_without_metadata_is_read(tmp_path: Path) -> None:
     path = record(tmp_path / "a.csv")
     (tmp_path / "a.csv.json").unlink()
     reader = open_recording(path)
@@ -256,7 +256,9 @@ MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
 @every_format
 @settings(max_examples=examples(60), deadline=None)
 @given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
-def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: list[Row]) -> None:
+def test_any_rows_are_read_as_they_were_written(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, some: list[Row]
+) -> None:
     assert rows_of(pa.record_batch(from_rows(some))) == some
     path = tmp_path_factory.mktemp("any") / f"a{suffix}"
     with open_writer(path, {}) as writer:
@@ -340,7 +342,7 @@ def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -
 @pytest.mark.uncounted
 @pytest.mark.slow
 @pytest.mark.long
-def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> None:
+def test_converting_needs_memory_for_few_batches(tmp_path: Path) -> None:
     """A conversion of 13 MB needs less than half that memory at its peak."""
     tracemalloc = pytest.importorskip("tracemalloc")
     with open_writer(tmp_path / "a.arrows", {}) as writer:
@@ -380,7 +382,7 @@ DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".p
 
 @every_format
 @pytest.mark.parametrize("target", FORMATS)
-def test_half_a_conversion_is_left_nowhere(tmp_path: Path, suffix: str, target: str) -> None:
+def test_a_failed_conversion_leaves_no_file(tmp_path: Path, suffix: str, target: str) -> None:
     """The error is about the recording, in words of ours."""
     path = record(tmp_path / f"a{suffix}")
     content = path.read_bytes()
@@ -417,7 +419,7 @@ def test_an_interrupted_conversion_leaves_no_file(
 
 @table("act", [lambda path: open_writer(path, {}), open_recording, repair])
 @table("name", ["a.xlsx", "a", "arrows", "a.arrow"])
-def test_unknown_suffix(tmp_path: Path, act: object, name: str) -> None:
+def test_an_unknown_suffix_is_refused(tmp_path: Path, act: object, name: str) -> None:
     assert callable(act)
     with pytest.raises(ValueError, match=rf"{name}: a recording's name must end in \.arrows, \.csv"):
         act(tmp_path / name)
@@ -466,7 +468,7 @@ def test_neither_arrows_nor_csv_need_pyarrow(
 # ---- dictionaries ----
 
 
-def test_recordings_from_before_are_read_and_converted(tmp_path: Path) -> None:
+def test_recordings_of_earlier_versions_are_read(tmp_path: Path) -> None:
     batches = (example(), counting(2000), counting(500, 2000))
     path = record_as_before(tmp_path / "a.arrows", *batches, metadata=json.dumps(METADATA).encode())
     reader = open_recording(path)
@@ -508,7 +510,7 @@ class Grown:
 
 
 @pytest.mark.long
-def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path) -> None:
+def test_every_reader_gets_names_of_later_drives(tmp_path: Path) -> None:
     """polars and nanoarrow read no deltas, so each changed dictionary is written again."""
     polars = pytest.importorskip("polars", reason="needs polars")
     nanoarrow = pytest.importorskip("nanoarrow")
@@ -569,7 +571,7 @@ def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
     assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == [*batch, *batch]
 
 
-def test_a_row_takes_35_bytes_at_most(tmp_path: Path) -> None:
+def test_a_row_takes_at_most_35_bytes(tmp_path: Path) -> None:
     """31 drives with 10 values at 10 Hz, in batches of a tenth of a second; some rows are misses."""
     drives = Names([f"pump-{number}" for number in range(31)])
     registers = Names([f"some_register_{number}" for number in range(10)])

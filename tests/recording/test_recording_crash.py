@@ -79,7 +79,7 @@ def test_random_cuts_of_arrows_lose_only_incomplete_batches(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_a_cut_between_dictionary_and_rows_is_readable_by_all(tmp_path: Path) -> None:
+def test_a_cut_between_dictionary_and_rows_is_readable(tmp_path: Path) -> None:
     """Dictionaries precede their batch: a cut may leave some dictionaries without a batch."""
     polars = pytest.importorskip("polars", reason="needs polars")
     path = tmp_path / "a.arrows"
@@ -103,7 +103,7 @@ def test_a_cut_between_dictionary_and_rows_is_readable_by_all(tmp_path: Path) ->
         assert polars.read_ipc_stream(path)["drive"].to_list() == expected
 
 
-def test_names_of_a_batch_that_had_no_room_are_written_with_the_next(tmp_path: Path) -> None:
+def test_names_of_a_failed_batch_are_written_with_the_next(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         for room in (0, 100, 700):
@@ -114,7 +114,7 @@ def test_names_of_a_batch_that_had_no_room_are_written_with_the_next(tmp_path: P
         assert rows_of(stream.read_all()) == list(counting(ROWS))
 
 
-def test_a_recording_behind_another_is_not_read_as_its_end(tmp_path: Path) -> None:
+def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
     """Two recordings, one behind the other: codes of the second mean other names."""
     first, second = tmp_path / "a.arrows", tmp_path / "b.arrows"
     record(first, 2)
@@ -126,7 +126,7 @@ def test_a_recording_behind_another_is_not_read_as_its_end(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("part", usually(256, 1))
-def test_names_that_would_fill_the_memory_are_damage(
+def test_names_that_exceed_memory_are_damage(
     tmp_path: Path, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Scale the limit and the data down by the same factor."""
@@ -160,7 +160,7 @@ def test_no_drive_has_a_name_of_two_lines() -> None:
         Toy(1, name="pump\n1")
 
 
-def test_long_torn_line_of_csv(tmp_path: Path) -> None:
+def test_a_long_incomplete_line_of_csv_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     record(path, 1)
     with path.open("ab") as file:
@@ -184,7 +184,7 @@ def test_repaired_recording_is_opened_by_pyarrow_and_polars(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_whole_recording_is_left_alone_by_repair(tmp_path: Path, suffix: str) -> None:
+def test_repair_leaves_a_whole_recording_unchanged(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     record(path, 2)
     before = path.read_bytes()
@@ -192,7 +192,7 @@ def test_whole_recording_is_left_alone_by_repair(tmp_path: Path, suffix: str) ->
     assert path.read_bytes() == before
 
 
-def test_end_marker_of_other_writers_is_not_torn(tmp_path: Path) -> None:
+def test_an_end_marker_is_not_a_truncated_end(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     table = pa.table(example())
     with pa.ipc.new_stream(path, table.schema) as stream:
@@ -220,7 +220,7 @@ for at in count():
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
-def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
+def test_a_killed_writer_keeps_all_written_batches(tmp_path: Path, suffix: str) -> None:
     """SIGKILL at full speed: every batch whose write had returned is there."""
     for until in (1, examples(160)):
         path = tmp_path / f"{until}{suffix}"
@@ -277,7 +277,7 @@ except RecordingError as failure:
 @pytest.mark.slow
 @pytest.mark.uncounted
 @pytest.mark.parametrize("suffix", usually(*FORMATS))
-def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
+def test_a_disk_that_becomes_full_keeps_the_rows_before(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     command = [
         sys.executable,
@@ -303,7 +303,7 @@ def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_disk_that_is_full_from_the_beginning(tmp_path: Path, suffix: str) -> None:
+def test_a_full_disk_refuses_a_recording(tmp_path: Path, suffix: str) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     path = tmp_path / f"a{suffix}"
@@ -315,7 +315,7 @@ def test_disk_that_is_full_from_the_beginning(tmp_path: Path, suffix: str) -> No
 
 
 @growing
-def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str) -> None:
+def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: str) -> None:
     """A batch that did not fit leaves no half of itself between the others."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
@@ -331,7 +331,7 @@ def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_read_only_directory(tmp_path: Path, suffix: str) -> None:
+def test_a_read_only_directory_is_one_sentence(tmp_path: Path, suffix: str) -> None:
     open_writer(tmp_path / f"a{suffix}", METADATA).close()  # imports before rights are dropped
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
@@ -342,14 +342,14 @@ def test_read_only_directory(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_directory_that_is_not_there(tmp_path: Path, suffix: str) -> None:
+def test_a_missing_directory_is_an_error(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(RecordingError, match="No such file or directory"):
         open_writer(tmp_path / "none" / f"a{suffix}", METADATA)
     with pytest.raises(FileNotFoundError):
         open_recording(tmp_path / f"a{suffix}")
 
 
-def test_a_torn_piece_that_could_not_be_cut_off_is_before_the_next(
+def test_an_incomplete_batch_is_cut_off_before_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk fails for a while, for cutting too."""
@@ -405,7 +405,7 @@ class Halving:
 
 
 @pytest.mark.parametrize("room", range(0, 120, 10))
-def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> None:
+def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None:
     """No .csv.json is incomplete, wherever the disk becomes full."""
     path = tmp_path / "a.csv"
     whole = {"plant": "p" * 60}
@@ -423,7 +423,7 @@ def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> 
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_clock_that_is_set_back_an_hour(tmp_path: Path, suffix: str) -> None:
+def test_rows_keep_their_order_if_the_clock_is_set_back(tmp_path: Path, suffix: str) -> None:
     """Rows stay in the order of monotonic_ns; `time` repeats the clock."""
     path = tmp_path / f"a{suffix}"
     offsets = (UTC_0, UTC_0 - 3600 * SECOND)
@@ -452,7 +452,7 @@ GARBAGE = {
 
 @table("suffix", FORMATS)
 @table("content", GARBAGE.values(), ids=GARBAGE)
-def test_garbage(tmp_path: Path, suffix: str, content: bytes) -> None:
+def test_garbage_is_not_a_recording(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(content)
     for act in (open_recording, repair):
@@ -462,7 +462,7 @@ def test_garbage(tmp_path: Path, suffix: str, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".parquet"])
-def test_other_columns(tmp_path: Path, suffix: str) -> None:
+def test_other_columns_are_not_a_recording(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     other = pa.table({"time": [1], "value": [0.5]})
     if suffix == ".arrows":

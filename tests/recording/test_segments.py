@@ -55,7 +55,7 @@ def read(path: Path) -> list[Row]:
     return [found for batch in open_recording(path) for found in batch]
 
 
-def test_a_segment_begins_when_the_last_is_old_enough(tmp_path: Path, hand: Hand) -> None:
+def test_a_segment_starts_when_the_last_is_old_enough(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
         assert names(tmp_path) == []  # no rows, no file
         for number in range(5):
@@ -71,7 +71,7 @@ def test_a_segment_begins_when_the_last_is_old_enough(tmp_path: Path, hand: Hand
         assert pa.ipc.open_stream(path.read_bytes()).read_all().num_rows in (3, 6)
 
 
-def test_numbers_go_on_after_a_restart_whatever_the_clock_says(tmp_path: Path, hand: Hand) -> None:
+def test_segment_numbers_grow_after_a_restart(tmp_path: Path, hand: Hand) -> None:
     for number in range(3):
         with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
             writer.write(rows(number))
@@ -82,7 +82,7 @@ def test_numbers_go_on_after_a_restart_whatever_the_clock_says(tmp_path: Path, h
     assert names(tmp_path)[-1] == "run.00000071.arrows"
 
 
-def test_other_files_are_none_of_ours(tmp_path: Path) -> None:
+def test_other_files_are_not_segments(tmp_path: Path) -> None:
     for name in ("run.arrows", "run.1.arrows", "other.00000009.arrows", "run.00000009.arrows.bak"):
         (tmp_path / name).write_bytes(b"precious")
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60, keep=1.0, most=1000) as writer:
@@ -91,7 +91,7 @@ def test_other_files_are_none_of_ours(tmp_path: Path) -> None:
     assert len([*tmp_path.iterdir()]) == 6  # and the lock
 
 
-def test_other_metadata_begins_a_segment(tmp_path: Path) -> None:
+def test_other_metadata_starts_a_segment(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
         writer.write(rows(0))
         writer.rotate({"plant": "other.toml"})
@@ -112,7 +112,7 @@ def test_one_process_records_at_a_time(tmp_path: Path) -> None:
     SegmentWriter(path, ABOUT, every=60).close()
 
 
-def test_only_arrows(tmp_path: Path) -> None:
+def test_segments_are_arrows_files(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"the name of a recording in segments must end in \.arrows"):
         SegmentWriter(tmp_path / "run.csv", ABOUT, every=60)
     with pytest.raises(RecordingError, match="cannot be written: No such file or directory"):
@@ -120,7 +120,7 @@ def test_only_arrows(tmp_path: Path) -> None:
     assert [*tmp_path.iterdir()] == []
 
 
-def test_half_a_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> None:
+def test_an_incomplete_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "run.arrows"
     with SegmentWriter(path, ABOUT, every=60) as writer:
         writer.write(rows(0))
@@ -131,7 +131,7 @@ def test_half_a_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> None:
     assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # it refuses half a batch
 
 
-def test_more_than_a_batch_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_longer_damaged_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments_module, "MOST_CUT", 100)
     path = tmp_path / "run.arrows"
     with SegmentWriter(path, ABOUT, every=60) as writer:
@@ -154,7 +154,7 @@ def test_a_full_disk_is_reported_and_the_segment_continues(tmp_path: Path) -> No
     assert read(path) == [*rows(0), *rows(2)]
 
 
-def test_a_segment_that_could_not_begin_leaves_no_file_and_its_number_is_not_given_again(
+def test_a_failed_segment_leaves_no_file_and_its_number_is_skipped(
     tmp_path: Path,
 ) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
@@ -181,7 +181,7 @@ def test_old_segments_are_removed_when_a_segment_starts(tmp_path: Path, hand: Ha
     assert names(tmp_path) == ["run.00000008.arrows"]
 
 
-def test_the_oldest_go_when_all_take_too_much(tmp_path: Path, hand: Hand) -> None:
+def test_the_oldest_segments_beyond_the_size_are_removed(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=DAY, most=10_000) as writer:
         for number in range(20):
             writer.write(rows(number))
@@ -193,7 +193,7 @@ def test_the_oldest_go_when_all_take_too_much(tmp_path: Path, hand: Hand) -> Non
     assert 2 <= len(kept) <= 10_000 // sizes[0] + 1
 
 
-def test_the_segment_that_is_written_is_never_removed(tmp_path: Path, hand: Hand) -> None:
+def test_the_current_segment_is_never_removed(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=DAY, keep=1.0, most=1000) as writer:
         writer.write(rows(0))
         hand.utc += 100 * DAY
@@ -202,7 +202,7 @@ def test_the_segment_that_is_written_is_never_removed(tmp_path: Path, hand: Hand
         assert names(tmp_path) == ["run.00000002.arrows"]
 
 
-def test_outlived() -> None:
+def test_outlived_files_are_removed() -> None:
     files = [StoredFile(Path(str(number)), number, number * 10.0, 100) for number in (3, 1, 2, 4)]
 
     def gone(now: float, keep: float | None, most: int | None) -> list[int]:
@@ -247,7 +247,7 @@ def test_ages(text: str, seconds: float) -> None:
 @table(
     "text", ["", "30", "-1 h", "1 month", "0.5 s", "1 hs", "\u0661 h", "nan s", "1e9 weeks", 30, None, b"1 h"]
 )
-def test_no_ages(text: str) -> None:
+def test_invalid_ages_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r'invalid time .*: write 1 s to 100 years, such as "10 min"'):
         parse_age(text)
 
@@ -258,6 +258,6 @@ def test_sizes(text: str, size: int) -> None:
 
 
 @table("text", ["", "20", "20 gb", "-1 GB", "0.5 kB", "1 GiB", 20, None, b"1 GB"])
-def test_no_sizes(text: str) -> None:
+def test_invalid_sizes_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r'invalid size .*: write 1 kB or more, such as "500 MB"'):
         parse_size(text)

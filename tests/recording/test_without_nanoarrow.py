@@ -19,7 +19,7 @@ def multidrop(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_it_polls_and_records(tmp_path: Path) -> None:
+def test_polling_and_recording_need_no_nanoarrow(tmp_path: Path) -> None:
     ran = multidrop("demo", "--seconds", "1", "--out", "run.arrows", folder=tmp_path)
     assert ran.returncode == 0, ran.stderr
     rows = pyarrow.ipc.open_stream(tmp_path / "run.arrows").read_all().num_rows
@@ -28,7 +28,7 @@ def test_it_polls_and_records(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_it_records_as_text(tmp_path: Path) -> None:
+def test_csv_recordings_need_no_nanoarrow(tmp_path: Path) -> None:
     ran = multidrop("demo", "--seconds", "1", "--out", "run.csv", folder=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert len((tmp_path / "run.csv").read_text().splitlines()) > 5

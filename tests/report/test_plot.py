@@ -45,7 +45,7 @@ def _imported() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.01, 0.3, 2, 7, 90, 4000, 200_000])
-def test_no_two_ticks_of_the_time_say_the_same(seconds: float) -> None:
+def test_ticks_of_the_time_axis_differ(seconds: float) -> None:
     from multidrop.report.style import day, label_time, new_figure
 
     figure, (axes,) = new_figure([2.0])
@@ -134,7 +134,7 @@ def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
     assert "насос" in report_page(loaded)
 
 
-def test_a_fault_is_a_span_that_misses_do_not_end(look: Recording) -> None:
+def test_misses_do_not_end_a_fault(look: Recording) -> None:
     (span,) = look.of("pump", "fault")[0].faults()
     assert span.what == "OVERHEAT"
     assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
@@ -174,7 +174,7 @@ def test_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Pa
     assert pump.seconds * 1e3 == pytest.approx([10.0] * 10 + [30.0])
 
 
-def test_noise_that_comes_with_speed_is_seen(look: Recording) -> None:
+def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
     shares = miss_shares(look, "pump")
     assert shares is not None
     slow = shares[1][shares[0] < 28]
@@ -400,7 +400,7 @@ def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None
     }
 
 
-def test_no_line_and_no_state_leads_across_a_pause(tmp_path: Path) -> None:
+def test_lines_and_states_end_at_a_pause(tmp_path: Path) -> None:
     """A suspended process records no rows, not even misses. A changed rate is not a pause."""
     times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]
     rows = [row(at, "pump", name, 1.0) for at in times for name in ("output_frequency", "status")]
@@ -440,7 +440,7 @@ def test_a_constant_value_has_a_wide_axis(tmp_path: Path) -> None:
     assert low <= 0 < 50 < high
 
 
-def test_zero_is_there_if_it_is_near(tmp_path: Path) -> None:
+def test_a_near_zero_is_on_the_axis(tmp_path: Path) -> None:
     for least, bottom in ((10.0, 0.0), (45.0, None)):
         rows = [row(at, "pump", "output_frequency", value) for at, value in enumerate((least, 50.0))]
         (axes,) = plot(load(record(tmp_path / f"{least:g}.arrows", rows)))[0].axes
@@ -513,7 +513,7 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
     assert of_bit == of_drives[1]
 
 
-def test_a_state_of_one_row_is_seen(tmp_path: Path) -> None:
+def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
     """A pale bar of a pixel is not, without an edge."""
     rows = [row(at, "che", "status", 3 if at == 500 else None) for at in range(1000)]
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -548,7 +548,7 @@ def test_an_unnamed_number_is_not_a_sum_of_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
+def test_lanes_without_room_in_a_panel_are_counted(tmp_path: Path) -> None:
     bits = {f"B{bit}": 1 << bit for bit in range(16)}
     drives = [f"yd{number}" for number in range(80)]
     meaning = {"unit": "", "values": bits, "bits": True}
@@ -748,7 +748,7 @@ LARGEST_VALUES = [1e308, float("-inf"), 1e149]
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", usually(*LARGEST_VALUES))
 @pytest.mark.parametrize("register", usually("output_frequency", "fault", "output_current"))
-def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: float) -> None:
+def test_values_too_large_for_an_axis_are_counted(tmp_path: Path, register: str, value: float) -> None:
     drive = "fan" if register == "output_current" else "pump"
     rows = [row(at, drive, register, 1.0 if at % 2 else value) for at in range(40)]
     rows += [row(at + 0.5, drive, register, None, "no reply") for at in range(40)]
@@ -761,7 +761,7 @@ def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: floa
 
 
 @pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
-def test_times_that_no_calendar_has_are_a_sentence(run: Run, tmp_path: Path, time: int) -> None:
+def test_times_outside_the_calendar_are_a_sentence(run: Run, tmp_path: Path, time: int) -> None:
     rows = [
         row(0, "pump", "output_frequency", 1.0),
         row(1, "pump", "output_frequency", 1.0)._replace(time_ns=time),

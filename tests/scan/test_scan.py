@@ -169,7 +169,7 @@ def test_the_usual_settings_come_first() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("format", ["8N1", "8E1"])
-def test_a_sweep_takes_little_more_than_its_silences_and_time_outs(format: str) -> None:
+def test_a_sweep_takes_its_silences_and_timeouts(format: str) -> None:
     nobody = Pair([simulated(YD1000(9))])
     line = Line(nobody)
     plan = sweeps(FAMILIES, addresses=range(10, 248), baudrates=[9600], formats=[format])
@@ -229,7 +229,7 @@ class Junk(Line):
 
 
 @pytest.mark.long
-def test_some_noise_is_neither_a_drive_nor_several() -> None:
+def test_some_noise_is_not_a_drive() -> None:
     line = Junk(Pair([simulated(each) for each in ALL_EIGHT]))
     findings = found(line, sweeps(FAMILIES, addresses=range(1, 12), baudrates=[9600, 38400]))
     assert drives(findings) == declared(
@@ -327,7 +327,7 @@ def test_two_drives_that_answer_one_after_the_other_are_doubted() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.05, 0.15, 0.3])
-def test_a_drive_that_answers_late_is_found_all_the_same(delay: float) -> None:
+def test_a_drive_that_answers_late_is_found(delay: float) -> None:
     slow = simulated(InvtCHE(3), response_delay=delay)
     line = Line(Pair([slow, simulated(InvtCHE(5))]))
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
@@ -347,7 +347,7 @@ class Hesitant(SimulatedCHE):
         return super().delay if self.counters.requests <= 1 + self.hurried else 0.4
 
 
-def test_a_drive_that_answers_late_from_then_on_is_identified() -> None:
+def test_a_drive_that_becomes_slow_is_identified() -> None:
     line = Line(Pair([Hesitant(InvtCHE(3))]))
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
     assert drives(found(line, plan, FAMILIES)) == declared(InvtCHE(3))
@@ -371,7 +371,7 @@ def test_a_drive_of_no_family_is_unknown() -> None:
 
 
 @pytest.mark.slow
-def test_a_family_of_one_s_own_is_found() -> None:
+def test_a_user_s_family_is_found() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
     families = [*FAMILIES, Unsure]
     findings = found(line, sweeps(families, baudrates=[9600, 19200], formats=["8N1"]), families)
@@ -398,7 +398,7 @@ class Older(SimulatedDrive):
     ("kind", "held", "models"),
     [(SimulatedDrive, 7, ("addressed",)), (SimulatedDrive, 9, ()), (Older, 0, ("addressed",))],
 )
-def test_who_holds_another_address_is_of_another_family(
+def test_a_drive_with_another_address_register_is_another_family(
     kind: type[SimulatedDrive], held: int, models: tuple[str, ...]
 ) -> None:
     drive = kind(Addressed(7))
@@ -444,7 +444,7 @@ def test_a_family_without_readable_registers_is_skipped() -> None:
     assert {family for sweep in plan for family in sweep.families} == {InvtCHE}
 
 
-def test_a_drive_that_was_found_is_asked_for_once() -> None:
+def test_a_found_drive_is_reported_once() -> None:
     line = Line(Pair([simulated(InvtCHE(2, format="8N2"))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1", "8N2"]), [InvtCHE])
     assert len(drives(findings)) == 1
@@ -512,7 +512,7 @@ def questions(plan: Sequence[Sweep]) -> Iterator[bytes]:
 
 
 @pytest.mark.slow
-def test_every_question_is_a_read_of_the_documents() -> None:
+def test_every_request_is_a_documented_read() -> None:
     for sweep in sweeps(FAMILIES):
         assert sweep.request.function in READS[sweep.framing]
         for family in sweep.families:
@@ -531,7 +531,7 @@ class Bare(SimulatedIBD):
 
 
 @pytest.mark.slow
-def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
+def test_an_ibd_without_line_registers_is_named_with_doubt() -> None:
     bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
     line = Line(Pair([Bare(each) for each in bare]))
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
@@ -544,7 +544,7 @@ def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
 
 
 @pytest.mark.long
-def test_other_bits_than_an_ibd_s_terminals_exclude_it() -> None:
+def test_bits_besides_terminals_exclude_an_ibd() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))
         drive.shows = {(0x03, 22): lambda self, bits=bits: bits}
@@ -562,7 +562,7 @@ class Anything(SimulatedDrive):
 
 
 @pytest.mark.slow
-def test_a_device_that_answers_everything_is_of_no_family() -> None:
+def test_a_device_that_answers_every_read_has_no_family() -> None:
     line = Line(Pair([Anything(Toy(7))]))
     (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
     assert isinstance(answering, Found)
