@@ -44,7 +44,7 @@ def test_ports_lists_real_ports_with_adapter_and_driver(
 ) -> None:
     assert main(["ports"]) == 0
     assert capsys.readouterr().out == (
-        f"{devices}/ttyUSB0\n  FTDI R (0403:6001), driver ftdi_sio\n  you may open it\n"
+        f"{devices}/ttyUSB0\n  FTDI R (0403:6001); driver ftdi_sio\n  you may open it\n"
     )
 
 

@@ -124,21 +124,24 @@ def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
         if getattr(arguments, name) is not None:
             raise ValueError(f"--{name} is not for plant files: set it in {plant.path}")
     for line in plant.lines:
-        rs485, settle = opening_of(arguments, line)
+        opening = opening_of(arguments, line)
         if arguments.name in (None, line.name):
             drives = [polled.drive for polled in line.drives]
-            yield _Target(line.port, drives, usual_settings(line), rs485, settle, line.name)
+            yield _Target(line.port, drives, usual_settings(line), *opening, line.name)
     if arguments.name not in {None, *(line.name for line in plant.lines)}:
         line, drive = plant.find_drive(arguments.name)
-        rs485, settle = opening_of(arguments, line)
-        yield _Target(line.port, [drive], drive.settings, rs485, settle, line.name)
+        yield _Target(line.port, [drive], drive.settings, *opening_of(arguments, line), line.name)
 
 
 def _by_hand(arguments: argparse.Namespace) -> _Target:
     drive = _drive(arguments)
-    settings = drive.settings if drive else _line_settings(arguments)
-    rs485, settle = opening_of(arguments, None)
-    return _Target(arguments.port, [drive] if drive else [], settings, rs485, settle)
+    baudrate = 9600 if arguments.baudrate is None else arguments.baudrate
+    settings = (
+        drive.settings
+        if drive
+        else Settings(baudrate, "8N1" if arguments.format is None else arguments.format)
+    )
+    return _Target(arguments.port, [drive] if drive else [], settings, *opening_of(arguments, None))
 
 
 def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
@@ -160,14 +163,6 @@ def _drive(arguments: argparse.Namespace) -> Drive | None:
         return None
     return find_model(arguments.model)(
         arguments.address, framing=arguments.framing, baudrate=arguments.baudrate, format=arguments.format
-    )
-
-
-def _line_settings(arguments: argparse.Namespace) -> Settings:
-    """Return the settings for the echo test without a drive."""
-    return Settings(
-        9600 if arguments.baudrate is None else arguments.baudrate,
-        "8N1" if arguments.format is None else arguments.format,
     )
 
 
@@ -263,23 +258,10 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
 def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
     """Read from an unused address: only an echo of the request may come back."""
     request = Message(NOBODY, 0x03, 0, 1)
-    peer = Peer(least_timeout=4 * LEAST_TIMEOUT, most_timeout=4 * LEAST_TIMEOUT)
-    probe = Exchange(
-        Framing.RTU,
-        request,
-        peer,
-        baudrate=settings.baudrate,
-        format=settings.format,
-        character=settings.character,
-        silence=max(settings.t3_5, LEAST_TIMEOUT),
-    )
-    line = Line(port, rs485=rs485).open()
     try:
-        found = line.carry_out(probe)
+        found = ask_once(port, request, settings, rs485, 4 * LEAST_TIMEOUT)
     except LineError as failure:
         return Finding("echo", f"not tested: {failure.reason}")
-    finally:
-        line.close()
     return echo_finding(found, build_request(Framing.RTU, request), settings)
 
 
@@ -378,18 +360,21 @@ def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
 TIMEOUT = 2.0  # s; includes the time that a gateway waits for its drives
 
 
-def ask_once(port: str, request: Message, settings: Settings) -> Completion:
-    """Send one read in this network port's framing; return its outcome. Raises LineError."""
+def ask_once(
+    port: str, request: Message, settings: Settings, rs485: RS485 = RS485.OFF, timeout: float = TIMEOUT
+) -> Completion:
+    """Send one read in the port's framing of Modbus; return its outcome. Raises LineError."""
+    is_tcp = speaks_tcp(port)
     exchange = Exchange(
-        Framing.TCP if speaks_tcp(port) else Framing.RTU,
+        Framing.TCP if is_tcp else Framing.RTU,
         request,
-        Peer(least_timeout=TIMEOUT, most_timeout=TIMEOUT),
+        Peer(least_timeout=timeout, most_timeout=timeout),
         baudrate=settings.baudrate,
         format=settings.format,
         character=settings.character,
-        silence=0.0 if speaks_tcp(port) else settings.t3_5,
+        silence=0.0 if is_tcp else max(settings.t3_5, LEAST_TIMEOUT),
     )
-    line = Line(port).open()
+    line = Line(port, rs485=rs485).open()
     try:
         return line.carry_out(exchange)
     finally:

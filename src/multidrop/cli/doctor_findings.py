@@ -35,10 +35,8 @@ class Finding:
 
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
     """Describe the adapter; `lasting` is its device name by serial number, or the port if there is none."""
-    product = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
-    driver = f"driver {adapter.driver}" if adapter.driver else "driver unknown"
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
-    return Finding("adapter", f"{product}; {driver}", advice if lasting != port else "")
+    return Finding("adapter", str(adapter), advice if lasting != port else "")
 
 
 def latency_finding(adapter: Adapter) -> Finding:
@@ -199,6 +197,10 @@ class Adapter:
     usb_id: str = ""
     latency_timer: int | None = None  # ms
     latency_path: Path | None = None
+
+    def __str__(self) -> str:
+        product = f"{self.product or 'a USB device'} ({self.usb_id})" if self.usb_id else "not on USB"
+        return f"{product}; {f'driver {self.driver}' if self.driver else 'driver unknown'}"
 
 
 @dataclass(frozen=True)

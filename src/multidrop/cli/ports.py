@@ -62,11 +62,8 @@ def _linux_ports(sysfs: Path = SYSFS, devices: Path = Path("/dev")) -> Iterator[
         adapter = find_adapter(str(device), sysfs)
         if not adapter.driver or not device.exists():
             continue
-        what = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
         advice = "" if os.access(device, os.R_OK | os.W_OK) else _permission_advice(device)
-        yield SerialPort(
-            of_device(str(device)), str(device), f"{what}, driver {adapter.driver}", not advice, advice
-        )
+        yield SerialPort(of_device(str(device)), str(device), str(adapter), not advice, advice)
 
 
 def _permission_advice(device: Path) -> str:
