@@ -666,6 +666,15 @@ def test_a_star_polls_all_readings_but_those_with_a_rate_of_their_own(load: Load
     }
 
 
+def test_a_text_in_a_poll_is_named_as_a_text(mistakes: Mistakes, tmp_path: Path) -> None:
+    (tmp_path / "meter.toml").write_text(
+        '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'
+        "[reading]\npower = { at = 1 }\n[text]\nmark = { at = 9, length = 4 }\n"
+    )
+    (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "meter.toml") + 'poll = ["mark"]')
+    assert sentence.endswith("'mark' of Meter is a text: texts are read, but neither polled nor written")
+
+
 def test_a_star_twice_is_a_mistake(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY + 'poll = ["*", "*"]')
     assert sentence.endswith('poll number 2: "*" is there twice; keep it once')

@@ -162,6 +162,10 @@ class Drive(RegisterAccess):
         try:
             return cls.registers[name]
         except KeyError:
+            if name in cls.texts:
+                raise ValueError(
+                    f"{name!r} of {cls._kind()} is a text: texts are read, but neither polled nor written"
+                ) from None
             near = difflib.get_close_matches(name, cls.registers, n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else f"see `multidrop models {cls.model}`"
             raise ValueError(f"{cls._kind()} has no register {name!r}; {hint}") from None
