@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    from command_desks import Desks
     from nats_clusters import Cluster
 
 HERE = Path(__file__).parent
@@ -77,3 +78,12 @@ async def _init(servers: Cluster) -> None:
     await set_up(paths)
     for path in paths:
         await path.close()
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desks]:
+    """Return the desks of a gateway with a simulated drive."""
+    from command_desks import desks
+
+    with desks(tmp_path) as made:
+        yield made

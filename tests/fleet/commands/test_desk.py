@@ -6,7 +6,7 @@ import asyncio
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -42,12 +42,6 @@ DONE, REFUSED, NOT_SENT, UNKNOWN = (
 SETPOINT = "frequency"
 
 pytestmark = patient  # a stop whose reply is late is sent again, and the writes are counted here
-
-
-@pytest.fixture
-def desk(tmp_path: Path) -> Iterator[Desks]:
-    with desks(tmp_path) as made:
-        yield made
 
 
 def setpoints(desk: Desks) -> list[int]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-import unittest.mock
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from command_desks import LINE, MAY, PATIENCE_S, desks
+from command_desks import LINE, MAY, PATIENCE_S, Desks
 
 from multidrop.fleet.commands import desk as command_desk
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
@@ -68,103 +66,89 @@ async def settled(subjects: CommandSubjects) -> None:
     await asyncio.gather(*supervisor().started)
 
 
-def test_a_closing_line_answers_its_stops_until_it_is_closed(tmp_path: Path) -> None:
-    async def main() -> None:
-        path, lines = HeardPath(), SlowLines()
-        subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]
-        commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
-        await commanded.take(LINE, {"may": MAY})
-        await settled(subjects)
-        offered = made.offered()
-        going = asyncio.create_task(commanded.let_go(LINE))
-        await asyncio.sleep(0)
-        await settled(subjects)
-        assert path.heard.keys() == {names.stop_subject(LINE)}
-        assert made.ask(register="frequency", value=20.0) is None
-        assert "was released" in (await made.do(offered)).text
-        while (told := await path.ask(names.stop_subject(LINE), drives=None))["outcome"] == "under way":
-            pass
-        assert told["outcome"] == "done"
-        lines.closes.set()
-        await going
-        await settled(subjects)
-        assert path.heard == {}
-        assert await made.stop() is None
-        assert made.written == {"control"}
-
-    with desks(tmp_path) as made:
-        asyncio.run(main())
+async def test_a_closing_line_answers_its_stops_until_it_is_closed(desk: Desks) -> None:
+    path, lines = HeardPath(), SlowLines()
+    subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)  # type: ignore[list-item]
+    commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+    await commanded.take(LINE, {"may": MAY})
+    await settled(subjects)
+    offered = desk.offered()
+    going = asyncio.create_task(commanded.let_go(LINE))
+    await asyncio.sleep(0)
+    await settled(subjects)
+    assert path.heard.keys() == {names.stop_subject(LINE)}
+    assert desk.ask(register="frequency", value=20.0) is None
+    assert "was released" in (await desk.do(offered)).text
+    while (told := await path.ask(names.stop_subject(LINE), drives=None))["outcome"] == "under way":
+        pass
+    assert told["outcome"] == "done"
+    lines.closes.set()
+    await going
+    await settled(subjects)
+    assert path.heard == {}
+    assert await desk.stop() is None
+    assert desk.written == {"control"}
 
 
-def test_a_stop_is_answered_only_to_an_inbox(tmp_path: Path) -> None:
+async def test_a_stop_is_answered_only_to_an_inbox(desk: Desks) -> None:
     """An answer that goes to a record of the plant would take its line from all gateways."""
     answered: list[str] = []
 
-    async def main() -> None:
-        path = HeardPath()
-        subjects = CommandSubjects("gw-1", [path], made.lines, made.log)  # type: ignore[list-item]
-        subjects.open(LINE, {"may": MAY})
+    path = HeardPath()
+    subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)  # type: ignore[list-item]
+    subjects.open(LINE, {"may": MAY})
+    await settled(subjects)
+    for number, reply in enumerate(("$KV.plant.line-1", "", "_INBOX_UABC.1")):
+
+        async def respond(data: bytes, reply: str = reply) -> None:
+            answered.append(reply)
+
+        data = json.dumps({"id": f"stop {number}", "by": "anna", "drives": None}).encode()
+        await path.heard[names.stop_subject(LINE)](
+            SimpleNamespace(data=data, subject="", reply=reply, respond=respond)
+        )
         await settled(subjects)
-        for number, reply in enumerate(("$KV.plant.line-1", "", "_INBOX_UABC.1")):
-
-            async def respond(data: bytes, reply: str = reply) -> None:
-                answered.append(reply)
-
-            data = json.dumps({"id": f"stop {number}", "by": "anna", "drives": None}).encode()
-            await path.heard[names.stop_subject(LINE)](
-                SimpleNamespace(data=data, subject="", reply=reply, respond=respond)
-            )
-            await settled(subjects)
-            assert "control" in made.written
-
-    with desks(tmp_path) as made:
-        asyncio.run(main())
+        assert "control" in desk.written
     assert answered == ["_INBOX_UABC.1"]
 
 
 @pytest.mark.parametrize("may_wait", [True, False])
-def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
-    tmp_path: Path, may_wait: bool
+async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
+    desk: Desks, monkeypatch: pytest.MonkeyPatch, may_wait: bool
 ) -> None:
     """The requester gets the result, before the end of the line can cut the answer off."""
     begun, go_on = threading.Event(), threading.Event()
 
-    async def main() -> None:
-        lines = SlowLines()
-        lines.closes.set()
-        subjects = CommandSubjects("gw-1", [HeardPath()], made.lines, made.log)  # type: ignore[list-item]
-        subjects.desk = made.desk
-        commanded = CommandedLines(lines, subjects, lambda: may_wait)  # type: ignore[arg-type]
-        await commanded.take(LINE, {"may": MAY})
-        first, second = made.offered(20.0), made.offered(30.0)
-        offer = made.desk.offers.find(first)
-        assert offer is not None
-        work = offer.prepared.work
+    monkeypatch.setattr(command_desk, "AWAITED_S", PATIENCE_S)
+    lines = SlowLines()
+    lines.closes.set()
+    subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)  # type: ignore[list-item]
+    subjects.desk = desk.desk
+    commanded = CommandedLines(lines, subjects, lambda: may_wait)  # type: ignore[arg-type]
+    await commanded.take(LINE, {"may": MAY})
+    first, second = desk.offered(20.0), desk.offered(30.0)
+    offer = desk.desk.offers.find(first)
+    assert offer is not None
+    work = offer.prepared.work
 
-        def held_up() -> CommandAnswer:
-            begun.set()
-            assert go_on.wait(PATIENCE_S)
-            return work()
+    def held_up() -> CommandAnswer:
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        return work()
 
-        offer.prepared = offer.prepared._replace(work=held_up)
-        doing = asyncio.create_task(made.do(first))
-        await asyncio.to_thread(begun.wait, PATIENCE_S)
-        going = asyncio.create_task(commanded.let_go(LINE))
-        for _ in range(10):
-            await asyncio.sleep(0.002)
-        assert lines.is_going is not may_wait
-        assert (await made.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing starts now
-        go_on.set()
-        assert (await doing).outcome is CommandOutcome.DONE
-        await going
-        assert lines.is_going
-        assert [raw for name, raw in made.writes if name == "frequency"] == [2000]
-
-    with (
-        desks(tmp_path) as made,
-        unittest.mock.patch.object(command_desk, "AWAITED_S", PATIENCE_S),
-    ):
-        asyncio.run(main())
+    offer.prepared = offer.prepared._replace(work=held_up)
+    doing = asyncio.create_task(desk.do(first))
+    await asyncio.to_thread(begun.wait, PATIENCE_S)
+    going = asyncio.create_task(commanded.let_go(LINE))
+    for _ in range(10):
+        await asyncio.sleep(0.002)
+    assert lines.is_going is not may_wait
+    assert (await desk.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing starts now
+    go_on.set()
+    assert (await doing).outcome is CommandOutcome.DONE
+    await going
+    assert lines.is_going
+    assert [raw for name, raw in desk.writes if name == "frequency"] == [2000]
 
 
 class ClosedLines(SlowLines):
@@ -182,20 +166,18 @@ class ClosedLines(SlowLines):
 
 
 @pytest.mark.parametrize("drives", [None, ["pump"]])
-def test_a_stop_on_a_closed_line_is_left_to_the_next_master(tmp_path: Path, drives: list[str] | None) -> None:
+async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
+    desk: Desks, drives: list[str] | None
+) -> None:
     """The requester would accept a refusal, and ask no other gateway."""
 
-    async def main() -> None:
-        lines = ClosedLines(made.bus(LINE).close)
-        subjects = CommandSubjects("gw-1", [HeardPath()], made.lines, made.log)  # type: ignore[list-item]
-        commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
-        await commanded.take(LINE, {"may": MAY})
-        going = asyncio.create_task(commanded.let_go(LINE))
-        await lines.are_closed.wait()
-        assert await made.stop(drives=drives) is None
-        lines.closes.set()
-        await going
-        await settled(subjects)
-
-    with desks(tmp_path) as made:
-        asyncio.run(main())
+    lines = ClosedLines(desk.bus(LINE).close)
+    subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)  # type: ignore[list-item]
+    commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+    await commanded.take(LINE, {"may": MAY})
+    going = asyncio.create_task(commanded.let_go(LINE))
+    await lines.are_closed.wait()
+    assert await desk.stop(drives=drives) is None
+    lines.closes.set()
+    await going
+    await settled(subjects)

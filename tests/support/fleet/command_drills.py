@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from kills import kill_all
+from fleet_drills import GATEWAYS, PATIENCE_S, FleetProcesses
 from nats_clusters import Cluster, cluster
 
 from multidrop import YD1000
@@ -30,8 +27,6 @@ from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, Off
 from multidrop.fleet.errors import FleetError
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-GATEWAYS = ("gw-a", "gw-b", "gw-c")
-PATIENCE_S = 120.0
 HIGHEST = 4999  # raw counts of the setpoint; a drive gets each value once
 STOP_EVERY = 20  # every 20th command of a drive is a stop
 SENT = (CommandOutcome.DONE, CommandOutcome.FAILED)
@@ -98,55 +93,22 @@ class UnreliableCommands(FleetCommands):
         await asyncio.gather(*self._copies)
 
 
-class CommandDrill:
+class CommandDrill(FleetProcesses):
     """Three gateways, three NATS nodes, and lines with one drive each."""
 
     def __init__(
         self, folder: Path, nats: Cluster, simulator: Simulator, sims: dict[str, SimulatedDrive]
     ) -> None:
-        self.folder, self.nats, self.sims = folder, nats, sims
-        self._simulator = simulator
-        self._environment = {
-            **os.environ,
-            "MULTIDROP_NATS": ",".join(nats.urls),
-            "XDG_STATE_HOME": str(folder / "state"),
-        }
-        self.gateways: dict[str, subprocess.Popen[str]] = {}
-        (folder / "plant.toml").write_text(self._plant())
-        made = self.run("init", str(folder / "plant.toml"))
-        assert made.returncode == 0, made.stderr
-        for name in GATEWAYS:
-            self.start(name)
-
-    def _plant(self) -> str:
+        self.sims = sims
         lines = [
             f'[[line]]\nname = "line-{name}"\nport = "{wire.path}"\n'
             f'[[line.drive]]\nname = "{name}"\nmodel = "yd1000"\naddress = 1\n'
             'poll = ["output_frequency"]\nevery = "1 s"\n'
-            for name, wire in zip(self.sims, self._simulator.wires, strict=True)
+            for name, wire in zip(sims, simulator.wires, strict=True)
         ]
-        listed = ", ".join(f'"{name}.frequency"' for name in self.sims)
-        return "\n".join([*lines, f"[fleet.may]\nwrite = [{listed}]\n"])
-
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run `multidrop fleet` with these words."""
-        command = [sys.executable, "-m", "multidrop", "fleet", *words]
-        return subprocess.run(
-            command, env=self._environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S
-        )
-
-    def start(self, name: str) -> None:
-        with (self.folder / f"{name}.log").open("a") as log:
-            self.gateways[name] = subprocess.Popen(
-                [sys.executable, "-m", "multidrop", "fleet", "serve", name],
-                env=self._environment,
-                stdout=subprocess.DEVNULL,
-                stderr=log,
-                text=True,
-            )
-
-    def close(self) -> None:
-        kill_all(self.gateways.values())
+        listed = ", ".join(f'"{name}.frequency"' for name in sims)
+        super().__init__(folder, nats, "\n".join([*lines, f"[fleet.may]\nwrite = [{listed}]\n"]))
+        self.start(*GATEWAYS)
 
     # ---- writes that the drives received ----
 
@@ -260,9 +222,7 @@ class CommandDrill:
             return done
 
     def _kill_gateway(self, dice: random.Random) -> None:
-        victim = self.gateways[dice.choice(GATEWAYS)]
-        victim.kill()
-        victim.wait()
+        self.kill(dice.choice(GATEWAYS))
 
     def _stop_gateway(self, dice: random.Random) -> None:
         """Suspend a gateway; if it is suspended for longer than its lease, the kernel kills it."""

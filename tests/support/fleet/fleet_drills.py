@@ -34,30 +34,22 @@ PATIENCE_S = 120.0
 JUDGED_S = 11.0  # an election may come 9 s after a death
 
 
-class FleetDrill:
-    """A fleet of processes; each round performs an action and measures its effect on the lines."""
+class FleetProcesses:
+    """Gateways as processes, of a fleet that `fleet init` has made from this plant."""
 
     def __init__(
-        self,
-        folder: Path,
-        nats: Cluster,
-        lines: int = 12,
-        seed: int = 1,
-        places: Mapping[str, Namespace] | None = None,
-        host: str = "127.0.0.1",
+        self, folder: Path, nats: Cluster, plant: str, places: Mapping[str, Namespace] | None = None
     ) -> None:
+        self.folder = folder
         self.nats = nats
-        self.hall = SerialHall(lines, host)
         self.places = places or {}  # namespaces of gateways; the others run here
-        self.random = random.Random(seed)
-        self._folder = folder
         self._environment = {
             **os.environ,
             "MULTIDROP_NATS": ",".join(nats.urls),
             "XDG_STATE_HOME": str(folder / "state"),
         }
         self.gateways: dict[str, subprocess.Popen[str]] = {}
-        (folder / "plant.toml").write_text(self.hall.plant())
+        (folder / "plant.toml").write_text(plant)
         made = self.run("init", str(folder / "plant.toml"))
         assert made.returncode == 0, made.stderr
 
@@ -74,7 +66,7 @@ class FleetDrill:
     def start(self, *names: str) -> None:
         for name in names:
             prefix = self.places[name].prefix if name in self.places else []
-            with (self._folder / f"{name}.log").open("a") as log:
+            with (self.folder / f"{name}.log").open("a") as log:
                 self.gateways[name] = subprocess.Popen(
                     [*prefix, sys.executable, "-m", "multidrop", "fleet", "serve", name],
                     env=self._environment,
@@ -84,8 +76,29 @@ class FleetDrill:
                     preexec_fn=partial(signal.signal, signal.SIGHUP, signal.SIG_DFL),  # undoes nohup
                 )
 
-    def log(self, name: str) -> str:
-        return (self._folder / f"{name}.log").read_text()
+    def kill(self, name: str) -> None:
+        self.gateways[name].kill()
+        self.gateways[name].wait()
+
+    def close(self) -> None:
+        kill_all(self.gateways.values())
+
+
+class FleetDrill(FleetProcesses):
+    """A fleet of processes; each round performs an action and measures its effect on the lines."""
+
+    def __init__(
+        self,
+        folder: Path,
+        nats: Cluster,
+        lines: int = 12,
+        seed: int = 1,
+        places: Mapping[str, Namespace] | None = None,
+        host: str = "127.0.0.1",
+    ) -> None:
+        self.hall = SerialHall(lines, host)
+        self.random = random.Random(seed)
+        super().__init__(folder, nats, self.hall.plant(), places)
 
     def settle(self) -> None:
         """Restart dead processes, and wait until gateways, leases, paths and leaders are complete."""
@@ -153,11 +166,11 @@ class FleetDrill:
         """Do nothing, which shows this machine's usual gaps."""
 
     def kill_gateway(self) -> None:
-        self._kill(self.random.choice(GATEWAYS))
+        self.kill(self.random.choice(GATEWAYS))
 
     def kill_two_gateways(self) -> None:
         for name in self.random.sample(GATEWAYS, 2):
-            self._kill(name)
+            self.kill(name)
 
     def kill_gateway_and_node(self) -> None:
         self.kill_gateway()
@@ -220,12 +233,8 @@ class FleetDrill:
         for node in self.nats.nodes:
             node.start()
 
-    def _kill(self, name: str) -> None:
-        self.gateways[name].kill()
-        self.gateways[name].wait()
-
     def close(self) -> None:
-        kill_all(self.gateways.values())
+        super().close()
         self.hall.close()
 
 
@@ -394,16 +403,14 @@ class MachineDrill(FleetDrill):
         name = self.random.choice(GATEWAYS)
         [node] = [node for node in self.nats.nodes if node.place is self.places[name]]
         node.kill()
-        self.gateways[name].kill()
-        self.gateways[name].wait()
+        self.kill(name)
 
     def kill_gateway_and_another_node(self) -> None:
         """Kill a gateway, and at the same moment a node on another machine."""
         name = self.random.choice(GATEWAYS)
         others = [node for node in self.nats.nodes if node.place is not self.places[name]]
         self.random.choice(others).kill()
-        self.gateways[name].kill()
-        self.gateways[name].wait()
+        self.kill(name)
 
     def cut_machine(self) -> None:
         cut(self, "gateway cut off", seconds=self.random.uniform(4, 8))
