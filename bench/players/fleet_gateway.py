@@ -12,6 +12,7 @@ import os
 import sys
 import time
 import traceback
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
@@ -19,8 +20,9 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterd
 from spooled import numbered
 
 from multidrop.core import Names
+from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.samples_stream import StreamError, connect
+from multidrop.fleet.samples.samples_stream import samples_path
 from multidrop.fleet.samples.spool import Spool
 
 EXCHANGES = 100  # in a batch
@@ -59,12 +61,10 @@ def fill(spool: Spool, drives: Names, told: Path) -> None:
 
 async def forward(spool: Spool, urls: list[str]) -> None:
     while True:
-        try:
-            client = await connect(urls)
-        except StreamError:
-            await asyncio.sleep(0.2)
-        else:
-            await Forwarder(spool, client).run()
+        with suppress(FleetError):
+            async with samples_path(urls) as path:
+                await Forwarder(spool, path).run()
+        await asyncio.sleep(0.2)
 
 
 if __name__ == "__main__":

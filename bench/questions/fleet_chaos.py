@@ -18,7 +18,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -31,7 +31,8 @@ from spooled import NOON, STEP
 
 from bench.players.fleet_gateway import GAP
 from bench.support import tables
-from multidrop.fleet.samples.samples_stream import StreamError, connect, create_stream, last_of, subject_of
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.samples.samples_stream import create_stream, last_of, samples_path, subject_of
 
 ROOT = Path(__file__).parents[2]
 GATEWAYS = ("gateway-1", "gateway-2")
@@ -192,23 +193,21 @@ class Chaos:
     async def _forwarded(self) -> None:
         """Wait until the stream has the newest message of each spool."""
         ends = time.monotonic() + PATIENCE_S
-        client = await connect(self.servers.urls)
-        for name, gateway in zip(GATEWAYS, self.gateways, strict=True):
-            stored = [int(path.name[:12]) for path in (self.folder / name).glob("*.arrows")]
-            if not stored:  # it was always killed before it stored a sample
-                continue
-            log = subject_of(name, _log_of(self.folder / name))
-            while True:
-                try:
-                    last = await last_of(client, log)
-                except StreamError:
+        async with samples_path(self.servers.urls) as path:
+            for name, gateway in zip(GATEWAYS, self.gateways, strict=True):
+                stored = [int(file.name[:12]) for file in (self.folder / name).glob("*.arrows")]
+                if not stored:  # it was always killed before it stored a sample
+                    continue
+                log = subject_of(name, _log_of(self.folder / name))
+                while True:
                     last = None
-                if last and last.sequence >= max(stored):
-                    break
-                gateway.check_alive()
-                assert time.monotonic() < ends, f"{name} does not forward: see {self.folder}"
-                await asyncio.sleep(0.1)
-        await client.close()
+                    with suppress(FleetError):
+                        last = await last_of(path, log)
+                    if last and last.sequence >= max(stored):
+                        break
+                    gateway.check_alive()
+                    assert time.monotonic() < ends, f"{name} does not forward: see {self.folder}"
+                    await asyncio.sleep(0.1)
 
 
 def _log_of(folder: Path) -> str:
@@ -270,15 +269,12 @@ def everything(folder: Path, dice: random.Random) -> Iterator[Chaos]:
         database = stack.enter_context(postgres())
 
         async def make() -> None:
-            client = await connect(servers.urls)
-            while True:
-                try:
-                    await create_stream(client, replicas=3)
-                except StreamError:
+            async with samples_path(servers.urls) as path:
+                while True:
+                    with suppress(FleetError):
+                        await create_stream(path, replicas=3)
+                        return
                     await asyncio.sleep(0.2)  # no leader yet
-                else:
-                    break
-            await client.close()
 
         asyncio.run(make())
         chaos = Chaos(folder, servers, database, dice)

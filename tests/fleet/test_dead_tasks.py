@@ -61,7 +61,7 @@ MEMBER = (
     *(f"records {at}" for at in range(1, 1 + len(names.BUCKETS))),
     *("guard", "leaders", "weak session", "releases", "steps", "lines"),
 )
-TASKS = ("forwarder", "member", "look", *(f"gw-1: {name}" for name in MEMBER))
+TASKS = ("forwarder", "samples path", "member", "look", *(f"gw-1: {name}" for name in MEMBER))
 THREADS = ("multidrop spool", "multidrop poller", "multidrop batches")
 
 

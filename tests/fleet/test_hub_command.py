@@ -8,7 +8,6 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from nats_clusters import Cluster, cluster, free_ports
@@ -18,11 +17,12 @@ from terminals import closing_terminal
 
 from multidrop import History
 from multidrop.cli import main
-from multidrop.fleet.samples import parquet_sink, samples_stream
+from multidrop.fleet.samples import parquet_sink
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.hub import SampleHub
-from multidrop.fleet.samples.samples_stream import connect, create_stream
+from multidrop.fleet.samples.samples_stream import create_stream, samples_path
 from multidrop.fleet.samples.spool import Spool
+from multidrop.supervisor import end_tasks
 
 PATIENCE_S = 60.0
 
@@ -32,24 +32,22 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """Servers whose stream has 40 exchanges in 4 messages, of one gateway's spool."""
     folder = tmp_path_factory.mktemp("nats")
 
-    async def forward(url: str) -> None:
-        client = await connect([url])
-        await create_stream(client, replicas=1)
-        spool = Spool(folder / "spool", "gateway-1")
-        forwarder = Forwarder(spool, client)
-        task = asyncio.create_task(forwarder.run())
-        for number in range(4):
-            spool.append(numbered(number * 10, 10))
-            assert await asyncio.to_thread(spool.sync, 30.0)
-        while forwarder.last != 4:
-            await asyncio.sleep(0.01)
-        task.cancel()
-        await asyncio.wait([task])
-        spool.close()
-        await client.close()
+    async def forward(urls: list[str]) -> None:
+        async with samples_path(urls) as path:
+            await create_stream(path, replicas=1)
+            spool = Spool(folder / "spool", "gateway-1")
+            forwarder = Forwarder(spool, path)
+            task = asyncio.create_task(forwarder.run())
+            for number in range(4):
+                spool.append(numbered(number * 10, 10))
+                assert await asyncio.to_thread(spool.sync, 30.0)
+            while forwarder.last != 4:
+                await asyncio.sleep(0.01)
+            await end_tasks(task)
+            spool.close()
 
     with cluster(folder, 1) as one:
-        asyncio.run(asyncio.wait_for(forward(one.urls[0]), 60.0))
+        asyncio.run(asyncio.wait_for(forward(one.urls), 60.0))
         yield one
 
 
@@ -131,16 +129,6 @@ def test_a_hub_whose_compaction_ends_fails(
     assert said.endswith("multidrop: compaction has ended: ZeroDivisionError: a mistake\n")
 
 
-def test_closing_a_stuck_connection_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Stuck:
-        async def close(self) -> None:
-            await asyncio.sleep(PATIENCE_S)
-
-    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.01)
-    stuck: Any = Stuck()
-    asyncio.run(asyncio.wait_for(samples_stream.close(stuck), PATIENCE_S / 2))
-
-
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     status = main(["hub", *words])
     return status, capsys.readouterr().err
@@ -150,7 +138,6 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
 def test_no_server_is_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.5)
     url = f"nats://127.0.0.1:{free_ports(1)[0]}"
     status, told = refused(capsys, url, "--parquet", str(tmp_path / "hub"))
     assert status == 1

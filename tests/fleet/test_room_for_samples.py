@@ -10,10 +10,10 @@ from pathlib import Path
 import nats_clusters
 import pytest
 from commands import Run
-from nats.aio.client import Client
 from nats_clusters import Cluster, cluster
 
-from multidrop.fleet.samples.samples_stream import about, connect, create_stream, publish
+from multidrop.fleet.samples.samples_stream import about, create_stream, publish, samples_path
+from multidrop.fleet.servers.connections import ServerPath
 
 MESSAGE = 500_000  # bytes
 PLANT = """
@@ -33,30 +33,27 @@ def _small_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nats_clusters, "MAX_FILE", "20M")
 
 
-def with_client(servers: Cluster, work: Callable[[Client], Awaitable[object]]) -> None:
+def with_path(servers: Cluster, work: Callable[[ServerPath], Awaitable[object]]) -> None:
     async def live() -> None:
-        client = await connect(servers.urls)
-        try:
-            await work(client)
-        finally:
-            await client.close()
+        async with samples_path(servers.urls) as path:
+            await work(path)
 
     asyncio.run(live())
 
 
 @pytest.mark.long
 def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path) -> None:
-    async def fill(client: Client) -> None:
+    async def fill(path: ServerPath) -> None:
         for _ in range(60):
-            await publish(client, "samples.gw-1.log", bytes(MESSAGE), {})
-        found = await about(client)
+            await publish(path, "samples.gw-1.log", bytes(MESSAGE), {})
+        found = await about(path)
         assert (found.last, 60 - found.first < 8_000_000 / MESSAGE) == (60, True)
 
     with cluster(tmp_path / "nats", 1) as one:
         words = ["fleet", "init", "--nats", one.urls[0], "--json", "--keep", "8 MB"]
         status, out, _ = run(*words)
         assert (status, json.loads(out)["samples_bytes"]) == (0, 8_000_000)
-        with_client(one, fill)
+        with_path(one, fill)
         (tmp_path / "plant.toml").write_text(PLANT)
         status, out, _ = run(*words, tmp_path / "plant.toml")
         assert (status, json.loads(out)["lines"]["new"]) == (0, 1)
@@ -74,14 +71,14 @@ def test_servers_with_too_little_room_are_one_sentence(run: Run, tmp_path: Path,
 @pytest.mark.long
 def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "nats", 1) as one:
-        with_client(one, lambda client: create_stream(client, replicas=1))
+        with_path(one, lambda path: create_stream(path, replicas=1))
         _, out, err = run("fleet", "init", "--nats", one.urls[0], "--json")
         assert json.loads(out)["samples_bytes"] is None
         assert (
             "the stream of samples has no limit: when it fills the servers, no line is polled; `nats" in err
         )
     with cluster(tmp_path / "other", 1) as one:
-        with_client(one, lambda client: create_stream(client, replicas=1, most_bytes=8_000_000))
+        with_path(one, lambda path: create_stream(path, replicas=1, most_bytes=8_000_000))
         _, _, err = run("fleet", "init", "--nats", one.urls[0], "--keep", "9 MB")
         assert (
             "the stream of samples still keeps 8.0 MB; `nats stream edit samples --max-bytes 9000000`" in err

@@ -89,12 +89,11 @@ async def _read_until_signal(
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
     from multidrop.fleet.samples.hub import SampleHub
     from multidrop.fleet.samples.parquet_sink import compact_for_ever
-    from multidrop.fleet.samples.samples_stream import close, connect
+    from multidrop.fleet.samples.samples_stream import samples_path
     from multidrop.supervisor import end_tasks
 
-    client = await connect(arguments.servers, **options)
-    try:
-        hub = SampleHub(client, sink, every=arguments.every)
+    async with samples_path(arguments.servers, options) as path:
+        hub = SampleHub(path, sink, every=arguments.every)
         if arguments.parquet:  # PostgreSQL needs no merging
             supervisor().keep("compaction", compact_for_ever(arguments.parquet))
         reading = asyncio.ensure_future(hub.run(once=arguments.once))
@@ -107,5 +106,3 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
             await supervisor().release("compaction")
             await end_tasks(reading, failing)
         return hub.state()
-    finally:
-        await close(client)

@@ -26,7 +26,7 @@ from multidrop.fleet.lines.line_keeper import SILENT_S
 from multidrop.fleet.lines.moves import MOST_REPORTED
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.polled_units import PolledUnits
-from multidrop.fleet.samples.samples_stream import close, connect
+from multidrop.fleet.samples.samples_stream import samples_path
 from multidrop.fleet.samples.spool import Spool
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath, paths_of
@@ -98,11 +98,14 @@ class FleetGateway:
         try:
             await open_all(self.paths)
             await check_buckets(self.member.best())
-            client = await connect(self.urls, **self._options)
-        except BaseException:
+            async with samples_path(self.urls, self._options) as path:
+                await self._poll_and_forward(path, on_ready)
+        finally:
             await self._close()
-            raise
-        self.forwarder = Forwarder(self.spool, client)
+        supervisor().check()
+
+    async def _poll_and_forward(self, path: ServerPath, on_ready: Callable[[], object]) -> None:
+        self.forwarder = Forwarder(self.spool, path)
         forwarding = supervisor().keep("forwarder", self.forwarder.run())
         supervisor().watch("spool", self.spool.is_alive)
         try:
@@ -128,9 +131,6 @@ class FleetGateway:
         finally:
             supervisor().let_go("forwarder")
             await end_tasks(forwarding)
-            await close(client)
-            await self._close()
-        supervisor().check()
 
     async def _until_the_end(self) -> None:
         """Wait until `end` is called, or a task or thread that must not end has ended."""

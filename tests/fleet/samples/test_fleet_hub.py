@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from nats.aio.client import Client
 from nats_clusters import Cluster
 from peers import require_module
 from postgres_clusters import Postgres, postgres
-from sample_streams import client_of
+from sample_streams import empty_stream
 from spooled import NOON, STEP, exchanges_in, numbered, rows_of
 
 from multidrop import History
+from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples import hub as hub_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.hub import (
@@ -34,8 +34,8 @@ from multidrop.fleet.samples.hub import (
 from multidrop.fleet.samples.message import RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.postgres_sink import PostgresSink
-from multidrop.fleet.samples.samples_stream import StreamError, StreamMessage, publish
-from multidrop.fleet.servers.batch_client import BatchClient
+from multidrop.fleet.samples.samples_stream import StreamMessage, publish
+from multidrop.fleet.servers.connections import ServerPath
 
 LOG = "00112233aabbccdd"
 PATIENCE_S = 60.0
@@ -67,16 +67,16 @@ def message(first: int, count: int = 5) -> bytes:
 
 
 async def say(
-    client: Client, sequence: int, data: bytes, source: str = f"gateway-1.{LOG}", lost: int = 0
+    path: ServerPath, sequence: int, data: bytes, source: str = f"gateway-1.{LOG}", lost: int = 0
 ) -> None:
     headers = {samples_stream.SEQUENCE: str(sequence), samples_stream.LOST: str(lost)}
-    assert await publish(client, f"samples.{source}", data, headers)
+    assert await publish(path, f"samples.{source}", data, headers)
 
 
-async def say_all(client: Client, first: int, end: int) -> None:
+async def say_all(path: ServerPath, first: int, end: int) -> None:
     """Publish the messages `first` to `end` - 1, of five exchanges each."""
     for number in range(first, end):
-        await say(client, number, message(number * 5))
+        await say(path, number, message(number * 5))
 
 
 class Memory:
@@ -109,9 +109,9 @@ class Memory:
         return [row for commit in self.commits for table in commit.tables for row in rows_of(table)]
 
 
-async def read_all(client: Client, sink: SampleSink, place: int, every: float = 0.02) -> HubState:
+async def read_all(path: ServerPath, sink: SampleSink, place: int, every: float = 0.02) -> HubState:
     """Run a hub until it has kept so much."""
-    hub = SampleHub(client, sink, every=every)
+    hub = SampleHub(path, sink, every=every)
     task = asyncio.create_task(hub.run())
     try:
         async with asyncio.timeout(PATIENCE_S):
@@ -132,21 +132,21 @@ def test_a_lagging_server_does_not_end_a_full_read(
     looks = itertools.count()
     read_after = hub_module.read_after
 
-    async def late(client: BatchClient, place: int, *most: int) -> list[StreamMessage]:
-        return [] if next(looks) < is_behind_for else await read_after(client, place, *most)
+    async def late(path: ServerPath, place: int, *most: int) -> list[StreamMessage]:
+        return [] if next(looks) < is_behind_for else await read_after(path, place, *most)
 
     monkeypatch.setattr(hub_module, "read_after", late)
     monkeypatch.setattr(hub_module, "BEHIND_S", 0.2 if is_behind_for > 3 else PATIENCE_S)
 
     async def live() -> list[tuple[Any, ...]]:
-        async with client_of(running) as client:
-            await say(client, 1, message(5))
+        async with empty_stream(running) as path:
+            await say(path, 1, message(5))
             sink = Memory()
-            await SampleHub(client, sink).run(once=True)
+            await SampleHub(path, sink).run(once=True)
             return sink.rows()
 
     if is_behind_for > 3:
-        with pytest.raises(StreamError, match=r"messages 1 to 1 of the stream cannot be read now"):
+        with pytest.raises(FleetError, match=r"messages 1 to 1 of the stream cannot be read now"):
             asyncio.run(live())
     else:
         assert exchanges_in(asyncio.run(live())) == list(range(5, 10))
@@ -155,10 +155,10 @@ def test_a_lagging_server_does_not_end_a_full_read(
 @pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
 async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
-    async with client_of(running) as client:
-        await say_all(client, 1, 31)
+    async with empty_stream(running) as path:
+        await say_all(path, 1, 31)
         sink = Memory(fates)
-        state = await read_all(client, sink, 30)
+        state = await read_all(path, sink, 30)
     assert exchanges_in(sorted(sink.rows())) == list(range(5, 155))
     assert state[:5] == (30, 0, 30 * 50 if not fates else state.rows, 0, 0)
     assert sink.commits[-1].sources == {f"gateway-1.{LOG}": 30}
@@ -167,10 +167,10 @@ async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: 
 @pytest.mark.slow
 async def test_several_answers_are_stored(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
-    async with client_of(running) as client:
-        await say_all(client, 1, 12)
+    async with empty_stream(running) as path:
+        await say_all(path, 1, 12)
         sink = Memory()
-        hub = SampleHub(client, sink)
+        hub = SampleHub(path, sink)
         await hub.run(once=True)
         assert hub.state().place == 11
         assert exchanges_in(sorted(sink.rows())) == list(range(5, 60))
@@ -185,10 +185,10 @@ async def test_a_commit_ends_at_its_memory_limit(
     monkeypatch.setattr(hub_module, "MOST_READ", 1)
     monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
     sink = Memory()
-    async with client_of(running) as client:
+    async with empty_stream(running) as path:
         for sequence in (1, 2, 3):
-            await say(client, sequence, message(sequence) if is_good else b"?" * 1000)
-        await read_all(client, sink, 3, every=3600.0)
+            await say(path, sequence, message(sequence) if is_good else b"?" * 1000)
+        await read_all(path, sink, 3, every=3600.0)
     assert [commit.last for commit in sink.commits] == [1, 2, 3]
     assert len(sink.rows()) == (150 if is_good else 0)
 
@@ -198,15 +198,15 @@ def test_missing_or_doubled_messages_are_logged_and_counted(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> HubState:
-        async with client_of(running) as client:
+        async with empty_stream(running) as path:
             for sequence, source in ((1, "a.x"), (3, "b.x"), (2, "a.x"), (5, "a.x"), (5, "a.x"), (4, "a.x")):
-                await say(client, sequence, message(sequence * 5), source)
-            await say(client, 6, b"no message", "a.x")
-            await say(client, 7, message(0), "a.x", lost=70)
-            await say(client, 8, message(5), "a.x", lost=70)
-            assert await publish(client, "samples.c.x", message(0), {})
+                await say(path, sequence, message(sequence * 5), source)
+            await say(path, 6, b"no message", "a.x")
+            await say(path, 7, message(0), "a.x", lost=70)
+            await say(path, 8, message(5), "a.x", lost=70)
+            assert await publish(path, "samples.c.x", message(0), {})
             sink = Memory()
-            state = await read_all(client, sink, 10)
+            state = await read_all(path, sink, 10)
             assert sum(commit.rows for commit in sink.commits) == 6 * 50
             assert sink.commits[-1].sources == {"a.x": 8, "b.x": 3}
             return state
@@ -230,32 +230,32 @@ def test_missing_or_doubled_messages_are_logged_and_counted(
 async def test_messages_that_the_stream_removed_are_reported(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with client_of(running) as client:
-        await say_all(client, 1, 6)
-        await samples_stream._ask(client, "STREAM.PURGE.samples", {"seq": 4})
-        state = await read_all(client, Memory(), 5)
+    async with empty_stream(running) as path:
+        await say_all(path, 1, 6)
+        await samples_stream._ask(path, "STREAM.PURGE.samples", {"seq": 4})
+        state = await read_all(path, Memory(), 5)
         assert (state.alarms, state.missing) == (2, 3)
     assert "messages 1 to 3 of the stream were removed before they were read" in caplog.text
     assert f"gateway-1.{LOG}: messages 1 to 3 are missing" in caplog.text
 
 
 async def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
-    async with client_of(running) as client:
-        await say(client, 1, message(0))
+    async with empty_stream(running) as path:
+        await say(path, 1, message(0))
         sink = Memory()
         sink.commits.append(Commit("", 1, 5, {}, [], 0))
         with pytest.raises(NotThisHubs, match="the stream ends at message 1, and 5 are stored: it lost some"):
-            await SampleHub(client, sink).run()
+            await SampleHub(path, sink).run()
 
 
 # ---- Parquet ----
 
 
-def kept_in_files(client: Client, folder: Path, place: int) -> Any:
+def kept_in_files(path: ServerPath, folder: Path, place: int) -> Any:
     async def live() -> HubState:
         sink = ParquetSink(folder)
         try:
-            return await read_all(client, sink, place)
+            return await read_all(path, sink, place)
         finally:
             sink.close()
 
@@ -265,11 +265,11 @@ def kept_in_files(client: Client, folder: Path, place: int) -> Any:
 @pytest.mark.long
 async def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
     duckdb = require_module("duckdb")
-    async with client_of(running) as client:
-        await say_all(client, 1, 6)
-        assert (await kept_in_files(client, tmp_path, 5)).rows == 250
-        await say_all(client, 6, 9)
-        assert (await kept_in_files(client, tmp_path, 8)).rows == 150
+    async with empty_stream(running) as path:
+        await say_all(path, 1, 6)
+        assert (await kept_in_files(path, tmp_path, 5)).rows == 250
+        await say_all(path, 6, 9)
+        assert (await kept_in_files(path, tmp_path, 8)).rows == 150
     files = sorted((tmp_path / "rows").glob("*.parquet"))
     ranges = [tuple(map(int, file.name.split(".")[0].split("-"))) for file in files]
     assert ranges[0][0] == 1
@@ -294,13 +294,13 @@ async def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path
 
 async def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
     """A killed hub leaves one: the rows are read again."""
-    async with client_of(running) as client:
-        await say(client, 1, message(5))
-        await kept_in_files(client, tmp_path, 1)
+    async with empty_stream(running) as path:
+        await say(path, 1, message(5))
+        await kept_in_files(path, tmp_path, 1)
         part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.writing"
         part.write_bytes(b"PAR1")
-        await say(client, 2, message(10))
-        state = await kept_in_files(client, tmp_path, 2)
+        await say(path, 2, message(10))
+        state = await kept_in_files(path, tmp_path, 2)
         assert (state.rows, state.alarms) == (50, 0)
         assert not part.exists()
 
@@ -364,10 +364,10 @@ extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, driv
 
 @pytest.mark.long
 async def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
-    async with client_of(running) as client:
-        await say_all(client, 1, 6)
+    async with empty_stream(running) as path:
+        await say_all(path, 1, 6)
         sink = PostgresSink(empty.where)
-        state = await read_all(client, sink, 5)
+        state = await read_all(path, sink, 5)
         assert (state.rows, state.alarms) == (250, 0)
         sink.close()
     wanted = sorted(row for number in range(1, 6) for row in rows_of(unpack(message(number * 5))))

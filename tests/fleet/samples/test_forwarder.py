@@ -6,7 +6,6 @@ import asyncio
 import logging
 import random
 import re
-import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -14,29 +13,28 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from nats.aio.client import Client
-from nats_clusters import Cluster, cluster, old_server_program
-from sample_streams import client_of
+from nats_clusters import Cluster, cluster
+from sample_streams import empty_stream
 from spooled import exchanges_in, numbered, rows_of
 
-from multidrop.fleet.errors import TooOld
+from multidrop.fleet.errors import FleetError, NoRight, Unsure
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.message import MOST_BYTES, unpack
 from multidrop.fleet.samples.samples_stream import (
-    StreamError,
     StreamMessage,
     about,
-    connect,
     create_stream,
     digest_of,
     last_of,
     publish,
     read_after,
+    samples_path,
     subject_of,
 )
 from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.servers.connections import ServerPath
 
 PATIENCE_S = 30.0
 
@@ -47,8 +45,8 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @asynccontextmanager
-async def forwarding(spool: Spool, client: Any) -> AsyncIterator[Forwarder]:
-    forwarder = Forwarder(spool, client)
+async def forwarding(spool: Spool, path: Any) -> AsyncIterator[Forwarder]:
+    forwarder = Forwarder(spool, path)
     task = asyncio.create_task(forwarder.run())
     try:
         yield forwarder
@@ -64,10 +62,10 @@ async def until(is_so: Any) -> None:
             await asyncio.sleep(0.005)
 
 
-async def stored(client: Client) -> list[StreamMessage]:
+async def stored(path: ServerPath) -> list[StreamMessage]:
     """Return all messages of the stream."""
     found: list[StreamMessage] = []
-    while more := await read_after(client, found[-1].place if found else 0, 3, 1 << 20):
+    while more := await read_after(path, found[-1].place if found else 0, 3, 1 << 20):
         found += more
     return found
 
@@ -88,13 +86,13 @@ async def store(spool: Spool, first: int) -> None:
 
 async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
     spool = filled(tmp_path / "spool", 7)
-    async with client_of(running) as client, forwarding(spool, client) as forwarder:
+    async with empty_stream(running) as path, forwarding(spool, path) as forwarder:
         await until(lambda: forwarder.last == 7)
         await store(spool, 35)
         await until(lambda: forwarder.last == 8)
         assert (forwarder.sent, forwarder.last, forwarder.trouble) == (8, 8, None)
         assert spool.state().acknowledged == 8
-        found = await stored(client)
+        found = await stored(path)
     assert [(one.gateway, one.log, one.sequence, one.lost) for one in found] == [
         ("gateway-1", spool.log, number, 0) for number in range(1, 9)
     ]
@@ -106,41 +104,42 @@ async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: P
 async def test_a_restarted_gateway_continues_after_the_last_stored_message(
     running: Cluster, tmp_path: Path
 ) -> None:
-    async with client_of(running) as client:
+    async with empty_stream(running) as path:
         for run in range(3):
             spool = Spool(tmp_path / "spool", "gateway-1")
             spool.append(numbered(run * 10, 10))
             assert await asyncio.to_thread(spool.sync, PATIENCE_S)
-            async with forwarding(spool, client) as forwarder:
+            async with forwarding(spool, path) as forwarder:
                 await until(lambda forwarder=forwarder, run=run: forwarder.last == run + 1)
                 assert forwarder.sent == 1
             spool.close()
-        assert [one.sequence for one in await stored(client)] == [1, 2, 3]
+        assert [one.sequence for one in await stored(path)] == [1, 2, 3]
 
 
 class Lossy:
-    """A client whose answers to messages are lost, before or after the stream has them."""
+    """A path whose answers to messages are lost, before or after the stream has stored them."""
 
-    def __init__(self, client: Client, fates: str) -> None:
-        self._client, self._fates = client, iter(fates)
+    def __init__(self, path: ServerPath, fates: str) -> None:
+        self._path, self._fates = path, iter(fates)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._client, name)
+        return getattr(self._path, name)
 
-    async def request(self, subject: str, data: bytes, **details: Any) -> Any:
+    async def request(self, subject: str, data: bytes = b"", *details: Any, **more: Any) -> Any:
         fate = next(self._fates, "ok") if not subject.startswith("$JS") else "ok"
-        if fate == "b":  # lost before it was there
-            raise TimeoutError
-        if fate == "l":  # late: it arrives when it was said again
-            asyncio.get_running_loop().call_later(0.05, self._late, subject, data, details)
-            raise TimeoutError
-        answer = await self._client.request(subject, data, **details)
+        if fate == "b":  # lost before it was stored
+            raise Unsure("no answer")
+        if fate == "l":  # late: it arrives after it was sent again
+            asyncio.get_running_loop().call_later(0.05, self._late, subject, data, *details)
+            raise Unsure("no answer")
+        answer = await self._path.request(subject, data, *details, **more)
         if fate == "a":  # the answer is lost
-            raise TimeoutError
+            raise Unsure("no answer")
         return answer
 
-    def _late(self, subject: str, data: bytes, details: Any) -> None:
-        self.task = asyncio.create_task(self._client.publish(subject, data, headers=details["headers"]))
+    def _late(self, subject: str, data: bytes, headers: dict[str, str], _: float) -> None:
+        assert self._path._client
+        self.task = asyncio.create_task(self._path._client.publish(subject, data, headers=headers))
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
@@ -148,10 +147,10 @@ async def test_after_any_doubt_each_message_is_there_once(
     running: Cluster, tmp_path: Path, fates: str
 ) -> None:
     spool = filled(tmp_path / "spool", 6)
-    async with client_of(running) as client, forwarding(spool, Lossy(client, fates)) as forwarder:
+    async with empty_stream(running) as path, forwarding(spool, Lossy(path, fates)) as forwarder:
         await until(lambda: forwarder.last == 6)
         await asyncio.sleep(0.1)  # for late ones to be refused
-        assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4, 5, 6]
+        assert [one.sequence for one in await stored(path)] == [1, 2, 3, 4, 5, 6]
     spool.close()
 
 
@@ -161,39 +160,32 @@ async def test_server_answers_within_a_log_are_skipped(running: Cluster, tmp_pat
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
-    async with client_of(running) as client, forwarding(spool, client) as forwarder:
+    async with empty_stream(running) as path, forwarding(spool, path) as forwarder:
         await until(lambda: forwarder.last == 2)
         for number, headers in enumerate(answers, 3):
-            assert await publish(client, subject, b"{}", headers)
+            assert await publish(path, subject, b"{}", headers)
             await store(spool, number * 5)
             await until(lambda number=number: forwarder.last == number)
         assert (forwarder.sent, spool.state().acknowledged) == (4, 4)
-        sequences = [one.sequence for one in await stored(client) if one.data != b"{}"]
+        sequences = [one.sequence for one in await stored(path) if one.data != b"{}"]
         assert sequences == [1, 2, 3, 4]
     spool.close()
 
 
-class Refusing:
-    """A client to whose first messages the stream says that it has no room, as full servers do."""
+class Refusing(Lossy):
+    """A path on which the stream rejects the first messages for lack of room, as full servers do."""
 
-    def __init__(self, client: Client, times: int) -> None:
-        self._client, self.left = client, times
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._client, name)
-
-    async def request(self, subject: str, data: bytes, **details: Any) -> Any:
-        if self.left and not subject.startswith("$JS"):
-            self.left -= 1
+    async def request(self, subject: str, data: bytes = b"", *details: Any, **more: Any) -> Any:
+        if not subject.startswith("$JS") and next(self._fates, ""):
             return SimpleNamespace(data=b'{"error":{"err_code":10023,"description":"no room"}}')
-        return await self._client.request(subject, data, **details)
+        return await self._path.request(subject, data, *details, **more)
 
 
 async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
-    async with client_of(running) as client, forwarding(spool, Refusing(client, 5)) as forwarder:
+    async with empty_stream(running) as path, forwarding(spool, Refusing(path, "12345")) as forwarder:
         await until(lambda: forwarder.last == 2)
         await until(lambda: forwarder.trouble is None)
     spool.close()
@@ -208,9 +200,9 @@ async def test_dropped_messages_of_the_spool_are_skipped(running: Cluster, tmp_p
     spool = Spool(tmp_path / "spool", "gateway-1", most=1)
     await store(spool, 25)
     await until(lambda: spool.state().oldest == 6)
-    async with client_of(running) as client, forwarding(spool, client) as forwarder:
+    async with empty_stream(running) as path, forwarding(spool, path) as forwarder:
         await until(lambda: forwarder.last == 6)
-        (found,) = await stored(client)
+        (found,) = await stored(path)
     assert (found.sequence, found.lost) == (6, 250)
     spool.close()
 
@@ -219,19 +211,19 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
-    async with client_of(running) as client:
-        async with forwarding(spool, client) as forwarder:
+    async with empty_stream(running) as path:
+        async with forwarding(spool, path) as forwarder:
             await until(lambda: forwarder.last == 2)
         spool.close()
         (tmp_path / "spool" / "000000000002-50.arrows").unlink()
         spool = Spool(tmp_path / "spool", "gateway-1")
         for number in (100, 200):  # first as long as the stream, and then longer
-            async with forwarding(spool, client) as forwarder:
+            async with forwarding(spool, path) as forwarder:
                 await until(lambda forwarder=forwarder: forwarder.trouble)
             await store(spool, number)
-        async with forwarding(spool, client) as forwarder:
+        async with forwarding(spool, path) as forwarder:
             await until(lambda: forwarder.trouble)
-        assert [one.sequence for one in await stored(client)] == [1, 2]
+        assert [one.sequence for one in await stored(path)] == [1, 2]
         spool.close()
     told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     ends = ": its folder was copied or set back; move it away to start a new log"
@@ -245,14 +237,14 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
 async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     spool = filled(tmp_path / "spool", 3)
     with cluster(tmp_path / "nats", 1) as servers:
-        async with client_of(servers) as client, forwarding(spool, client) as forwarder:
+        async with empty_stream(servers) as path, forwarding(spool, path) as forwarder:
             await until(lambda: forwarder.last == 3)
             servers.nodes[0].kill()
             spool.append(numbered(15, 5))
             await until(lambda: forwarder.trouble)
             servers.nodes[0].start()
             await until(lambda: forwarder.last == 4)
-            assert [one.sequence for one in await stored(client)] == [1, 2, 3, 4]
+            assert [one.sequence for one in await stored(path)] == [1, 2, 3, 4]
     spool.close()
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
     assert told[0].startswith("samples are not forwarded: ")
@@ -261,54 +253,39 @@ async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pyte
 
 
 async def test_the_largest_message_comes_back(running: Cluster) -> None:
-    async with client_of(running) as client:
+    async with empty_stream(running) as path:
         data = random.Random(1).randbytes(MOST_BYTES)
         headers = {samples_stream.SEQUENCE: "7", samples_stream.DIGEST: digest_of(data)}
         for place in (1, 2, 3):
-            assert await publish(client, "samples.a.b", data, headers) == place
-        assert await last_of(client, "samples.a.b") == (3, 7, digest_of(data))
-        assert [one.data == data for one in await stored(client)] == [True] * 3
+            assert await publish(path, "samples.a.b", data, headers) == place
+        assert await last_of(path, "samples.a.b") == (3, 7, digest_of(data))
+        assert [one.data == data for one in await stored(path)] == [True] * 3
 
 
 # ---- mistakes ----
 
 
-def test_a_mute_server_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        url = f"nats://127.0.0.1:{listener.getsockname()[1]}"
-        with pytest.raises(StreamError, match="no NATS server answers at"):
-            asyncio.run(connect([url]))
-
-
-def test_an_old_server_is_refused(tmp_path: Path) -> None:
-    said = r"is 2\.\d+; a fleet needs 2\.12 or newer"
-    with cluster(tmp_path, 1, old_server_program()) as servers, pytest.raises(TooOld, match=said):
-        asyncio.run(connect(servers.urls))
-
-
 @pytest.mark.slow
 async def test_a_missing_stream_is_reported_and_awaited(running: Cluster, tmp_path: Path) -> None:
-    async with client_of(running) as client:
-        await samples_stream._ask(client, "STREAM.DELETE.samples", {})
-        for asked in (about(client), last_of(client, "samples.a.b")):
-            with pytest.raises(StreamError, match="there is no stream 'samples': create it with"):
+    async with empty_stream(running) as path:
+        await samples_stream._ask(path, "STREAM.DELETE.samples", {})
+        for asked in (about(path), last_of(path, "samples.a.b")):
+            with pytest.raises(FleetError, match="there is no stream 'samples': create it with"):
                 await asked
-        with pytest.raises(StreamError, match="there is no stream 'samples', or it has no leader now"):
-            await read_after(client, 0, 10, 1000)
-        with pytest.raises(StreamError, match=r"no stream takes samples\.a\.b"):
-            await publish(client, subject_of("a", "b"), b"", {})
+        with pytest.raises(FleetError, match="there is no stream 'samples', or it has no leader now"):
+            await read_after(path, 0, 10, 1000)
+        with pytest.raises(FleetError, match=r"no stream takes samples\.a\.b"):
+            await publish(path, subject_of("a", "b"), b"", {})
         spool = filled(tmp_path / "spool", 1)
-        async with forwarding(spool, client) as forwarder:
+        async with forwarding(spool, path) as forwarder:
             await until(lambda: forwarder.trouble)
-            await create_stream(client, replicas=1)
+            await create_stream(path, replicas=1)
             await until(lambda: forwarder.last == 1)
         spool.close()
 
 
 @pytest.mark.long
-def test_insufficient_rights_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(samples_stream, "ANSWER_S", 1.0)
+def test_insufficient_rights_are_one_sentence(tmp_path: Path) -> None:
     with cluster(tmp_path, 1) as servers:
         path = tmp_path / "n1.conf"
         servers.nodes[0].kill()
@@ -318,16 +295,16 @@ def test_insufficient_rights_are_one_sentence(tmp_path: Path, monkeypatch: pytes
         path.write_text(path.read_text() + f"authorization {{ users: [ {rights} ] }}\n")
         servers.nodes[0].start()
         servers.wait()
-        url = servers.urls[0]
 
         async def live() -> None:
-            with pytest.raises(StreamError, match="refuses these credentials, or the lack of any"):
-                await connect([url], user="gateway-2", password="wrong")
-            client = await connect([url], user="gateway-2", password="x")
-            await create_stream(client, replicas=1)
-            assert await publish(client, subject_of("gateway-2", "b"), b"", {}) == 1
-            with pytest.raises(StreamError, match=r"this connection lacks rights: .*samples\.gateway-1"):
-                await publish(client, subject_of("gateway-1", "b"), b"", {})
-            await client.close()
+            wrong, right = ({"user": "gateway-2", "password": word} for word in ("wrong", "x"))
+            with pytest.raises(FleetError, match="refuses these credentials, or the lack of any"):
+                async with samples_path(servers.urls, wrong):
+                    pass
+            async with samples_path(servers.urls, right) as path:
+                await create_stream(path, replicas=1)
+                assert await publish(path, subject_of("gateway-2", "b"), b"", {}) == 1
+                with pytest.raises(NoRight, match=r"do not allow to publish to samples\.gateway-1"):
+                    await publish(path, subject_of("gateway-1", "b"), b"", {})
 
         asyncio.run(live())

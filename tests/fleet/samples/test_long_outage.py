@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,33 +15,29 @@ from multidrop import History
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.hub import HubState, SampleHub
 from multidrop.fleet.samples.parquet_sink import ParquetSink
-from multidrop.fleet.samples.samples_stream import connect, create_stream
+from multidrop.fleet.samples.samples_stream import create_stream, samples_path
 from multidrop.fleet.samples.spool import Spool, SpoolState
+from multidrop.supervisor import end_tasks
 
 MESSAGES, EXCHANGES = 40, 5
 PATIENCE_S = 60.0
 
 
 async def forwarded(spool: Spool, servers: Cluster) -> None:
-    client = await connect(servers.urls)
-    forwarder = Forwarder(spool, client)
-    task = asyncio.create_task(forwarder.run())
-    async with asyncio.timeout(PATIENCE_S):
+    async with samples_path(servers.urls) as path, asyncio.timeout(PATIENCE_S):
+        forwarder = Forwarder(spool, path)
+        task = asyncio.create_task(forwarder.run())
         while forwarder.last != spool.state().newest:
             await asyncio.sleep(0.01)
-    task.cancel()
-    await asyncio.wait([task])
-    await client.close()
+        await end_tasks(task)
 
 
 async def kept(folder: Path, servers: Cluster) -> HubState:
-    client = await connect(servers.urls)
-    sink = ParquetSink(folder)
-    hub = SampleHub(client, sink)
-    await hub.run(once=True)
-    sink.close()
-    await client.close()
-    return hub.state()
+    async with samples_path(servers.urls) as path:
+        with closing(ParquetSink(folder)) as sink:
+            hub = SampleHub(path, sink)
+            await hub.run(once=True)
+        return hub.state()
 
 
 def filled(folder: Path, first: int, most: int) -> Spool:
@@ -74,9 +71,8 @@ def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: i
     with cluster(tmp_path / "nats", 1) as servers:
 
         async def live() -> tuple[HubState, SpoolState]:
-            client = await connect(servers.urls)
-            await create_stream(client, replicas=1)
-            await client.close()
+            async with samples_path(servers.urls) as path:
+                await create_stream(path, replicas=1)
             spool = await asyncio.to_thread(filled, tmp_path / "spool", 0, most)
             settled(spool, most)
             await forwarded(spool, servers)

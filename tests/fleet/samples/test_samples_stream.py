@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 from nats.aio.client import Client
 from nats_clusters import Cluster
-from sample_streams import client_of
+from sample_streams import empty_stream
 
 from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 
@@ -57,13 +57,13 @@ def test_headers_cannot_forge_the_origin_of_samples(
         monkeypatch.setattr(Client, "_process_headers", parser)
 
     async def live() -> list[StreamMessage]:
-        async with client_of(running) as client:
+        async with empty_stream(running) as path:
             for number, headers in enumerate(HOSTILE.values(), 1):
                 text = headers.format(f"log{number}", number, number - 1)
                 say_with(running.urls[0], "samples.evil.log", f"{text}Multidrop-Sequence: {number}\r\n")
             say_with(running.urls[0], "samples.good.log", "Multidrop-Sequence: 1\r\nMultidrop-Lost: 7\r\n")
             found: list[StreamMessage] = []
-            while more := await read_after(client, found[-1].place if found else 0, 4, 1 << 20):
+            while more := await read_after(path, found[-1].place if found else 0, 4, 1 << 20):
                 found += more
             return found
 

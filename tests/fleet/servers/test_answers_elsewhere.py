@@ -19,7 +19,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from secured_clusters import SecuredCluster, in_one_account, secured_cluster
 
-from multidrop.fleet.samples.samples_stream import STREAM, connect, create_stream
+from multidrop.fleet.samples.samples_stream import STREAM, create_stream
 from multidrop.fleet.servers.connections import paths_of
 from multidrop.fleet.servers.credentials import inbox_of, public_key
 from multidrop.fleet.servers.rights import OTHERS, rights_of
@@ -44,11 +44,9 @@ async def make_streams(servers: SecuredCluster) -> None:
     """Make a fleet's buckets and its stream of samples."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
+    await create_stream(operator[0], replicas=len(servers.nodes))
     for path in operator:
         await path.close()
-    client = await connect(servers.urls, **servers.options("operator"))
-    await create_stream(client, replicas=len(servers.nodes))
-    await client.close()
 
 
 @asynccontextmanager

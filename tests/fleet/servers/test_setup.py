@@ -67,7 +67,7 @@ class Deaf:
         self.said = said
         self.buckets = buckets
 
-    async def request(self, subject: str, data: bytes) -> SimpleNamespace:
+    async def request(self, subject: str, data: bytes, answer_s: float) -> SimpleNamespace:
         if not subject.endswith(self.buckets):
             return SimpleNamespace(data=b'{"cluster":{"leader":"n1"}}')
         if self.said is None:

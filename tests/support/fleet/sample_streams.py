@@ -1,25 +1,23 @@
-"""A connection to NATS servers with an empty stream of samples."""
+"""A path to NATS servers with an empty stream of samples."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
-from nats.aio.client import Client
 from nats_clusters import Cluster
 
+from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples import samples_stream
-from multidrop.fleet.samples.samples_stream import StreamError, connect, create_stream
+from multidrop.fleet.samples.samples_stream import create_stream, samples_path
+from multidrop.fleet.servers.connections import ServerPath
 
 
 @asynccontextmanager
-async def client_of(servers: Cluster) -> AsyncIterator[Client]:
-    """Give a connection to servers with an empty stream."""
-    client = await connect(servers.urls)
-    try:
-        with suppress(StreamError):
-            await samples_stream._ask(client, "STREAM.DELETE.samples", {})
-        await create_stream(client, replicas=1)
-        yield client
-    finally:
-        await client.close()
+async def empty_stream(servers: Cluster) -> AsyncIterator[ServerPath]:
+    """Give a path to servers with an empty stream."""
+    async with samples_path(servers.urls) as path:
+        with suppress(FleetError):
+            await samples_stream._ask(path, "STREAM.DELETE.samples", {})
+        await create_stream(path, replicas=1)
+        yield path

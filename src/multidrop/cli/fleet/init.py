@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import (
     add_server_arguments,
-    nats_options,
     require_fleet,
     run_with_paths,
-    urls_of,
 )
 from multidrop.cli.fleet.tables import size
 from multidrop.cli.support.output import print_text, warn
@@ -55,19 +53,14 @@ def run(arguments: argparse.Namespace) -> int:
 async def _init(
     arguments: argparse.Namespace, records: dict[str, Record] | None, keep: int, paths: list[ServerPath]
 ) -> int:
-    from multidrop.fleet.samples.samples_stream import close, connect, create_stream
+    from multidrop.fleet.samples.samples_stream import create_stream
     from multidrop.fleet.servers import names
     from multidrop.fleet.servers.buckets import Bucket
     from multidrop.fleet.servers.plant_store import store
     from multidrop.fleet.servers.setup import set_up
 
     made = await set_up(paths)
-    urls = urls_of(arguments)
-    client = await connect(urls, **nats_options(arguments, urls))
-    try:
-        kept = await create_stream(client, replicas=made["replicas"], most_bytes=keep)
-    finally:
-        await close(client)
+    kept = await create_stream(paths[0], replicas=made["replicas"], most_bytes=keep)
     made["samples_bytes"] = None if kept < 0 else kept
     if records is not None:
         made["lines"] = await store(Bucket(names.PLANT, lambda: paths[0]), records)

@@ -14,14 +14,11 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from nats.aio.client import Client
-
 from multidrop.fleet.samples.samples_stream import (
     DIGEST,
     EXPECTED,
     LOST,
     SEQUENCE,
-    StreamError,
     digest_of,
     end_if_cancelled,
     last_of,
@@ -29,6 +26,7 @@ from multidrop.fleet.samples.samples_stream import (
     subject_of,
 )
 from multidrop.fleet.samples.spool import Spool, StoredMessage
+from multidrop.fleet.servers.connections import ServerPath
 
 AGAIN_S = 0.25  # between attempts after a failure
 LOOKING_S = 1.0  # between checks for a message that the spool did not announce
@@ -45,10 +43,10 @@ class NotOurLog(Exception):
 
 
 class Forwarder:
-    """Sends the messages of a spool over this connection until cancelled: `await forwarder.run()`."""
+    """Sends the messages of a spool over this path until cancelled: `await forwarder.run()`."""
 
-    def __init__(self, spool: Spool, client: Client) -> None:
-        self._spool, self._client = spool, client
+    def __init__(self, spool: Spool, path: ServerPath) -> None:
+        self._spool, self._path = spool, path
         self._subject = subject_of(spool.gateway, spool.log)
         self._news = asyncio.Event()
         self.sent = 0  # messages since the start
@@ -81,7 +79,7 @@ class Forwarder:
         while True:
             try:
                 await self._forward()
-            except (StreamError, NotOurLog, OSError) as failure:
+            except (NotOurLog, OSError) as failure:
                 self._note(str(failure))
             except Exception as failure:  # such as a bug here, or MemoryError
                 self._note(f"{type(failure).__name__}: {failure}", failure)
@@ -102,7 +100,7 @@ class Forwarder:
             data = await asyncio.to_thread(_read, stored.path)
             if data is None:  # the full spool has just removed the message
                 continue
-            found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
+            found = await publish(self._path, self._subject, data, self._headers(stored, data, place))
             end_if_cancelled()
             if found is None:  # refused because an earlier attempt of ours succeeded
                 return
@@ -113,7 +111,7 @@ class Forwarder:
 
     async def _ask(self) -> tuple[int, int]:
         """Return position and sequence of the last message of this log in the stream."""
-        last = await last_of(self._client, self._subject)
+        last = await last_of(self._path, self._subject)
         end_if_cancelled()
         if last is None or last.sequence == 0:  # none is stored any longer, or the last one is forged
             sequence = self.last or 0

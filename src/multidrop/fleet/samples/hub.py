@@ -12,16 +12,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples.message import MessageError, unpack
 from multidrop.fleet.samples.samples_stream import (
     StreamAbout,
-    StreamError,
     StreamMessage,
     about,
     end_if_cancelled,
     read_after,
 )
-from multidrop.fleet.servers.batch_client import BatchClient
+from multidrop.fleet.servers.connections import ServerPath
 
 _log = logging.getLogger("multidrop.fleet.samples.hub")
 
@@ -137,8 +137,8 @@ class HubState(NamedTuple):
 class SampleHub:
     """Reads a stream into a sink, with one commit each `every` seconds or million rows."""
 
-    def __init__(self, client: BatchClient, sink: SampleSink, *, every: float = 10.0) -> None:
-        self._client, self._sink, self._every = client, sink, every
+    def __init__(self, path: ServerPath, sink: SampleSink, *, every: float = 10.0) -> None:
+        self._path, self._sink, self._every = path, sink, every
         self._sources = SourceCheck({})
         self._place = self._end = self._rows = 0
         self._trouble: str | None = None
@@ -161,7 +161,7 @@ class SampleHub:
                     pass
             except NotThisHubs:
                 raise
-            except (StreamError, SinkError) as failure:
+            except (FleetError, SinkError) as failure:
                 if once:
                     raise
                 self._note(str(failure))
@@ -170,7 +170,7 @@ class SampleHub:
                 return
 
     async def _begin(self) -> None:
-        found = await about(self._client)
+        found = await about(self._path)
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
@@ -197,17 +197,17 @@ class SampleHub:
         patient_until = time.monotonic() + BEHIND_S
         while rows < MOST_ROWS and size < MOST_BYTES and (ends is None or time.monotonic() < ends):
             place = messages[-1].place if messages else self._place
-            found = await read_after(self._client, place, MOST_READ, MOST_READ_BYTES)
+            found = await read_after(self._path, place, MOST_READ, MOST_READ_BYTES)
             end_if_cancelled()
             if not found:
                 if once and place >= self._end:
                     is_end = True
                     break
                 if once and not messages and time.monotonic() > patient_until:
-                    raise StreamError(f"messages {place + 1} to {self._end} of the stream cannot be read now")
+                    raise FleetError(f"messages {place + 1} to {self._end} of the stream cannot be read now")
                 await asyncio.sleep(LOOKING_S)
                 if not messages:
-                    self._check_end(await about(self._client))
+                    self._check_end(await about(self._path))
                     end_if_cancelled()
                 continue
             ends = ends or time.monotonic() + self._every

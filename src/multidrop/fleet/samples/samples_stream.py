@@ -10,25 +10,22 @@ import asyncio
 import base64
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from typing import Any, NamedTuple
 
-from nats.aio.client import Client
-from nats.errors import Error, NoRespondersError
-
-from multidrop.fleet.errors import TooOld, Unsure, failure_to_connect
+from multidrop.fleet.errors import FleetError, NobodyThere
 from multidrop.fleet.servers.batch_client import (
     STATUS,
-    BatchClient,
     DirectGet,
     DirectMessage,
     Request,
     last_header,
     stored_message,
 )
-from multidrop.fleet.servers.buckets import parsed_answer
-from multidrop.fleet.servers.connections import check_version
+from multidrop.fleet.servers.buckets import ServerError, ask, parsed_answer
+from multidrop.fleet.servers.connections import ServerPath
+from multidrop.supervisor import end_tasks, supervisor
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
@@ -44,10 +41,6 @@ SENTENCES = {  # error messages by code
         "or raise max_file in their jetstream blocks",
     ),
 }
-
-
-class StreamError(OSError):
-    """NATS cannot be reached, refuses a request, or has no such stream. The message is one sentence."""
 
 
 class StreamAbout(NamedTuple):
@@ -88,43 +81,25 @@ def end_if_cancelled() -> None:
         raise asyncio.CancelledError
 
 
-async def connect(servers: list[str], **options: Any) -> BatchClient:
-    """Return a connection that reconnects by itself. Raises StreamError or TooOld."""
-    client = BatchClient()
+@asynccontextmanager
+async def samples_path(
+    urls: Sequence[str], options: Mapping[str, Any] | None = None
+) -> AsyncIterator[ServerPath]:
+    """Stay connected to one of these servers. Raises FleetError if none can be used."""
+    path = ServerPath(urls, options, ANSWER_S)
     try:
-        async with asyncio.timeout(ANSWER_S):
-            await client.connect(
-                servers,
-                allow_reconnect=True,
-                max_reconnect_attempts=-1,
-                reconnect_time_wait=1,
-                ping_interval=2,
-                **{"error_cb": _ignore, **options},
-            )
-    except (Error, OSError, TimeoutError) as failure:
-        last = client.last_error or failure
-        await close(client)
-        raise StreamError(str(failure_to_connect(", ".join(servers), last))) from failure
-    try:
-        check_version(client, ", ".join(servers))
-    except TooOld:
-        await close(client)
-        raise
-    return client
+        await path.open()
+        keeping = supervisor().keep("samples path", path.keep())
+        try:
+            yield path
+        finally:
+            supervisor().let_go("samples path")
+            await end_tasks(keeping)
+    finally:
+        await path.close()
 
 
-async def close(client: Client) -> None:
-    """Close a connection, even if it is half open or its servers are gone."""
-    with suppress(Exception):
-        async with asyncio.timeout(ANSWER_S):
-            await client.close()
-
-
-async def _ignore(_: Exception) -> None:
-    """Ignore the error: callers get it too, and the client would log a traceback for each."""
-
-
-async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> int:
+async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int = -1) -> int:
     """Create the stream if it is missing, and return its size limit in bytes; -1 for none.
 
     The oldest messages are removed above `most_bytes`, which the servers reserve: a stream without a limit
@@ -141,26 +116,26 @@ async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = 
         "allow_direct": True,
         "deny_delete": True,
     }
-    found = await _ask(client, f"STREAM.INFO.{STREAM}", {}, NO_STREAM)
+    found = await _ask(path, f"STREAM.INFO.{STREAM}", {}, NO_STREAM)
     if found is None:
-        found = await _ask(client, f"STREAM.CREATE.{STREAM}", config)
+        found = await _ask(path, f"STREAM.CREATE.{STREAM}", config)
     with _as_wanted():
         return int(found["config"].get("max_bytes", -1))
 
 
-async def about(client: Client) -> StreamAbout:
-    """Return the stream's identity and extent. Raises StreamError."""
-    found = await _ask(client, f"STREAM.INFO.{STREAM}", {})
+async def about(path: ServerPath) -> StreamAbout:
+    """Return the stream's identity and extent. Raises FleetError."""
+    found = await _ask(path, f"STREAM.INFO.{STREAM}", {})
     with _as_wanted():
         config, state = found["config"], found["state"]
         if not config.get("allow_direct"):
-            raise StreamError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
+            raise FleetError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
         return StreamAbout(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
 
 
-async def last_of(client: Client, subject: str) -> LastMessage | None:
-    """Return the newest message of a subject, from the stream's leader. Raises StreamError."""
-    found = await _ask(client, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
+async def last_of(path: ServerPath, subject: str) -> LastMessage | None:
+    """Return the newest message of a subject, from the stream's leader. Raises FleetError."""
+    found = await _ask(path, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
     if found is None:
         return None
     with _as_wanted():
@@ -171,22 +146,20 @@ async def last_of(client: Client, subject: str) -> LastMessage | None:
         return LastMessage(int(message["seq"]), number, headers.get(DIGEST, ""))
 
 
-async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
+async def publish(path: ServerPath, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
     """Store a message, and return its position; None if the subject's last message is not the expected one.
 
-    After a StreamError, the message may have been stored or not.
+    After a FleetError, the message may have been stored or not.
     """
     try:
-        answer = await client.request(subject, data, timeout=ANSWER_S, headers=headers)
-    except NoRespondersError as failure:
-        raise StreamError(f"no stream takes {subject}: it is missing, or has no leader now") from failure
-    except (Error, OSError, TimeoutError) as failure:
-        raise silent(client, failure) from failure
-    found = _table(answer.data)
+        answer = await path.request(subject, data, headers, ANSWER_S)
+    except NobodyThere as failure:
+        raise FleetError(f"no stream takes {subject}: it is missing, or has no leader now") from failure
+    found = parsed_answer(answer.data)
     if error := found.get("error"):
         if error.get("err_code") == WRONG_SEQUENCE:
             return None
-        raise StreamError(f"the stream {STREAM!r} refuses a message: {error.get('description')}")
+        raise FleetError(f"the stream {STREAM!r} refuses a message: {error.get('description')}")
     with _as_wanted():
         return int(found["seq"])
 
@@ -196,53 +169,25 @@ def number_of(text: str | None) -> int:
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else 0
 
 
-async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int) -> Any:
+async def _ask(path: ServerPath, subject: str, what: Mapping[str, Any], *none: int) -> Any:
     """Return the answer of JetStream's API; None for an error whose code is in `none`."""
     try:
-        answer = await client.request(f"$JS.API.{subject}", json.dumps(what).encode(), timeout=ANSWER_S)
-    except NoRespondersError as failure:
-        raise StreamError("the NATS servers run without JetStream, or have no quorum now") from failure
-    except (Error, OSError, TimeoutError) as failure:
-        raise silent(client, failure) from failure
-    found = _table(answer.data)
-    error = found.get("error")
-    if not error:
-        return found
-    if error.get("err_code") in none:
-        return None
-    if sentence := SENTENCES.get(error.get("err_code")):
-        raise StreamError(sentence)
-    raise StreamError(f"NATS refuses {subject}: {error.get('description')}")
-
-
-def _table(data: bytes) -> dict[str, Any]:
-    try:
-        return parsed_answer(data)
-    except Unsure as failure:
-        raise StreamError(str(failure)) from None
+        return await ask(path, subject, what, ANSWER_S)
+    except NobodyThere as failure:
+        raise FleetError("the NATS servers run without JetStream, or have no quorum now") from failure
+    except ServerError as failure:
+        if failure.code in none:
+            return None
+        raise FleetError(SENTENCES.get(failure.code, str(failure))) from failure
 
 
 @contextmanager
 def _as_wanted() -> Iterator[None]:
-    """Raise StreamError if an answer lacks a field."""
+    """Raise FleetError if an answer lacks a field."""
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise StreamError("the answer of NATS lacks a field") from None
-
-
-def silent(client: Client, failure: Exception) -> StreamError:
-    """Return the error for a missing answer; a server reports missing rights in a separate message."""
-    last = client.last_error
-    if last and "permissions violation" in str(last).lower():
-        return StreamError(f"this connection lacks rights: {_text(last)}")
-    if not client.is_connected:
-        return StreamError(f"NATS cannot be reached: {_text(last or failure)}")
-    return StreamError(f"NATS did not answer within {ANSWER_S:.0f} s")
-
-
-def _text(failure: Exception) -> str:
-    return str(failure).removeprefix("nats: ") or type(failure).__name__
+        raise FleetError("the answer of NATS lacks a field") from None
 
 
 SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
@@ -263,19 +208,19 @@ class StreamMessage(NamedTuple):
     data: bytes
 
 
-async def read_after(client: BatchClient, place: int, messages: int, size: int) -> list[StreamMessage]:
+async def read_after(path: ServerPath, place: int, messages: int, size: int) -> list[StreamMessage]:
     """Return the next messages after this position, without a gap, within the limits of number and bytes.
 
-    An empty list means that there is none now. Any replica may answer. Raises StreamError.
+    An empty list means that there is none now. Any replica may answer. Raises FleetError.
     """
     wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
     get = SampleGet()
     try:
-        await client.batch(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
-    except (Error, OSError) as failure:
+        await path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
+    except FleetError as failure:
         if get.found or get.has_hole:  # each message is complete; the next call continues after the last
             return get.found
-        raise _refused(get.end_line) if get.last.done() else silent(client, failure) from failure
+        raise _refused(get.end_line) if get.last.done() else failure from failure
     return get.found
 
 
@@ -310,10 +255,10 @@ class SampleGet(DirectGet):
             self.found.append(_stream_message(stored, headers))
 
 
-def _refused(end_line: str) -> StreamError:
+def _refused(end_line: str) -> FleetError:
     if end_line.startswith("503"):
-        return StreamError(f"there is no stream {STREAM!r}, or it has no leader now")
-    return StreamError(f"the stream {STREAM!r} cannot be read: {end_line}")
+        return FleetError(f"there is no stream {STREAM!r}, or it has no leader now")
+    return FleetError(f"the stream {STREAM!r} cannot be read: {end_line}")
 
 
 def _stream_message(stored: DirectMessage, headers: bytes) -> StreamMessage:

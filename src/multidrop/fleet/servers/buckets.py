@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
 from multidrop.fleet.servers.batch_client import Request
-from multidrop.fleet.servers.connections import ServerPath
+from multidrop.fleet.servers.connections import ANSWER_S, ServerPath
 from multidrop.fleet.servers.record_shapes import largest, parsed
 
 NONE_YET = 0  # revision of a key without a record
@@ -71,13 +71,16 @@ def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
     }
 
 
-async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
+async def ask(
+    path: ServerPath, subject: str, data: Mapping[str, Any] | None = None, answer_s: float = ANSWER_S
+) -> dict[str, Any]:
     """Return JetStream's answer to a request about streams.
 
     Raises FleetError with the server's text for an error, Unsure if the servers cannot decide or the answer
     is invalid.
     """
-    message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
+    sent = json.dumps(data).encode() if data else b""
+    message = await path.request(f"$JS.API.{subject}", sent, answer_s=answer_s)
     said = parsed_answer(message.data)
     error = said.get("error")
     if error and error.get("err_code") == _UNAVAILABLE:

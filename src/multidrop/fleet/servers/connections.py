@@ -42,13 +42,16 @@ _log = logging.getLogger("multidrop.fleet")
 class ServerPath:
     """One connection: to its home server while that one answers, otherwise to any other."""
 
-    def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, urls: Sequence[str], options: Mapping[str, Any] | None = None, pong_s: float = PONG_S
+    ) -> None:
         self.urls = [masked(url) for url in urls]  # the first is the home server
         self._full = dict(zip(self.urls, urls, strict=True))  # the same URLs with users and passwords
         self.url = ""  # URL of the present server
         self.others: Sequence[ServerPath] = ()  # the other paths of this process
         self.spare = Spare()  # shared by all paths of this process
         self._options = options or {}
+        self._pong_s = pong_s
         self._client: BatchClient | None = None
         self._denials = Denials()
         self._trouble = ""  # the failure that was logged last
@@ -113,7 +116,7 @@ class ServerPath:
     async def _answers(self) -> bool:
         assert self._client is not None
         try:
-            await asyncio.wait_for(self._client.flush(), PONG_S)
+            await asyncio.wait_for(self._client.flush(), self._pong_s)
         except (NatsError, OSError, TimeoutError):
             return False
         return True
@@ -203,12 +206,12 @@ class ServerPath:
         ways = [self, *(other for other in self.others if other.is_open)]
         return await first_answer(ways, Request(subject, data), self.spare)
 
-    async def gather(self, request: Request, get: DirectGet) -> None:
+    async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
         """Collect the messages of a direct get on this path only. Raises Unsure as `request` does."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:
-            await client.batch(request, get, ANSWER_S)
+            await client.batch(request, get, silence_s)
         except (NatsError, OSError) as failure:
             denials.check_request(request.subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
@@ -251,22 +254,14 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
     except (NatsError, OSError, TimeoutError, ValueError) as failure:
         _cut(client)
         raise failure_to_connect(url, refusals[-1] if refusals else failure) from None
-    try:
-        check_version(client, url)
-    except TooOld:
-        await _close(client)
-        raise
-    return client
-
-
-def check_version(client: BatchClient, url: str) -> None:
-    """Raise TooOld if the server of this connection is older than OLDEST."""
     found = client.connected_server_version
     if (found.major, found.minor) < OLDEST:
+        await _close(client)
         raise TooOld(
             f"the NATS server at {masked(url)} is {found.major}.{found.minor}; a fleet needs "
             f"{'.'.join(map(str, OLDEST))} or newer: older ones may give one lease to two gateways"
         )
+    return client
 
 
 async def _close(client: BatchClient) -> None:
