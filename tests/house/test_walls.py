@@ -63,7 +63,18 @@ CLIENTS = {  # rooms that import only public names, and the commands that import
         "cli/hub.py",
     },
 }
-ROOMS = ("core", "drive", "families", "plant", "transport", "control", "polling", "recording", "history")
+ROOMS = (
+    "core",
+    "drive",
+    "families",
+    "plant",
+    "transport",
+    "control",
+    "polling",
+    "recording",
+    "history",
+    "params",
+)
 OPEN = {
     f"multidrop.{name}"
     for name in (

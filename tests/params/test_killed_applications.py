@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from random import Random
 from threading import Timer
+from time import monotonic
 
 import pytest
 from killable_apply import DRIVE
@@ -57,7 +58,7 @@ def lives(tmp_path: Path) -> Iterator[tuple[Lives, object]]:
     set_at_random(sim, there, Random(1))
     program = Path(__file__).parents[1] / "support" / "processes" / "killable_apply.py"
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path / "state")}
-    with Simulator([Wire([sim])]) as simulator:
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
         port = simulator.wires[0].path
         with Bus(port) as bus:
             saved = params.read(bus.attach(DelixiNative, **DRIVE), [one.code for one in there])
@@ -76,15 +77,17 @@ def lives(tmp_path: Path) -> Iterator[tuple[Lives, object]]:
 @pytest.mark.long
 def test_killed_applications_are_finished_by_the_next(lives: tuple[Lives, object], tmp_path: Path) -> None:
     killed, (sim, there) = lives
-    random, kills = Random(41), 0
+    random, kills, whole_s = Random(41), 0, 60.0
     wanted = {one.code: raw_of(sim, one) for one in there}
     while kills < KILLS:
         factory_reset(sim, there)
         sim.counters.eeprom_writes.clear()
         differing = {one.code for one in there if raw_of(sim, one) != wanted[one.code]}
-        while status := killed.live(random.uniform(0.05, 2.5)):
+        begun = monotonic()
+        while status := killed.live(random.uniform(0, whole_s) if kills or whole_s < 60 else whole_s):
             assert status == signal.SIGKILL
             kills += 1
+        whole_s = min(whole_s, monotonic() - begun)
         assert {one.code: raw_of(sim, one) for one in there} == wanted
         names = {one.code: one.name for one in there}
         assert {names[code]: 1 for code in differing} == {

@@ -235,41 +235,24 @@ def _applied_lines(result: params.Applied) -> list[str]:
 
 def _list(arguments: argparse.Namespace) -> int:
     words = arguments.words
+    held: ParameterSet | None = None
     if len(words) == 1 and not is_plant(words[0]):
         family: Any = find_model(words[0])
-        held: dict[str, int] | None = None
     else:
         target, rest = _drive_of(arguments, words)
         _check_no_more(arguments, rest)
         family = type(target.drive)
-        held = dict(_read(target).values)
-    known = parameters_of(family)
-    shown = [one for code, one in known.items() if (one.is_declared if held is None else code in held)]
-    rows = []
-    for one in shown:
-        default = one.default_raw
-        raw = None if held is None else held[one.code]
-        rows.append(
-            {
-                "code": one.code,
-                "name": one.name if one.is_declared else "",
-                "value": "" if raw is None else one.text(raw),
-                "factory": "" if default is None else one.text(default),
-                "not_written": one.never,
-            }
-            | ({} if raw is None else {"raw": raw})
-        )
+        held = _read(target)
+    rows = params.rows(family, held)
     if arguments.json:
         print_text(json.dumps({"model": family.model, "parameters": rows}, indent=2))
         return DONE
     head = ("CODE", "NAME", "VALUE", "FACTORY", "NOT WRITTEN BECAUSE")
-    table = [
-        (str(row["code"]), str(row["name"]), str(row["value"]), str(row["factory"]), str(row["not_written"]))
-        for row in rows
-    ]
-    print_text("\n".join(aligned([head, *table], "<<>><")))
-    if held is None and len(known) > len(shown):
-        print_text(f"\nand {len(known) - len(shown)} codes by rule, which are saved as raw counts")
+    keys = ("code", "name", "value", "factory", "not_written")
+    print_text("\n".join(aligned([head, *([row[key] for key in keys] for row in rows)], "<<>><")))
+    unknown = len(parameters_of(family)) - len(rows)
+    if held is None and unknown:
+        print_text(f"\nand {unknown} codes by rule, which are saved as raw counts")
     return DONE
 
 

@@ -30,6 +30,7 @@ from multidrop.gateway.live.alarms import Alarm, Alarms
 from multidrop.gateway.live.drive_reads import Identities, SideReads
 from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub
+from multidrop.gateway.live.parameter_reads import ParameterReads
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 from multidrop.gateway.live.views import troubles_of
 from multidrop.gateway.parts import LiveParts, PartContext
@@ -97,6 +98,7 @@ class Gateway:
         self.seen_frames = SeenFrames(boottime_ns, self.commands.stopped_ns)
         self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(48))
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, utc_ms)
+        self.parameter_reads = ParameterReads()
         self.identities = Identities(
             lambda: self.plant, self.bus, self._is_there, lambda: self.note_failure("identities")
         )
@@ -164,6 +166,7 @@ class Gateway:
         self.frames.close()
         await self._end_of("web", left_s(2.4), self._end_server(server))
         await self._end_of("side reads", left_s(2.4), self.side_reads.close())
+        await self._end_of("parameter reads", left_s(2.4), self.parameter_reads.close())
         await self._end_of("reload", left_s(2.4), self.reload.close())
         if self.poller is not None:
             closing = supervisor().within("polling", END_S, self.poller.close)

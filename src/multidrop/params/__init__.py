@@ -16,3 +16,4 @@ from multidrop.params.values import ParameterSet as ParameterSet
 from multidrop.params.values import compare as compare
 from multidrop.params.values import defaults as defaults
 from multidrop.params.values import read as read
+from multidrop.params.values import rows as rows

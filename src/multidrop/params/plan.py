@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from multidrop.control.rules import check_plain, raw_count
 from multidrop.drive.family import Drive
 from multidrop.drive.parameters import Parameter, parameters_of
+from multidrop.drive.register import Register
 from multidrop.drive.state import Condition
 from multidrop.errors import Advice, Unsupported, WriteForbidden
 from multidrop.params.values import ParameterSet, Progress, check_same_model, parameter_of, read, text_of
@@ -149,17 +150,25 @@ def check_stands(drive: Drive, *, is_first: bool = False) -> None:
 def _check_no_run_command(drive: Drive) -> None:
     """Raise WriteForbidden if the motor has a run command at 0 Hz, or may get one from panel or terminals."""
     status = drive.registers.get("status")
-    run = getattr(status.values, "RUN", None) if status is not None and status.readable else None
+    run = _member(status, "run")
     if status is not None and isinstance(run, Flag) and run in drive.read(status):
         raise _runs(drive, "its status shows a run command")
     source = drive.registers.get("run_source")
-    line = None if source is None else getattr(source.values, "LINE", None)
+    line = _member(source, "line")
     if source is not None and line is not None and (held := drive.read(source)) != line:
         raise WriteForbidden(
             f"nothing is written to {drive.name}: {source.place or source.name} is {source.format(held)}, so "
             f"its panel or a terminal may start the motor while parameters change; set it to {int(line)} "
             "(the line) on the panel first"
         )
+
+
+def _member(register: Register[Any] | None, name: str) -> Any:
+    """Return a register's named value, in capitals or not; None if it has none of this name."""
+    if register is None or register.values is None or not register.readable:
+        return None
+    members: Any = register.values
+    return next((one for one in members if one.name.lower() == name), None)
 
 
 def _runs(drive: Drive, why: str) -> WriteForbidden:

@@ -204,6 +204,30 @@ class _Reader:
             self.drive.read(probe)
 
 
+def rows(family: Any, held: ParameterSet | None = None) -> list[dict[str, Any]]:
+    """Return a dict for each parameter of a set, with texts and the reason why it is not written.
+
+    Without a set, return the declared parameters of the family, with "value" empty and no "raw".
+    """
+    known = parameters_of(family)
+    if held is None:
+        shown: dict[str, int | None] = {code: None for code, one in known.items() if one.is_declared}
+    else:
+        shown = {code: raw for code, raw in held.values.items() if code in known}
+    found = []
+    for code, raw in shown.items():
+        one = known[code]
+        row = {
+            "code": code,
+            "name": one.name if one.is_declared else "",
+            "value": "" if raw is None else one.text(raw),
+            "factory": "" if one.default_raw is None else one.text(one.default_raw),
+            "not_written": one.never,
+        }
+        found.append(row if raw is None else row | {"raw": raw})
+    return found
+
+
 # ---- comparing ----
 
 

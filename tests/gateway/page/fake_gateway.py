@@ -55,6 +55,7 @@ class FakeGateway:
         self.knows_since = 0  # UTC, ms: it has no alarms of before
         self.maximum_hz = 50.0  # that the drive holds
         self.has_changed = False  # it knows no alarm that is acknowledged
+        self.parameters: list[dict[str, Any]] = []  # answers for parameters, the last one again and again
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
         self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # of a stop of the fleet
         self.reloaded: dict[str, Any] = {
@@ -161,6 +162,9 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
                 self.frame(int(asked["after"][0]))
             elif url.path.startswith("/api/drive/"):
                 self.tell(drive(unquote(url.path[len("/api/drive/") :]), gateway))
+            elif url.path.startswith("/api/parameters/"):
+                left = gateway.parameters if "read" in asked or len(gateway.parameters) < 3 else []
+                self.tell((left.pop(0) if len(left) > 1 else left[0]) if left else {"state": "none"})
             elif url.path in ANSWERS:
                 ANSWERS[url.path](self, gateway, asked)
             else:

@@ -103,6 +103,24 @@ def line_of_one(number: int, most: float) -> dict[str, Any]:
     return line | {"drives": [drive | {"registers": registers}]}
 
 
+def test_parameters_are_read_when_the_user_asks(opened: Opener, gateway: FakeGateway) -> None:
+    row = {"code": "P00.11", "name": "acceleration_time", "value": "10.0 s", "factory": "20.0 s"}
+    gateway.parameters = [
+        {"state": "reading", "done": 0, "total": 0},
+        {"state": "reading", "done": 40, "total": 200},
+        {"state": "read", "saved": "2026-11-29T07:00:00Z", "parameters": [row]},
+    ]
+    page = opened()
+    page.get_by_role("link", name="pump-1").click()
+    page.get_by_role("button", name="Read all parameters").click()
+    page.locator("#parameters", has_text="Read 40 of 200 addresses.").wait_for()
+    shown = page.locator("#parameters tbody tr")
+    until_met(page, lambda: shown.count() == 1)
+    assert shown.inner_text().split() == ["P00.11", "acceleration", "time", "10.0", "s", "20.0", "s"]
+    link = page.get_by_role("link", name="Save as CSV").get_attribute("href")
+    assert link == "api/parameters/pump-1?format=csv"
+
+
 def test_motor_speed_is_not_labelled_frequency(opened: Opener, gateway: FakeGateway) -> None:
     line = line_of_one(0, 50)
     (drive,) = line["drives"]

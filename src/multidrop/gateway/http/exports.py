@@ -16,7 +16,9 @@ from urllib.parse import quote
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from multidrop import params
 from multidrop.gateway.http.messages import Denied
+from multidrop.gateway.live.parameter_reads import ParameterRead
 from multidrop.supervisor import supervisor
 
 MOST_EXPORTS = 8  # concurrent exports
@@ -25,6 +27,10 @@ R = TypeVar("R")
 MOST_NAME = 80  # characters of a series' name in a file name
 FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # signs that some systems forbid in file names
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+PARAMETER_KINDS = {
+    "toml": (params.to_toml, "application/toml; charset=utf-8"),
+    "csv": (params.to_csv, KINDS["csv"]),
+}
 
 
 class Exports:
@@ -57,9 +63,7 @@ class _Export(StreamingResponse):
     """One export, until its client has received all or disconnected."""
 
     def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str, name: str) -> None:
-        plain = name.encode("ascii", "replace").decode().replace("?", "_")
-        named = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"
-        super().__init__(_through(pieces), media_type=KINDS[kind], headers={"content-disposition": named})
+        super().__init__(_through(pieces), media_type=KINDS[kind], headers=_attachment(name))
         self._exports = exports
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -67,6 +71,20 @@ class _Export(StreamingResponse):
             await super().__call__(scope, receive, send)
         finally:
             self._exports.under_way -= 1
+
+
+def parameter_file(read: ParameterRead, kind: str) -> Response:
+    """Return a drive's parameters as a TOML or CSV file. Raises Denied for another format."""
+    if read.found is None or kind not in PARAMETER_KINDS:
+        raise Denied(400, f"format = {kind[:20]!r} is neither toml nor csv")
+    make, media_type = PARAMETER_KINDS[kind]
+    name = f"{_what([f'{read.drive.name}.'])} {read.found.saved.replace(':', '-')}.{kind}"
+    return Response(make(read.found, type(read.drive)), media_type=media_type, headers=_attachment(name))
+
+
+def _attachment(name: str) -> dict[str, str]:
+    plain = name.encode("ascii", "replace").decode().replace("?", "_")
+    return {"content-disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"}
 
 
 async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:

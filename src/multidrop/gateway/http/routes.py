@@ -24,7 +24,7 @@ from multidrop.control import CommandResult, read_audit
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import STOPPING, Admit
-from multidrop.gateway.http.exports import Exports
+from multidrop.gateway.http.exports import Exports, parameter_file
 from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard, Needed
 from multidrop.gateway.http.messages import (
     Denied,
@@ -89,6 +89,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/page/{name:path}", files.file),
         Route("/api/plant", pages.plant),
         Route("/api/drive/{name:path}", pages.drive),
+        Route("/api/parameters/{name:path}", pages.parameters),
         Route("/api/lines", pages.lines),
         Route("/api/minute", pages.minute),
         Route("/api/fleet", pages.fleet),
@@ -214,6 +215,19 @@ class _Pages:
             return JsonResponse(await drive_view(self._gateway, request.path_params["name"]))
         except ValueError as unknown:
             return _error(404, str(unknown))
+
+    async def parameters(self, request: Request) -> Response:
+        """Return a drive's parameters as JSON, or with `format` as a file; with `read`, read them first."""
+        reads, query, name = self._gateway.parameter_reads, request.query_params, request.path_params["name"]
+        try:
+            read = (reads.begin if "read" in query else reads.of)(self._gateway.plant, name)
+        except ValueError as unknown:
+            return _error(404, str(unknown))
+        if "format" not in query:
+            return JsonResponse({"state": "none"} if read is None else read.as_json())
+        if read is None or read.found is None:
+            return _error(409, "the parameters are not read yet")
+        return parameter_file(read, query["format"])
 
     async def lines(self, request: Request) -> Response:
         return JsonResponse(line_views(self._gateway))

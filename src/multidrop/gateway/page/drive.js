@@ -6,6 +6,7 @@ import * as details from "./details.js";
 import { fill, find, glyph, make, named, put } from "./dom.js";
 import { now } from "./link.js";
 import * as plots from "./panel_plots.js";
+import * as parameters from "./parameters.js";
 import * as registers from "./registers.js";
 import { driveAge, isLive, known, noteOf, onPlant, state, store } from "./store.js";
 import { stopOne } from "./stop.js";
@@ -97,6 +98,7 @@ function build({ spec, line }) {
     plots.build(spec),
     registers.build(spec),
     details.build(spec),
+    parameters.build(spec),
   );
   plots.begin(spec);
 }

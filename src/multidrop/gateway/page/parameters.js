@@ -1,0 +1,68 @@
+// All parameters of the selected drive, read on request: a table, and files of it. Nothing is written.
+
+import { get, query } from "./api.js";
+import { fill, find, make, tableHead } from "./dom.js";
+import { words } from "./values.js";
+
+const AGAIN_MS = 1000; // between two requests while the gateway reads
+
+let name = null;
+
+export function build(spec) {
+  name = spec.name;
+  const section = make("section", { id: "parameters", "aria-label": "Parameters" });
+  ask(spec.name, {});
+  return section;
+}
+
+const path = (drive, pairs) => `api/parameters/${encodeURIComponent(drive)}?${query(pairs)}`;
+
+// Fetch and redraw, and again while the gateway reads; a failure is shown in place of the data.
+async function ask(drive, pairs) {
+  const found = await get(path(drive, pairs)).catch(error => ({ state: "failed", error: error.message }));
+  if (drive !== name || !find("#parameters")) return;
+  fill(find("#parameters"), make("h3", {}, "Parameters"), ...shown(drive, found));
+  if (found.state === "reading") setTimeout(() => drive === name && ask(drive, {}), AGAIN_MS);
+}
+
+function shown(drive, found) {
+  if (found.state === "reading")
+    return [note(found.total ? `Read ${found.done} of ${found.total} addresses.` : "Reading starts.")];
+  const button = make(
+    "button",
+    { type: "button", onclick: () => ask(drive, { read: 1 }) },
+    found.state === "read" ? "Read again" : "Read all parameters",
+  );
+  if (found.state === "failed") return [note(found.error), button];
+  if (found.state !== "read") return [button];
+  return [
+    note(`${found.parameters.length} parameters, read at ${found.saved}.`),
+    make("div", { class: "acts" }, button, ...["toml", "csv"].map(format => file(drive, format))),
+    make(
+      "table",
+      { class: "plain" },
+      tableHead(["Parameter", "Value", "Factory"]),
+      make("tbody", {}, found.parameters.map(row)),
+    ),
+  ];
+}
+
+const note = text => make("p", { class: "note" }, text);
+
+const file = (drive, format) =>
+  make(
+    "a",
+    { class: "button", href: path(drive, { format }), download: "" },
+    `Save as ${format.toUpperCase()}`,
+  );
+
+function row({ code, name: register, value, factory }) {
+  const label = register ? make("small", {}, words(register)) : null;
+  return make(
+    "tr",
+    {},
+    make("th", { scope: "row" }, `${code} `, label),
+    make("td", {}, value),
+    make("td", {}, factory),
+  );
+}
