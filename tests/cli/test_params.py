@@ -6,15 +6,20 @@ import json
 import os
 import pty
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import patient
 import pytest
-from commands import MULTIDROP, Run
+from commands import Run
 from parameter_drives import with_parameters
 
-from multidrop import ErmanERG220
+from multidrop import ErmanERG220, cli
 from multidrop.sim import MotorDrive, Simulator, Wire
+
+pytestmark = pytest.mark.usefixtures("_patient")
+PATIENT_MULTIDROP = [sys.executable, patient.__file__, str(Path(cli.__file__).parents[1] / "__main__.py")]
 
 
 @pytest.fixture
@@ -70,7 +75,9 @@ def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim
     assert "--commissioning is for a person at a terminal" in err
     ours, theirs = pty.openpty()
     try:
-        done = subprocess.run([*MULTIDROP, *map(str, words)], stdin=theirs, capture_output=True, timeout=60)
+        done = subprocess.run(
+            [*PATIENT_MULTIDROP, *map(str, words)], stdin=theirs, capture_output=True, timeout=60
+        )
     finally:
         os.close(ours)
         os.close(theirs)

@@ -11,20 +11,29 @@ import os
 import sys
 import traceback
 from pathlib import Path
+from typing import Any
 
-from multidrop import Bus, DelixiNative, params
+from multidrop import Bus, BusError, DelixiNative, params
 
-DRIVE = {"address": 1, "baudrate": 38400}
+DRIVE: Any = {"address": 1, "baudrate": 38400}
+TRIES = 20  # replies may be missed on a busy machine
 
 
 def apply(port: str, file: str, report: str) -> None:
-    with Bus(port) as bus:
+    reported: list[str] = []
+    with Bus(port, expiry=60) as bus:
         drive = bus.attach(DelixiNative, **DRIVE)
-        result = params.apply(drive, params.load(file), commissioning=True)
-    if not result.ok:
-        raise SystemExit(f"{result.failure} {result.refused}")
-    own = [change.parameter.code for change in result.written]
-    Path(report).write_text("\n".join([*own, *result.earlier]))
+        for _ in range(TRIES):
+            try:
+                result = params.apply(drive, params.load(file), commissioning=True)
+            except BusError:
+                continue
+            reported += [*(change.parameter.code for change in result.written), *result.earlier]
+            if result.ok:
+                break
+        else:
+            raise SystemExit("the application does not end")
+    Path(report).write_text("\n".join(reported))
 
 
 def main() -> None:
