@@ -23,7 +23,7 @@ from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.recording import open_recording
 
-OUT, SECONDS = "demo.arrows", 10.0
+OUT, SECONDS = "demo.arrows", 8.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,10 +83,9 @@ class NextCommand(NamedTuple):
     extra: str = ""
 
     @property
-    def lacks(self) -> str:
-        """How to install what is missing; "" if nothing is."""
-        is_there = all(map(find_spec, LIBRARIES[self.extra]))
-        return "" if is_there else f"; first: {install_command(self.extra)}"
+    def lacks(self) -> bool:
+        """Return whether a library of the extra is missing."""
+        return not all(map(find_spec, LIBRARIES[self.extra]))
 
 
 LIBRARIES = {"": (), "plot": ("matplotlib",), "serve": ("starlette", "uvicorn")}
@@ -103,8 +102,11 @@ def _next(commands: Sequence[NextCommand]) -> Iterator[str]:
     """Yield the next commands, with the program as it was typed."""
     typed = sys.argv[0]
     program = typed if Path(typed).name == "multidrop" and which("multidrop") != typed else "multidrop"
-    rows = [(f"  {command_line([program, *one.words])}", one.effect + one.lacks) for one in commands]
+    rows = [(f"  {command_line([program, *one.words])}", one.effect) for one in commands]
     yield from ("", "Next:", *aligned(rows, "<<"))
+    if lacking := [one for one in commands if one.lacks]:
+        wanted = " ".join(install_command(one.extra).removeprefix("pip install ") for one in lacking)
+        yield f"first: {Path(program).with_name('pip')} install {wanted}"
 
 
 def _check_web(arguments: argparse.Namespace) -> None:

@@ -51,10 +51,10 @@ DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
 POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line has time for two requests at 9600 bit/s
 SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings that explain terminals
-EVERY, SLOW = "400 ms", "10 s"
+EVERY, SLOW = "400 ms", "2 s"
 MAXIMUM_HZ = 50
 TROUBLE = {  # faults of single drives
-    "fan-1": 'trip = "30 s"\nfirst = "4 s"',
+    "fan-1": 'trip = "30 s"\nfirst = "3 s"',
     "belt-5": 'trip = "50 s"',
     "belt-6": 'silence = "40 s"\nsilent_for = "3 s"\nfirst = "2 s"',
     "pump-2": 'silence = "70 s"',
