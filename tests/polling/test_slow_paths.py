@@ -1,12 +1,13 @@
-"""A path that delays everything and keeps the order, such as a modem, a gateway or a stalled network.
+"""Paths that delay replies, such as a modem, a gateway or a stalled network, on a clock that the test sets.
 
-No value is assigned to the wrong register, and polling continues. The tests set the clock.
+No value is assigned to the wrong register, and polling continues. Over Modbus TCP a reply with its id needs
+no proof; a gateway that replies with its own ids is treated like RTU.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 from examples import every_fourth, usually
@@ -26,11 +27,13 @@ from stories import (
     read_truly,
     stalling,
 )
+from tables import table
 from variants import LINES, of_all_variants, of_one_variant
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
-from multidrop.core import Framing, Message
+from multidrop.core import Framing, Message, Status, TransactionIds
+from multidrop.drive import Drive
 from multidrop.errors import BusError
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
@@ -52,13 +55,61 @@ READS = every_fourth(LINES, PATHS, [(name, (constant, 0.6)) for name in LINES])
 ASKED = [pair for pair in READS if "native" not in pair.values[0]]
 
 
+def check_story(story: Path, slow: tuple[Callable[[float], Delay], float]) -> None:
+    """Assert that each drive is read, truly."""
+    path, seconds = slow
+    answering = story.run_over(path(seconds), TAIL + TURNS * seconds)
+    assert answering == {drive.name for drive in story.drives}
+
+
+def check_writes(opened: Bus, line: PathLine, sim: SimulatedDrive, name: str) -> None:
+    """Assert that what each of thirty writes reports is true."""
+    (drive,) = opened.drives
+    done = 0
+    with opened:
+        for turn in range(30):
+            asked = float(10 + turn % 3)
+            try:
+                outcome = drive.try_write(drive.register(name), asked)
+            except BusError:
+                line.sleep(0.05)
+                continue
+            if outcome.effect is Effect.UNCONFIRMED:
+                continue
+            assert outcome.effect is Effect.DONE
+            assert (outcome.held, sim[name]) == (asked, asked)
+            done += 1
+    assert done > 10
+
+
+def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float) -> int:
+    """Assert that a stop leaves at once and is seen to be done; return how often it was sent."""
+    assert isinstance(sim, MotorDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    received = ReceivedRequests(sim)
+    sent_after: list[float] = []
+    begun = line.now
+
+    def note(request: Message) -> bool:
+        if request in received.writes:
+            sent_after.append((line.now - begun) / S)
+        return False
+
+    received.loses = note
+    with opened:
+        line.wire.advance(line.now / S)  # its clock starts
+        sim.motor.run(1)
+        opened.drives[0].stop()
+    assert not sim.motor.energised
+    assert sent_after[0] < 1  # after the answered reads, and one without an answer
+    assert (line.now - begun) / S < 8 * seconds + 3
+    return len(sent_after)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "slow"), STORIES)
 def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[float], Delay], float]) -> None:
-    path, seconds = slow
-    story = Path(of_one_variant(LINES[name]))
-    answering = story.run_over(path(seconds), TAIL + TURNS * seconds)
-    assert answering == {drive.name for drive in story.drives}
+    check_story(Path(of_one_variant(LINES[name])), slow)
 
 
 @pytest.mark.long
@@ -136,25 +187,8 @@ WRITTEN = {
 def test_what_became_of_a_write_over_a_slow_path_is_true(
     name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    drive = WRITTEN[name]
-    sim = simulated(drive)
-    opened, line = path_of([sim], constant(seconds))
-    register = drive.register(name)
-    done = 0
-    with opened:
-        for turn in range(30):
-            asked = float(10 + turn % 3)
-            try:
-                outcome = drive.try_write(register, asked)
-            except BusError:
-                line.sleep(0.05)
-                continue
-            if outcome.effect is Effect.UNCONFIRMED:
-                continue
-            assert outcome.effect is Effect.DONE
-            assert (outcome.held, sim[name]) == (asked, asked)
-            done += 1
-    assert done > 10
+    sim = simulated(WRITTEN[name])
+    check_writes(*path_of([sim], constant(seconds)), sim, name)
 
 
 @pytest.mark.parametrize("name", WRITTEN)
@@ -199,29 +233,8 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     """Its first frame leaves at once; its later reads wait as long as replies are known to take."""
-    drive = MAKE[model](1)
-    sim = simulated(drive)
-    assert isinstance(sim, MotorDrive)
-    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
-    opened, line = path_of([sim], constant(seconds))
-    received = ReceivedRequests(sim)
-    sent_after: list[float] = []
-    begun = line.now
-
-    def note(request: Message) -> bool:
-        if request in received.writes:
-            sent_after.append((line.now - begun) / S)
-        return False
-
-    received.loses = note
-    with opened:
-        line.wire.advance(line.now / S)  # its clock starts
-        sim.motor.run(1)
-        opened.drives[0].stop()
-    assert not sim.motor.energised
-    assert sent_after[0] < 1  # after the answered reads, and one without an answer
-    assert len(sent_after) <= 6
-    assert (line.now - begun) / S < 8 * seconds + 3
+    sim = simulated(MAKE[model](1))
+    assert check_stop(*path_of([sim], constant(seconds)), sim, seconds) <= 6
 
 
 @pytest.mark.long
@@ -230,3 +243,131 @@ def test_all_families_on_a_slow_path_that_is_rough_too(kind: str) -> None:
     story = Path(of_all_variants())
     story.wire.faults = Faults(**{kind: 0.1})
     story.run_over(stalling(3.0))
+
+
+# ---- Modbus TCP: late, doubled and reordered replies ----
+
+
+TCP = "tcp://test-line:502"
+FAMILIES = {family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000)}
+TCP_PATHS = [
+    (path, seconds)
+    for path, delays in ((constant, (0.0, 0.3, 0.6, 1.5, 10.0)), (jittering, (0.6, 10.0)))
+    for seconds in delays
+]
+ON_TCP_PATHS = every_fourth(FAMILIES, TCP_PATHS, [("innovert-ibd", (constant, 0.6))])
+KINDS = ("delay", "twice", "merge")  # faults of a gateway that keep the stream in step
+
+
+class TrueIds(PathWire):
+    """A path behind a gateway that replies with the requests' ids, late as it likes."""
+
+    most_late = 2.0
+
+
+class OwnIds(PathWire):
+    """A path behind a gateway that counts its replies, whatever their requests' ids were."""
+
+    ids = TransactionIds.IGNORE
+    most_late = 0.25  # s out of order: beyond the window of three time-outs no rule holds without ids
+    count = 0
+
+    def distort(self, reply: bytes) -> bytes:
+        self.count += 1
+        return (self.count & 0xFFFF).to_bytes(2) + reply[2:]
+
+
+class TrueIdsPath(Path):
+    wires = TrueIds
+
+
+class OwnIdsPath(Path):
+    wires = OwnIds
+
+
+every_gateway = pytest.mark.parametrize("story_of", usually(OwnIdsPath, TrueIdsPath))
+
+
+def two_of(name: str) -> list[Drive]:
+    return [FAMILIES[name](address, name=f"drive-{address}") for address in (1, 2)]
+
+
+@pytest.mark.long
+@every_gateway
+@pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
+def test_a_slow_gateway_costs_time_and_no_truth(
+    name: str, slow: tuple[Callable[[float], Delay], float], story_of: type[Path]
+) -> None:
+    story = story_of(two_of(name), port=TCP)
+    assert {drive.framing for drive in story.drives} == {Framing.TCP}
+    check_story(story, slow)
+
+
+@pytest.mark.long
+@every_gateway
+@pytest.mark.parametrize("kind", usually(*KINDS))
+def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, story_of: type[Path]) -> None:
+    story = story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP)
+    story.wire.faults = Faults(**{kind: 0.2, "late": story.wire.most_late})
+    story.run_over(stalling(1.0))
+    assert story.wire.struck[kind] > 50
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("story_of", usually(TrueIdsPath, OwnIdsPath))
+def test_a_stalled_gateway_costs_no_truth(story_of: type[Path]) -> None:
+    story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).run_over(
+        stalling(15.0)
+    )
+
+
+@pytest.mark.long
+def test_what_is_provably_late_holds_nothing_up() -> None:
+    """No request waits for a late reply, and none is sent to prove anything."""
+    story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
+    story.run_over(stalling(3.0))
+    told = story.clocked.poller.summary()["lines"]["line"]
+    assert told["late_replies"] > 0
+    assert str(Status.LATE_ANSWER_DUE) not in told["misses"]
+    assert {drive for drive, peer in story.clocked.poller.bus("line").peers.items() if peer.proofs} == set()
+
+
+@pytest.fixture(params=[TrueIds, OwnIds])
+def gateway_path_of(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[Bus, PathLine]]:
+    def made(sims: Sequence[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
+        return bus_over(request.param(sims, Faults(), port=TCP), delay, sims, monkeypatch)
+
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
+def test_what_a_bus_reads_over_a_slow_gateway_is_true(
+    name: str,
+    slow: tuple[Callable[[float], Delay], float],
+    gateway_path_of: Callable[..., tuple[Bus, PathLine]],
+) -> None:
+    path, seconds = slow
+    drives = two_of(name)
+    read_truly(*gateway_path_of([EncodedDrive(drive) for drive in drives], path(seconds)), drives)
+
+
+@pytest.mark.slow
+@table("seconds", [0.0, 0.6, 4.0])
+def test_what_became_of_a_write_over_a_slow_gateway_is_true(
+    seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    sim = simulated(InnovertIBD(1, ram=["acceleration_time"]))
+    check_writes(*gateway_path_of([sim], constant(seconds)), sim, "acceleration_time")
+
+
+@pytest.mark.slow
+@table("seconds", [0.0, 0.6])
+@table("model", FAMILIES)
+def test_a_stop_over_a_slow_gateway_is_seen_to_be_done(
+    model: str, seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    sim = simulated(DelixiModbus(1) if model == "delixi-modbus" else MAKE[model](1))
+    check_stop(*gateway_path_of([sim], constant(seconds)), sim, seconds)
