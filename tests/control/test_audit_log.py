@@ -1,9 +1,11 @@
-"""The audit log: each write with its frame, its outcome and the reason for it."""
+"""The audit log: each write with its author, its frame, its outcome and the reason for it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import nullcontext
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,12 @@ import pytest
 from simulated_bus import SimulatedBus, one
 
 from multidrop.control.audit_log import read_audit
+from multidrop.control.author import written_by
+from multidrop.control.ramp import start_staggered
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
+from multidrop.drive import Condition
 from multidrop.errors import (
+    BusError,
     DriveException,
     LineError,
     Unconfirmed,
@@ -127,3 +133,166 @@ def test_a_write_without_an_outcome_is_recorded(
     line.bus.close()
     (record,) = list(read_audit(log))[1:]
     assert (record["write"], record["outcome"], bool(record["why"])) == (what, "unconfirmed", True)
+
+
+# ---- authors ----
+
+
+Noted = list[tuple[str, str | None, str | None]]
+
+
+class Audited:
+    """A bus with one CHE, and what its log says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+        self.path = path
+        self.line: SimulatedBus
+        self.line, self.drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+        self.bus = self.line.bus
+
+    def noted(self) -> Noted:
+        self.bus._records.flush(60)
+        return [(entry["write"], entry.get("by"), entry.get("way")) for entry in read_audit(self.path)]
+
+
+@pytest.fixture
+def audited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Audited]:
+    made = Audited(monkeypatch, tmp_path / "audit.jsonl")
+    with made.bus:
+        yield made
+
+
+def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
+    bus, drive = audited.bus, audited.drive
+    with written_by("anna", "web, 10.0.0.7"):
+        drive.set_frequency(20)
+        drive.start()
+        drive.stop()
+        drive.send_raw(6, 0x1000, b"\0\5")
+        bus.broadcast(drive.control, CHEControl.STOP)
+        bus.stop_all()
+    with written_by("boris"):
+        drive.set_frequency(30)
+    drive.set_frequency(10)
+    noted = audited.noted()
+    annas = [entry for entry in noted if entry[1] == "anna"]  # a stop's last record may follow later writes
+    assert {write.partition(" = ")[0] for write, _, _ in annas} >= {"setpoint", "control"}
+    assert len(annas) >= 6
+    assert {way for _, _, way in annas} == {"web, 10.0.0.7"}
+    assert [entry for entry in noted if entry[1] != "anna"] == [
+        ("setpoint = 60.00 %", "boris", None),
+        ("setpoint = 20.00 %", None, None),
+    ]
+
+
+def test_a_write_in_doubt_has_its_author(audited: Audited) -> None:
+    audited.line.loses = lambda request: request.function == 6
+    with written_by("anna"), suppress(Unconfirmed):
+        audited.drive.set_frequency(20)
+    assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
+
+
+def test_a_stop_that_follows_a_failed_start_is_its_callers(audited: Audited) -> None:
+    """`start_staggered` stops its drives on threads of their own."""
+    drive = audited.drive
+    drive.set_frequency(20)
+    audited.line.loses = lambda request: request.data == b"\0\1"
+    with written_by("anna"), pytest.raises(BusError):
+        start_staggered([drive], gap=1.0)
+    assert [by for _, by, _ in audited.noted()][1:] == ["anna"] * (len(audited.noted()) - 1)
+    assert ("stop", "anna", None) in audited.noted()
+
+
+def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
+    drive, turn = audited.drive, asyncio.Lock()  # the simulated bus bears one caller at a time
+
+    async def write(name: str, hz: float, mine: asyncio.Event, other: asyncio.Event) -> None:
+        with written_by(name, "asyncio"):
+            mine.set()
+            await other.wait()
+            async with turn:
+                await asyncio.to_thread(drive.set_frequency, hz)
+
+    async def both() -> None:
+        first, second = asyncio.Event(), asyncio.Event()
+        await asyncio.gather(write("anna", 20, first, second), write("boris", 30, second, first))
+
+    asyncio.run(both())
+    with written_by("carla"):
+        thread = threading.Thread(target=drive.set_frequency, args=[10])
+        thread.start()
+        thread.join()
+    assert sorted(audited.noted()[:2]) == [
+        ("setpoint = 40.00 %", "anna", "asyncio"),
+        ("setpoint = 60.00 %", "boris", "asyncio"),
+    ]
+    assert audited.noted()[2:] == [("setpoint = 20.00 %", None, None)]
+
+
+def test_the_innermost_block_counts_and_ends(audited: Audited) -> None:
+    with written_by("anna", "web"):
+        with written_by("boris"), suppress(ZeroDivisionError):
+            audited.drive.set_frequency(20)
+            _ = 1 / 0
+        audited.drive.set_frequency(30)
+    assert [(by, way) for _, by, way in audited.noted()] == [("boris", None), ("anna", "web")]
+
+
+class Nameless:
+    """An object that cannot be shown."""
+
+    def __repr__(self) -> str:
+        raise ZeroDivisionError
+
+
+NAMES: list[tuple[Any, str | None]] = [  # and as it is noted of a stop
+    ("", None),
+    ("  ", None),
+    ("a\nb", r"a\nb"),
+    ("\x1b[2J", r"\x1b[2J"),
+    ("\ud800", r"\ud800"),
+    ("x" * 201, "x" * 200),
+    (7, "7"),
+    (None, "None"),
+    (Nameless(), "Nameless"),
+]
+
+
+@pytest.mark.parametrize(("who", "noted"), NAMES, ids=range(len(NAMES)))
+@pytest.mark.parametrize("is_way", [False, True])
+def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
+    audited: Audited, who: Any, noted: str | None, is_way: bool
+) -> None:
+    bus, drive = audited.bus, audited.drive
+    if is_way and who == "":
+        return  # no way
+    drive.set_frequency(30)
+    with written_by(*(("anna", who) if is_way else (who, "web"))):
+        for call in (
+            lambda: drive.set_frequency(20),
+            drive.start,
+            lambda: drive.send_raw(6, 0x1000, b"\0\5"),
+            lambda: drive.write(drive.setpoint, 20.0),
+            lambda: bus.broadcast(drive.setpoint, 0.0),
+            lambda: start_staggered([drive], gap=1.0),
+        ):
+            before = len(audited.noted())
+            with pytest.raises((TypeError, ValueError), match=r"is not text|is not 1 to 200 printable"):
+                call()
+            assert {write for write, *_ in audited.noted()[before:]} <= {"control = STOP", "stop"}
+        before = len(audited.noted())
+        drive.stop()
+        bus.stop_all()
+        bus.broadcast(drive.control, CHEControl.STOP)
+        drive.write(drive.control, CHEControl.STOP)
+        assert drive.state().condition is Condition.STOPPED
+    stops = audited.noted()[before:]
+    by = ("anna", noted) if is_way else (noted, "web")
+    assert sorted(stops) == [("control = STOP", *by)] * 2 + [("stop", *by)] * 4
+
+
+def test_a_log_from_before_is_read(audited: Audited) -> None:
+    audited.path.write_text('{"time": "2026-01-01T00:00:00.000000000Z", "write": "old", "outcome": "done"}\n')
+    with written_by("anna"):
+        audited.drive.set_frequency(20)
+    assert audited.noted() == [("old", None, None), ("setpoint = 40.00 %", "anna", None)]

@@ -1,18 +1,23 @@
-"""Closing a bus or removing drives: calls that end, stops that are sent and awaited, and the report."""
+"""Drives that join and leave a bus, on any thread: latches, stops that are sent and awaited, the report."""
 
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from gc import collect
+from time import sleep
 from typing import Any
+from weakref import ref
 
 import pytest
 from lines import until
-from simulated_bus import SimulatedBus
+from simulated_bus import SimulatedBus, one
 
 from multidrop.core import Message
-from multidrop.errors import CancelledByStop, PortLost
+from multidrop.drive import Drive
+from multidrop.errors import CancelledByStop, NotAttached, PortLost
 from multidrop.families import InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
@@ -155,3 +160,150 @@ def test_only_the_main_thread_makes_a_bus_that_stops_on_exit(monkeypatch: pytest
         with pytest.raises(ValueError, match="main thread"):
             made.result()
     assert closed
+
+
+# ---- one bus at a time ----
+
+
+def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    other = SimulatedBus(monkeypatch)
+    with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
+        other.attach(drive)
+    assert other.bus.drives == []
+    drive.state()  # its verbs still go over the first
+    line.bus.detach(drive)
+    other.attach(drive)
+    other.bus.close()
+    line.attach(drive)  # the other one is closed
+
+
+def test_a_drive_is_attached_to_the_next_bus_while_its_last_one_closes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first bus closes afterwards, and the drive stays on the next one."""
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    before = line.bus
+    free = before._attached.free
+    monkeypatch.setattr(before._attached, "free", lambda: None)
+    before.close()
+    after = SimulatedBus(monkeypatch, sim)
+    after.attach(drive)
+    free()
+    assert drive.bus is after.bus
+    with pytest.raises(ValueError, match="is on the bus at hall: detach it there first"):
+        SimulatedBus(monkeypatch).attach(drive)
+    drive.stop()
+    assert line.written == []
+    assert len(after.written) == 1
+
+
+def test_a_drive_detached_by_another_thread_is_not_detached_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    latches = line.bus._latches
+    await_stops = latches.await_stops
+
+    def detach_meanwhile(drives: Any = None) -> None:
+        monkeypatch.setattr(latches, "await_stops", await_stops)
+        line.bus.detach(drive)
+
+    monkeypatch.setattr(latches, "await_stops", detach_meanwhile)
+    with pytest.raises(NotAttached, match="is not attached"):
+        line.bus.detach(drive)
+    line.attach(drive)
+
+
+def test_drives_of_a_bus_that_was_closed_are_on_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    line.bus.close()
+    assert drive.bus is None
+
+
+def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = SimulatedBus(monkeypatch)
+    together = threading.Barrier(8)
+    add, inside, most = line.bus._exchanges.add, set[str](), 0
+
+    def slow(drive: Drive) -> None:
+        nonlocal most
+        inside.add(drive.name)
+        most = max(most, len(inside))
+        sleep(0.001)  # the others may continue
+        inside.discard(drive.name)
+        add(drive)
+
+    monkeypatch.setattr(line.bus._exchanges, "add", slow)
+    outcomes: list[str] = []
+
+    def attach(address: int) -> None:
+        together.wait(120)
+        try:
+            line.attach(InvtCHE(address))
+            outcomes.append("attached")
+        except ValueError:
+            outcomes.append("taken")
+
+    for _ in range(20):
+        outcomes.clear()
+        threads = [threading.Thread(target=attach, args=[1 + number % 4]) for number in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(120)
+        assert sorted(outcomes) == ["attached"] * 4 + ["taken"] * 4
+        assert sorted(drive.address for drive in line.bus.drives) == [1, 2, 3, 4]
+        for drive in line.bus.drives:
+            line.bus.detach(drive)
+    assert most == 1
+
+
+# ---- latches ----
+
+
+def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else leaving a `with` block by a signal's exception would take for ever."""
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    latches, stop = line.bus._latches, object()
+    latches.begin(stop, [drive])
+    latches.await_stops()
+    waiting = threading.Thread(target=latches.await_stops, args=[[drive]])
+    waiting.start()
+    waiting.join(0.05)
+    assert waiting.is_alive()
+    for _ in range(2):
+        latches.over(stop)
+    waiting.join(60)
+    assert not waiting.is_alive()
+    assert latches.latch(drive).permit().is_good
+
+
+def test_a_drive_attached_after_leaving_is_not_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The process is ending and could not stop it; drives that were attached before are not moved either."""
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.leave()
+    line.bus.detach(drive)
+    line.attach(drive)
+    for call in (drive.start, drive.jog, lambda: drive.set_frequency(20)):
+        with pytest.raises(CancelledByStop, match="the bus was left"):
+            call()
+    assert line.written == []
+    drive.stop()
+    assert line.written != []
+    assert not sim.motor.energised
+
+
+def test_a_drive_that_was_taken_off_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bus whose drives change for years does not grow."""
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    drive.stop()
+    line.bus.detach(drive)
+    line.sims = ()
+    known = ref(drive)
+    del drive, _
+    collect()
+    assert known() is None

@@ -1,4 +1,4 @@
-"""A forked process: the child opens its own lines, and does not touch its parent's lines."""
+"""A forked process opens its own lines and does not touch its parent's; a sub-interpreter is rejected."""
 
 from __future__ import annotations
 
@@ -343,3 +343,42 @@ def test_a_child_stops_no_motor(end: str) -> None:
         start, *stops = (write.raw for write in sim.counters.writes if write.name == "control")
         # A busy machine may have the stop repeated, or followed by that of a jog.
         assert (start, stops[0], set(stops) - {5, 8}) == (1, 5, set())
+
+
+# ---- interpreters ----
+
+
+CODE = """
+try:
+    import _interpreters as interpreters
+except ImportError:
+    import _xxsubinterpreters as interpreters
+
+INSIDE = '''
+import sys
+try:
+    import multidrop
+except ImportError as refusal:
+    print(refusal)
+print([name for name in sys.modules if name.startswith("multidrop")])
+'''
+for _ in range(3):
+    one = interpreters.create()
+    interpreters.run_string(one, INSIDE)
+    interpreters.destroy(one)
+from multidrop import Bus
+print("and here it works:", Bus.__name__)
+"""
+
+
+@pytest.mark.slow
+def test_a_sub_interpreter_is_refused_and_the_main_one_is_served() -> None:
+    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
+    refused = (
+        "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "
+        "use it there, or in a process of its own"
+    )
+    lines = done.stdout.splitlines()
+    assert lines[0::2][:3] == [refused] * 3
+    assert lines[1::2] == ["['multidrop.interpreter']"] * 3
+    assert lines[6] == "and here it works: Bus"

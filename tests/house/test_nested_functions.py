@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).parents[1]
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -21,6 +23,7 @@ def never_named(tree: ast.AST) -> list[str]:
     return found
 
 
+@pytest.mark.long
 def test_inner_functions_are_used() -> None:
     found = {}
     for path in sorted(TESTS.rglob("*.py")):

@@ -1,12 +1,21 @@
-"""Check command-line mistakes of tools/: each prints one sentence and starts nothing."""
+"""Developer tools: command-line mistakes, fuzzing corpora, mutants, and processes that tests start."""
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import corpora
 import pytest
+from c_programs import CC, SANITIZERS, STRICT
+from harness import HERE, command
+from kills import BoundProcess
+from mutation.edits import mutants
+from mutation.trials import core_names
+from readers import READERS, read
 from tables import table
 
 pytestmark = pytest.mark.long
@@ -86,3 +95,160 @@ def test_help_is_the_header_of_the_tool(tool: str) -> None:
     assert f"tools/{tool} " in ran.stdout
     assert ran.stdout.isascii()
     assert ran.stderr == ""
+
+
+# ---- fuzzing ----
+
+
+HARNESSES = sorted(path.stem.removeprefix("fuzz_") for path in HERE.glob("fuzz_*.c"))
+
+
+def test_every_parser_has_a_small_corpus() -> None:
+    assert len(HARNESSES) == 6
+    assert {path.stem for path in corpora.FOLDER.iterdir()} == {*HARNESSES, *READERS}
+    inputs = [data for name in (*HARNESSES, *READERS) for data in corpora.load(name).values()]
+    assert len(inputs) > 500
+    assert sum(map(len, inputs)) < 300_000
+
+
+def test_a_corpus_is_unpacked_and_saved_unchanged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    corpora.unpack("frame", tmp_path / "inputs")
+    inputs = {path.name: path.read_bytes() for path in (tmp_path / "inputs").iterdir()}
+    text = (corpora.FOLDER / "frame.txt").read_bytes()
+    monkeypatch.setattr(corpora, "FOLDER", tmp_path)
+    corpora.save("frame", inputs)
+    assert (tmp_path / "frame.txt").read_bytes() == text
+    assert corpora.load("no such parser") == {}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", HARNESSES)
+def test_the_core_survives_its_corpus(tmp_path: Path, name: str) -> None:
+    if shutil.which(CC) is None:
+        pytest.skip(f"no C compiler ({CC})")
+    build = command(name, tmp_path / name, "replay.c", CC, *STRICT, *SANITIZERS)
+    built = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    replay = [tmp_path / name, corpora.FOLDER / f"{name}.txt"]
+    run = subprocess.run(replay, capture_output=True, text=True, check=False, timeout=60)
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert run.stderr.split() == list(corpora.load(name))
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_reader_survives_its_corpus(tmp_path: Path, name: str) -> None:
+    for data in corpora.load(name).values():
+        read(name, data, tmp_path)
+
+
+# ---- mutation ----
+
+
+ROOT = Path(__file__).parents[2]
+
+
+EXPLAINED = tomllib.loads((ROOT / "tests" / "mutation" / "explained.toml").read_text("utf-8"))["mutant"]
+
+
+C = """\
+static int clamp(int *at, int most) /* not < mutated */
+{
+    if (*at < most)
+        return -1;
+    *at += 0x0F;
+    return most ? 1 : *at;
+}
+"""
+
+
+OF_C = {
+    "if (*at <= most)",
+    "if (*at >= most)",
+    "if (!(*at < most))",
+    ";",  # return -1; *at += 0x0F; return most ? 1 : *at;
+    "return 1;",
+    "return 0;",
+    "return -0;",
+    "return -2;",
+    "return -1;",
+    "*at -= 0x0F;",
+    "*at += 16;",
+    "*at += 14;",
+    "return !(most) ? 1 : *at;",
+    "return most ? 2 : *at;",
+    "return most ? 0 : *at;",
+}
+
+
+PYTHON = '''\
+def most(found: list[int] | None, limit: int = 9) -> int:
+    """Not - mutated."""
+    if not found:
+        return 0
+    at = min(found) + limit  # nor < this
+    return at
+'''
+
+
+OF_PYTHON = {
+    "def most(found: list[int] | None, limit: int = 10) -> int:",
+    "def most(found: list[int] | None, limit: int = 8) -> int:",
+    "if found:",
+    "if (not (not found)):",
+    "return 1",
+    "return -1",
+    "pass",
+    "pass # nor < this",
+    "at = max(found) + limit # nor < this",
+    "at = min(found) - limit # nor < this",
+    "return None",
+}
+
+
+@pytest.mark.parametrize(("path", "source", "made"), [("a.c", C, OF_C), ("a.py", PYTHON, OF_PYTHON)])
+def test_mutants_of_a_source(path: str, source: str, made: set[str]) -> None:
+    found = mutants(path, source)
+    assert {each.after for each in found} == made
+    assert len({each.text for each in found}) == len(found)
+    assert {each.function for each in found} == {"clamp" if path == "a.c" else "most"}
+
+
+def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
+    (negated,) = (
+        mutant.after for mutant in mutants("a.c", "    if (a\n        || b)\n") if "!(" in mutant.after
+    )
+    assert negated == "if (!(a || b))"
+
+
+@pytest.mark.slow
+def test_explained_mutants_exist() -> None:
+    files = {each["file"] for each in EXPLAINED}
+    names = {mutant.name for path in files for mutant in mutants(path, (ROOT / path).read_text("utf-8"))}
+    for row in EXPLAINED:
+        assert row["why"]
+        assert (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)) in names
+
+
+def test_mutation_trials_compile_existing_files() -> None:
+    assert all((ROOT / "csrc" / f"{name}.c").exists() for name in core_names(ROOT))
+    assert {"frame", "waiter_epoll", "wakeup"} <= {*core_names(ROOT)}
+
+
+# ---- processes of tests ----
+
+
+TESTS = Path(__file__).parents[1]
+
+
+SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
+
+
+def test_failing_block_kills_its_process() -> None:
+    with pytest.raises(ZeroDivisionError), BoundProcess(SLEEPS) as process:
+        raise ZeroDivisionError
+    assert process.returncode
+
+
+def test_no_test_starts_an_unbound_process() -> None:
+    unbound = "with subprocess." + "Popen("
+    assert [str(path) for path in TESTS.rglob("*.py") if unbound in path.read_text("utf-8")] == []

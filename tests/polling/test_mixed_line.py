@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire
 from lines import LateWire, line, plant, polled, proofs, rows_of, served
+from toy import Toy
 from variants import LATEST, REASONS, fast_drives, real_drives, real_wires
 
+from multidrop.drive.register import HOLDING, Register
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
-from multidrop.sim import EncodedDrive, Wire
+from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Wire
 
 REAL_SECONDS = 4.0
 EVERY = 1.0  # s, the period of the rated registers
@@ -100,3 +104,71 @@ def test_late_lost_and_doubled_replies_are_never_taken_for_others() -> None:
     assert summary["samples"] > 0
     assert summary["misses"]["no reply"] > 0
     assert summary["stray_bytes"] > 0
+
+
+# ---- useless proofs ----
+
+
+POLLED = bytes((1, 3, 0, 1, 0, 1))  # output_frequency
+
+
+class LossyWire(ClockedWire):
+    """It `loses` so many polled requests."""
+
+    loses = 0
+
+    def receive(self, request: bytes, now: float, baudrate: int) -> None:
+        if self.loses and request.startswith(POLLED):
+            self.loses -= 1
+        else:
+            super().receive(request, now, baudrate)
+
+
+class SilentWire(LossyWire):
+    """Its device answers polled reads only."""
+
+    unanswered = 0
+
+    def receive(self, request: bytes, now: float, baudrate: int) -> None:
+        if request.startswith(POLLED):
+            super().receive(request, now, baudrate)
+        else:
+            self.unanswered += 1
+
+
+class MisprintedToy(Toy):
+    """Its document is wrong about what two registers hold."""
+
+    most_registers = {HOLDING: 1}
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        return {Toy.mystery: (1, 1), Toy.acceleration_time: (2, 9)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [1, 5])
+def test_a_lost_request_does_not_slow_it_for_good(lost: int) -> None:
+    pump = Toy(1, name="pump")
+    wire = SilentWire([EncodedDrive(pump)], Faults())
+    with ClockedLines(wire, [polled(pump, [Toy.output_frequency], 0.1)]) as lines:
+        lines.run(4)
+        wire.loses = lost
+        lines.run(10)
+        assert wire.unanswered > 0
+        wire.unanswered = 0
+        rows = lines.run(4)
+    assert [row.status for row in rows] == ["ok"] * 40
+    assert wire.unanswered == 0
+
+
+def test_a_misprint_does_not_end_the_polling_after_a_lost_request() -> None:
+    pump = MisprintedToy(1, name="pump")
+    sim = SimulatedDrive(pump)
+    sim["mystery"], sim["acceleration_time"] = 1234, 123.4
+    wire = LossyWire([sim], Faults())
+    with ClockedLines(wire, [polled(pump, [Toy.output_frequency], 0.1)]) as lines:
+        lines.run(4)
+        wire.loses = 1
+        lines.run(10)
+        rows = lines.run(4)
+    assert [row.status for row in rows] == ["ok"] * 40
