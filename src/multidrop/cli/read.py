@@ -35,15 +35,14 @@ def run(arguments: argparse.Namespace) -> int:
         wanted = [register for register in drive.registers.values() if register.readable]
     with target.open_bus():
         values = _read(drive, wanted)
-        read_texts = {text: _read_text(drive, text) for text in texts}
+        read_texts = {text: _read_one(drive, text) for text in texts}
     if arguments.json:
         record = {"drive": drive.name, "model": drive.model, "address": drive.address}
-        shown = {register.name: _as_json(register, value) for register, value in values.items()}
-        shown |= {text.name: _text_as_json(answer) for text, answer in read_texts.items()}
+        shown = {one.name: _as_json(one, value) for one, value in (values | read_texts).items()}
         print_text(json.dumps(record | {"values": shown}, indent=2))
     else:
-        lines = aligned([_row(*answer) for answer in values.items()], "<><")
-        lines += aligned([_text_row(*answer) for answer in read_texts.items()], "<<")
+        lines = aligned(map(_row, values, values.values()), "<><")
+        lines += aligned(map(_row, read_texts, read_texts.values()), "<<<")
         print_text("\n".join(lines))
     answers = (*values.values(), *read_texts.values())
     return 1 if any(isinstance(answer, DriveException) for answer in answers) else 0
@@ -60,47 +59,27 @@ def _read(drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]
     return {register: found.get(register.name) for register in wanted}
 
 
-def _read_one(drive: Drive, register: Register[Any]) -> Any:
+def _read_one(drive: Drive, wanted: Register[Any] | Text) -> Any:
+    """Return the value of a register or text, the drive's exception, or None if it has no valid value."""
     try:
-        return drive.read(register)
+        return drive.read(wanted)
     except NoValue:
         return None
     except DriveException as refusal:
         return refusal
 
 
-def _read_text(drive: Drive, text: Text) -> str | DriveException:
-    try:
-        return drive.read(text)
-    except DriveException as refusal:
-        return refusal
-
-
-def _row(register: Register[Any], value: Any) -> Row:
+def _row(wanted: Register[Any] | Text, value: Any) -> Row:
     if isinstance(value, DriveException):
-        return register.name, "", _refusal(value)
+        return wanted.name, "", f"refused: code {value.code:02X}H, {value.meaning}"
     if value is None:
-        return register.name, "", str(Status.NO_VALUE)
-    return as_row(register, value)
+        return wanted.name, "", str(Status.NO_VALUE)
+    return (wanted.name, value, "") if isinstance(wanted, Text) else as_row(wanted, value)
 
 
-def _text_row(text: Text, answer: str | DriveException) -> Row:
-    return text.name, _refusal(answer) if isinstance(answer, DriveException) else answer
-
-
-def _refusal(refusal: DriveException) -> str:
-    return f"refused: code {refusal.code:02X}H, {refusal.meaning}"
-
-
-def _text_as_json(answer: str | DriveException) -> dict[str, Any]:
-    if isinstance(answer, DriveException):
-        return {"value": None, "refused": answer.meaning, "code": answer.code}
-    return {"value": answer}
-
-
-def _as_json(register: Register[Any], value: Any) -> dict[str, Any]:
+def _as_json(wanted: Register[Any] | Text, value: Any) -> dict[str, Any]:
     if isinstance(value, DriveException):
         return {"value": None, "refused": value.meaning, "code": value.code}
     if value is None:
         return {"value": None, "reason": str(Status.NO_VALUE)}
-    return as_json(register, value)
+    return {"value": value} if isinstance(wanted, Text) else as_json(wanted, value)

@@ -61,15 +61,13 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
         details["order"] = order
 
 
-def scaled(
-    details: dict[str, Any], step: Any, offset: Any = 0, keys: tuple[str, str] = ("scale", "offset")
-) -> None:
+def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
     """Add step and offset unless they have no effect; ignore a step of 0. Raises as `number` does."""
-    found = number(step, 1, keys[0]), number(offset, 0, keys[1])
-    if found[0] not in (0, 1):
-        details["step"] = found[0]
-    if found[1] != 0:
-        details["offset"] = found[1]
+    step, offset = number(step, 1, "scale"), number(offset, 0, "offset")
+    if step not in (0, 1):
+        details["step"] = step
+    if offset:
+        details["offset"] = offset
 
 
 def number(given: Any, default: float, key: str = "number") -> float:

@@ -76,14 +76,17 @@ def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[A
     return figure, list(axes)
 
 
+MOST_COLUMNS = 6  # of a legend
+
+
 def set_title(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="left", fontsize=10)
 
 
-def add_legend(figure: Figure, handles: Sequence[Any], columns: int = 6) -> None:
+def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
     """Add a legend above the axes, as wide as fits; the figure grows by the legend's height."""
     longest = max((len(handle.get_label()) for handle in handles), default=0)
-    columns = max(1, min(columns, int(WIDTH / (LEGEND_MARK + LEGEND_LETTER * longest))))
+    columns = max(1, min(MOST_COLUMNS, int(WIDTH / (LEGEND_MARK + LEGEND_LETTER * longest))))
     rows = -(-len(handles) // columns)
     figure.set_figheight(figure.get_figheight() + LEGEND_ROW * max(0, rows - 1))
     figure.legend(handles=handles, loc="outside upper left", ncols=columns, frameon=False)
