@@ -86,19 +86,6 @@ def test_any_metadata_is_tolerated(tmp_path: Path, about: dict[str, object]) -> 
     assert pa.table(multidrop.open_recording(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
 
 
-@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
-def test_a_truncated_end_is_left_out_and_counted(tmp_path: Path, suffix: str) -> None:
-    path = record(tmp_path / f"run{suffix}", [row(at, "pump", "output_frequency", 50.0) for at in range(40)])
-    whole = recorded(path)
-    path.write_bytes(path.read_bytes()[:-5])
-    found = multidrop.open_recording(path)
-    assert found.truncated > 0
-    kept = rows_of(pa.table(found))
-    assert kept == whole[: len(kept)]
-    assert 0 < len(kept) < 40
-    assert len(found.wide()) == len(kept)
-
-
 def test_a_damaged_recording_raises_its_reader_s_error(tmp_path: Path) -> None:
     path = record(tmp_path / "run.csv", [row(at, "pump", "output_frequency", 50.0) for at in range(4)])
     path.write_text(path.read_text().replace("pump,", "pump;", 1))
