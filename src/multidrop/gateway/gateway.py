@@ -95,7 +95,7 @@ class Gateway:
         self.notifier = Notifier()
         self.reload = Reload(self, read)
         self.commands = Commands(self, settings.may, lambda drive: self.hub.note_reset(drive))
-        self.seen_frames = SeenFrames(boottime_ns, self.commands.stopped_ns)
+        self.seen_frames = SeenFrames(boottime_ns, self.commands)
         self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(48))
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, utc_ms)
         self.parameter_reads = ParameterReads()

@@ -156,7 +156,6 @@ class Reload:
             gateway.alarms.forget(name, utc_ms())
         gateway.plant = plant
         gateway.revision += 1
-        gateway.seen_frames.note_reload()
         gateway.commands.note_reload()
         self._take_up_rights(settings)
         gateway.side_reads.cancel()

@@ -47,7 +47,8 @@ class Times:
     def __init__(self) -> None:
         self.now_ns = 10**12
         self.stopped: dict[str, int] = {}
-        self.frames = SeenFrames(lambda: self.now_ns, self.stopped.get)
+        self.commands: Any = SimpleNamespace(stopped_ns=self.stopped.get, plant_ns=None)
+        self.frames = SeenFrames(lambda: self.now_ns, self.commands)
 
     def rule(self, seen: int, drive: str = "pump-1", command: object = "start") -> str:
         """Return the rule that a command breaks; "" for one that may be sent."""
@@ -89,8 +90,9 @@ def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
 
 def test_frames_of_another_plant_count_for_nothing(times: Times) -> None:
     times.frames.note(7)
-    times.frames.note_reload()
+    times.commands.plant_ns = times.now_ns
     assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
+    times.now_ns += 1
     times.frames.note(8)
     assert times.rule(8) == ""
     assert times.rule(7) == ANOTHER_PLANT

@@ -16,7 +16,7 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop import WriteForbidden
-from multidrop.gateway.commands import MOST_AGE_S
+from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
@@ -268,29 +268,22 @@ class SeenFrames:
     once, within MOST_AGE_S of that frame, and only if no stop and no reload came after it. Clocks of other
     computers play no role.
 
-    `clock` returns ns and includes sleep. `stopped_ns` returns when a drive's latest stop was called, by that
-    clock; None without one.
+    `clock` returns ns and includes sleep.
     """
 
-    def __init__(self, clock: Callable[[], int], stopped_ns: Callable[[str], int | None]) -> None:
+    def __init__(self, clock: Callable[[], int], commands: Commands) -> None:
         self.clock = clock
-        self._stopped_ns = stopped_ns
+        self._commands = commands
         self._made: dict[int, int] = {}  # when each frame was made (ns), by its number
         self._came: dict[int, set[object]] = {}  # commands admitted, by the frame that they named
-        self._newest = -1
-        self._newest_before = -1  # the last frame before the latest reload
 
     def note(self, n: int) -> None:
         """Note that the frame of this number is made now."""
         now_ns = self.clock()
-        self._newest, self._made[n] = n, now_ns
+        self._made[n] = now_ns
         for old in [one for one, made_ns in self._made.items() if now_ns - made_ns > MOST_AGE_NS]:
             del self._made[old]
             self._came.pop(old, None)
-
-    def note_reload(self) -> None:
-        """Note a reload: a name in an earlier frame may mean another drive now."""
-        self._newest_before = self._newest
 
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
         """Return the time in ns until which a command may be sent if its sender has seen this frame.
@@ -302,10 +295,10 @@ class SeenFrames:
         if made_ns is None or self.clock() > until_ns:
             last = f"frame {seen} is not from the last {MOST_AGE_S:g} s"
             raise WriteForbidden(f"{what} was not sent: {last}: check and confirm again", rule=TOO_LATE)
-        if seen <= self._newest_before:
+        if (self._commands.plant_ns or 0) >= made_ns:  # a name may mean another drive now
             since = f"the plant file was reloaded after frame {seen}"
             raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=ANOTHER_PLANT)
-        if (self._stopped_ns(drive) or 0) >= made_ns:
+        if (self._commands.stopped_ns(drive) or 0) >= made_ns:
             since = f"a stop was called after frame {seen}"
             raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=OVERTAKEN)
         came = self._came.setdefault(seen, set())

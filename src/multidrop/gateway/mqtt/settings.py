@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import ssl
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -75,45 +76,30 @@ class MqttSettings:
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each missing file, and each drive name that cannot be a topic."""
-        names = [*drives_of(plant)]
-        files = (("password", self.password), ("authorities", self.authorities))
-        return (
-            [
-                f'{key} = "{name}": there is no file {_beside(plant, name)}'
-                for key, name in files
-                if name and not _beside(plant, name).is_file()
-            ]
-            + [
-                f'authorities = "{self.authorities}": {path} has no certificates in PEM'
-                for path in [_beside(plant, self.authorities)]
-                if self.authorities and path.is_file() and not _has_certificates(path)
-            ]
-            + [
-                f"drive {name!r} cannot be a topic: choose a name without + # and /"
-                for name in names
-                if not LEVEL.fullmatch(name)
-            ]
-            + [mistake for mistake in map(_reserved, names) if mistake]  # unchecked in a plant without a file
-            + [
-                f'the plant file\'s name {plant.path.stem!r} cannot be an edge node; add node = "hall-1"'
-                for _ in self.sparkplug[:1]
-                if not self.node and not LEVEL.fullmatch(plant.path.stem)
-            ]
-        )
+        return [*self._mistakes_in(plant)]
+
+    def _mistakes_in(self, plant: Plant) -> Iterator[str]:
+        for key, name in (("password", self.password), ("authorities", self.authorities)):
+            path = _beside(plant, name)
+            if name and not path.is_file():
+                yield f'{key} = "{name}": there is no file {path}'
+            elif name and key == "authorities" and not _has_certificates(path):
+                yield f'authorities = "{name}": {path} has no certificates in PEM'
+        for name in drives_of(plant):
+            if not LEVEL.fullmatch(name):
+                yield f"drive {name!r} cannot be a topic: choose a name without + # and /"
+            try:
+                check_drive_name(name)  # a plant without a file was not checked
+            except ValueError as mistake:
+                yield f"drive {name!r}: {mistake}"
+        if self.sparkplug and not self.node and not LEVEL.fullmatch(plant.path.stem):
+            name = plant.path.stem
+            yield f'the plant file\'s name {name!r} cannot be an edge node; add node = "hall-1"'
 
     def login(self, plant: Plant) -> Login:
         """Return user, password and certificates. Raises OSError if the password cannot be read."""
         password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
         return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
-
-
-def _reserved(drive: str) -> str:
-    """Return why a drive cannot have this name; "" if it can."""
-    try:
-        check_drive_name(drive)
-    except ValueError as mistake:
-        return f"drive {drive!r}: {mistake}"
-    return ""
 
 
 def _has_certificates(path: Path) -> bool:
