@@ -170,7 +170,7 @@ function drawFilter() {
     h.row.hidden = isFiltered && h.rows.every(r => r.row.hidden);
     h.fold?.setAttribute("aria-expanded", isOpen);
     const running = h.rows.filter(r => state(r.name) === "runs").length;
-    put(h.count, isOpen ? "" : `${count(h.rows.length, "drive")}, ${running} running`);
+    put(h.count, `${count(h.rows.length, "drive")}, ${running} running`);
   }
   put(none, isFiltered && rows.every(r => r.row.hidden) ? "No drive matches the filter." : "");
   for (const button of find("#chips").children) {
