@@ -38,7 +38,7 @@ class UnopenedLines:
 
     @property
     def plant_coming(self) -> None:
-        return None  # nothing is reloaded
+        return None  # no reload
 
 
 @table(

@@ -49,7 +49,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Fifos:
-    """Files that hang when they are opened, until they are let go."""
+    """Files that hang when they are opened, until they are released."""
 
     def __init__(self) -> None:
         self._made: list[Path] = []
@@ -122,7 +122,7 @@ def test_history_that_hangs_during_a_reload_starts_later(tmp_path: Path, fifos: 
         assert health(gateway)["parts"] == {}
         fifos.let_go()
         until(lambda: health(gateway)["status"] == "ok")
-        assert gateway.gateway.feeds == {}  # nobody wants it any more
+        assert gateway.gateway.feeds == {}  # it is not needed now
 
 
 def test_history_that_fails_when_its_disk_answers_is_dead(tmp_path: Path, fifos: Fifos) -> None:

@@ -1,4 +1,4 @@
-"""A gateway interrupted at its start or end: it ends, and sends nothing afterwards."""
+"""A gateway interrupted at its start or end ends, and sends no frame afterwards."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
-# A collection amid the work finalizes what an earlier interruption left, and may be interrupted itself.
+# Garbage collection finalizes objects of an earlier interruption, and may be interrupted too.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 

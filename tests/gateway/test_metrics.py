@@ -60,7 +60,7 @@ def test_values_states_and_counters(tmp_path: Path) -> None:
         until(lambda: families(gateway)["multidrop_line_samples"].samples[0].value > 8)
         assert found["multidrop_line_samples"].type == "counter"
         assert found["multidrop_build"].samples[0].labels == {"version": gateway.gateway.version}
-        delays = {  # those of who has replied, as counted once a second
+        delays = {  # those of drives that have replied, counted once a second
             (one.name.removeprefix("multidrop_response_delay_seconds"), one.labels.get("quantile"))
             for one in families(gateway)["multidrop_response_delay_seconds"].samples
         }

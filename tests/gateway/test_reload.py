@@ -1,4 +1,4 @@
-"""Reload of the plant file: with mistakes nothing changes; without mistakes the new plant is polled."""
+"""Reload of the plant file: a file with mistakes changes no line; another one is polled."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Rows:
     """A part that keeps the rows of a line's drives."""
 
     def __init__(self) -> None:
-        self.found: list[tuple[str, str, int]] = []  # drive, status, when it was asked
+        self.found: list[tuple[str, str, int]] = []  # drive, status, time of the request
         self.adopted: list[Plant] = []
 
     def take(self, batch: Batch) -> None:
@@ -366,7 +366,7 @@ def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
         threads = [threading.Thread(target=lambda: told.append(reload(gateway)))]
         threads[0].start()
         assert changed.wait(PATIENCE)
-        assert old.bus is None  # nothing can be sent through it any more
+        assert old.bus is None  # no frame can be sent through it now
         threads += [
             threading.Thread(target=lambda drives=drives: told.append(gateway.post("/api/stop", drives).json))
             for drives in ({"drives": None}, {"drives": ["fan-1"]})
@@ -414,7 +414,7 @@ def test_a_stop_waits_for_no_port_that_a_reload_opens(
         assert fan.goal
         opening, go_on = held_up(monkeypatch)
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
-        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # opened anew
+        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # opened again
         told: list[Any] = []
         reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
         reloading.start()
@@ -461,7 +461,7 @@ def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
         assert reload(gateway)["done"]
         until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
         opening, go_on = held_up(monkeypatch)
-        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # opened anew
+        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # opened again
         before, _, roof = text.rpartition('model = "invt-che"')
         path.write_text(f'{before}model = "other.toml"\nformat = "8N1"{roof}')
         told: list[Any] = []

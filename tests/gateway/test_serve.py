@@ -132,7 +132,7 @@ def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
             try:
                 assert process.stdout is not None
                 port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
-                os.set_blocking(log, False)  # for the gateway's end too, for a moment
+                os.set_blocking(log, False)  # also for a moment after the gateway's end
                 with suppress(BlockingIOError):
                     while True:
                         os.write(log, bytes(1))
@@ -157,7 +157,7 @@ def test_tls(tmp_path: Path) -> None:
         assert url.startswith("https://127.0.0.1:")
         port = int(url.rstrip("/").rpartition(":")[2])
         context = ssl.create_default_context(cafile=str(tmp_path / "own.pem"))
-        silent = socket.create_connection(("127.0.0.1", port))  # it says nothing, and holds nobody up
+        silent = socket.create_connection(("127.0.0.1", port))  # it is silent, and delays no other work
         connection = http.client.HTTPSConnection("localhost", port, context=context, timeout=PATIENCE)
         connection.request("POST", "/api/token", '{"token": "secret"}', {"content-type": "application/json"})
         response = connection.getresponse()

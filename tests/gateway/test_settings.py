@@ -202,7 +202,7 @@ def test_no_rights_on_the_folder(tmp_path: Path) -> None:
 
 
 def test_what_a_service_manager_gives(tmp_path: Path) -> None:
-    """Credentials are found before files beside the plant file, and what is kept goes to the state folder."""
+    """Credentials are found before files beside the plant file; output files are in the state folder."""
     credentials, state = tmp_path / "credentials", tmp_path / "state"
     credentials.mkdir()
     state.mkdir()

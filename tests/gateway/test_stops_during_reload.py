@@ -90,7 +90,9 @@ def test_a_joining_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
         return await stopping
 
     ends = asyncio.run(main())
-    assert ends["fan"].drive is NEW_FAN  # the old one's end, which came last, is not told of the new one
+    assert (
+        ends["fan"].drive is NEW_FAN
+    )  # the old drive's result, which came last, is not reported for the new one
     assert lines.begun.count(NEW_FAN) == 1
 
 

@@ -21,7 +21,7 @@ WAYS = ("page", "http", "mqtt", "modbus")
 
 
 class GuardedLines:
-    """One drive; whoever reaches its line did so without the right to."""
+    """One drive; a command that reaches its line had no right to."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), polled=False)
 
@@ -36,7 +36,7 @@ class GuardedLines:
 
 
 def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
-    """Return the rule by which each command is refused; None where it passed all rights."""
+    """Return the rule by which each command is refused; None if it passed all rights."""
     caller = Caller("anna", way, "10.0.0.7", role)
 
     async def carried_out() -> dict[str, Any]:
@@ -78,13 +78,13 @@ def test_unlisted_writes_are_refused_to_writers(way: str) -> None:
 
 
 def test_no_verb_comes_by_modbus_though_it_is_listed() -> None:
-    """Nobody is asked there whether he means it."""
+    """Modbus has no dialog in which a person confirms."""
     rules = rules_of(ALL, "modbus", Right.WRITE)
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
 def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each has a thread, and a line that stands still would have any number of them."""
+    """Each write has a thread, and a blocked line would otherwise have any number of threads."""
     go_on = threading.Event()
 
     def slow(drive: Drive, **command: object) -> CommandResult:
@@ -95,7 +95,7 @@ def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytes
         control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
         writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
         some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
-        await asyncio.sleep(0)  # each has begun
+        await asyncio.sleep(0)  # each is in progress
         for further in (
             control.write("mill", "setpoint", 9.0, writer),
             control.act("mill", "start", {}, writer),

@@ -1,4 +1,4 @@
-"""Slow and silent HTTP clients: they delay nobody and are closed."""
+"""Slow and silent HTTP clients do not delay others, and are closed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # fewer than the slow clients and the res
 
 @contextmanager
 def slow_clients(port: int, sent: bytes) -> Iterator[list[socket.socket]]:
-    """500 connections that say this, and no more."""
+    """Open 500 connections that send only this."""
     with ExitStack() as stack:
         found = []
         for _ in range(500):
@@ -177,7 +177,7 @@ def test_the_first_request_and_later_ones_have_their_time(
     connections.sweep()
     assert [is_ended(pair) for pair in pairs[1:3]] == [False, True]
     assert (len(connections), connections.ended) == (1, 2)
-    connections.finish(("10.0.0.9", 9))  # nobody knows it: nothing happens
+    connections.finish(("10.0.0.9", 9))  # an unknown client is ignored
     assert len(connections) == 1
 
 
@@ -263,14 +263,14 @@ async def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> Non
     reads[1].cancel()
     await asyncio.gather(stop, *reads, return_exceptions=True)
     assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn when it came
-    await take(turns, "later", turns.others)  # nobody else waits
+    await take(turns, "later", turns.others)  # no other request waits
     assert order[-1] == "later"
 
 
 def test_a_stop_is_taken_ahead_of_reads_that_came_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """100 clients that send 20 requests each, all at once, and read nothing."""
+    """100 clients send 20 requests each, all together, and read no answers."""
     order: list[str] = []
     come, go_on = threading.Event(), threading.Event()
     described = web.describe

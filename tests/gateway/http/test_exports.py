@@ -49,7 +49,7 @@ def test_few_exports_go_on_at_a_time_and_hold_no_stop_up(tmp_path: Path) -> None
         part: Any = SlowHistory()
         gateway.gateway.feeds["history"] = part
         try:
-            for wrong in ("xlsx", "csv&series=pump"):  # takes nobody's place
+            for wrong in ("xlsx", "csv&series=pump"):  # takes no place
                 for _ in range(2 * MOST_EXPORTS):
                     assert gateway.get(EXPORT.format(wrong)).status == 400
             paths = [EXPORT.format(("csv", "parquet")[at % 2]) for at in range(MOST_EXPORTS)]

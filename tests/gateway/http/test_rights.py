@@ -29,7 +29,7 @@ UNLISTED_VERB = ("/api/act", {"drive": "pump-1", "verb": "jog", "options": {}})
 STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
 ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
 
-LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # as a proxy tells them
+LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # as a proxy reports them
 # By the settings, and where the caller is: the answers to looks, and to ACTS in their order, for each right.
 TABLE = {
     (MAY, LOCAL): [
@@ -81,7 +81,7 @@ def test_each_caller_has_the_rights_of_the_table(tmp_path: Path, serve: str, add
             looks = {path: gateway.get(path, **headers).status for path in LOOKS}
             assert looks == dict.fromkeys(LOOKS, look), right
             assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right
-            assert gateway.get("/", **headers).status in (200, 404)  # the page itself is nobody's secret
+            assert gateway.get("/", **headers).status in (200, 404)  # the page itself is not secret
 
 
 @pytest.mark.parametrize("way", ["authorization", "cookie"])
@@ -102,7 +102,7 @@ def test_wrong_token_is_refused_even_if_none_is_needed(tmp_path: Path, way: str)
         assert gateway.gateway.commands.called == 2
         for at in range(MOST_WRONG):
             gateway.get("/health", authorization=f"Bearer wrong-{at}")
-        for path in LOOKS:  # none is looked at any more, and none is taken for none
+        for path in LOOKS:  # no token is checked now, and an empty one is not accepted
             assert gateway.get(path, **wrong).status == 429
             assert gateway.get(path, authorization=gateway.bearer(Right.WRITE)).status == 429
             assert gateway.get(path).status == 200
@@ -278,7 +278,7 @@ def test_five_wrong_tokens_a_minute_are_checked(tmp_path: Path) -> None:
         for at in range(MOST_WRONG):
             assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
-        assert gateway.get("/api/plant", **right).status == 429  # not even looked at
+        assert gateway.get("/api/plant", **right).status == 429  # not even checked
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401

@@ -133,7 +133,7 @@ def test_check_warns_of_registers_that_cannot_show_a_fault(run: Run, tmp_path: P
     assert f"pump-1: {advice}" in errors
 
 
-# ---- begin and end ----
+# ---- start and end ----
 
 
 RUNS, STANDS = Shown("runs", None), Shown("stands", None)
@@ -186,7 +186,7 @@ def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     assert (first.acknowledged, first.by, first.note) == (7, "anna by page", "fan is dirty")
     assert [one.kind for one in events.shown()] == ["stopped", "port", "silent", "fault"]
     stopped = events.acknowledge(events.shown()[0].id, 8, "anna by page")
-    assert ("pump-2", "stopped", 3, 8) in seen(events)  # who knows of it needs it no longer
+    assert ("pump-2", "stopped", 3, 8) in seen(events)  # an acknowledged alarm is not needed any longer
     with pytest.raises(KeyError):
         events.acknowledge("1 fault pump-9", 9, "anna")
     events.acknowledge(stopped.id, 10, "boris", "the switch")
@@ -236,7 +236,7 @@ def test_alarms_of_an_earlier_run_go_on_or_are_over() -> None:
 
 
 def test_alarms_that_are_read_late_meet_those_of_now() -> None:
-    """A slow disk: the drives were looked at before."""
+    """A slow disk: the drives were observed before."""
     events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
     events.look(101, "pump-2", STANDS)
@@ -346,7 +346,7 @@ def test_alarms_are_logged_acknowledged_and_last_over_a_restart(
     assert any(
         text.startswith(f"alarm of pump-1, {words}, acknowledged by stopper") for text in caplog.messages
     )
-    with served(tmp_path) as gateway:  # the drive is well again meanwhile
+    with served(tmp_path) as gateway:  # the drive works again
         until(lambda: [one for one in faults(gateway) if one["ended"]])
         [again] = faults(gateway)
         kept = ("id", "time", "text", "by", "note", "acknowledged")

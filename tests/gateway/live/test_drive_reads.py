@@ -22,7 +22,7 @@ MAY = '[serve.may]\nstop = "anyone"\n'
 
 @pytest.mark.long
 def test_a_first_stop_is_sent_at_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is asked about a drive's identity between the call and its stop word."""
+    """No identity is read between the call of a stop and its frame."""
     asked: list[str] = []
     with served(tmp_path, MAY) as gateway:
         bus = gateway.gateway.bus("hall")
@@ -36,7 +36,7 @@ def test_a_first_stop_is_sent_at_once(tmp_path: Any, monkeypatch: pytest.MonkeyP
 
 
 class Asked:
-    """A bus that notes whom it asked, and fails as it is told to."""
+    """A bus that records its requests, and fails as the test says."""
 
     def __init__(self, failures: dict[str, Exception]) -> None:
         self.names: list[str] = []
@@ -86,7 +86,7 @@ def test_who_does_not_answer_is_not_asked() -> None:
 
 
 def test_who_is_known_is_not_asked() -> None:
-    """Nor is a thread woken for him: most of the time all are known."""
+    """Nor is a thread started for a known identity."""
     bus = Asked({})
     bus.known.add("pump-1")
     assert ask_all(bus, lambda name: True, "pump-1", "pump-2") == []

@@ -94,7 +94,7 @@ async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: 
 
 
 async def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock) -> None:
-    """Nothing else has to happen for them to be seen."""
+    """Viewers see them without any other event."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()
@@ -117,7 +117,7 @@ def test_no_frame_is_made_without_viewers(frames: Frames, clock: Clock, made: li
 async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -> None:
     first = await frames.after(-1)
     assert first is not None
-    for _ in range(50):  # it does not ask meanwhile
+    for _ in range(50):  # it sends no request during this time
         clock.now += 0.25
         frames.note_news()
         await frames.after(-1)

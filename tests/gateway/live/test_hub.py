@@ -66,7 +66,7 @@ def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
 
 
 def is_fresh(hub: Hub) -> bool:
-    """Return True where the frequency of the first pump is that of now, though a miss came after it."""
+    """Return True if the frequency of the first pump is current, even after a miss."""
     return next(current for one, _, _, current in hub.known("pump-1") if one.name == "output_frequency")
 
 
@@ -151,7 +151,7 @@ def test_line_is_lost_if_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -
 
 
 def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None:
-    """Neither a row, nor a turn of the gateway's loop: the process may have stood still until just now."""
+    """Without rows and without a turn of the gateway's loop, as after a suspended process."""
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns += SECOND
     assert is_fresh(hub)
@@ -162,7 +162,7 @@ def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None
 
 
 def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None:
-    """The monotonic clock, and so each row's age by it, stood still meanwhile."""
+    """The monotonic clock, and so each row's age, stopped during the sleep."""
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
     clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # no row, and no look, in between
@@ -209,7 +209,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
     hub = Hub(Plant.load(path), clock)
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
-    assert cycle_s > 1  # where 0.1 s are asked for
+    assert cycle_s > 1  # although 0.1 s are requested
     hub.take(all_of(10, FORWARD, 25))
     row = hub.newest("pump-1", "output_frequency")
     assert row is not None
@@ -293,7 +293,7 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
 def test_fault_stays_while_its_drive_is_partly_known(
     hub: Hub, clock: HubClock, status: int, is_over: bool
 ) -> None:
-    """A busy line misses its status for a second, and reads its current: nobody saw the fault go."""
+    """A busy line misses its status for a second, and reads its current: the fault may last."""
     events = Alarms()
 
     def look() -> list[tuple[int, int | None]]:
@@ -333,7 +333,7 @@ def test_ended_alarms_are_bounded() -> None:
 def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, clock: HubClock) -> None:
     hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
     for now, frequency, current in (
-        (12, [25.0], [None, "no reply", 12.0]),  # a miss is told at once
+        (12, [25.0], [None, "no reply", 12.0]),  # a miss is shown immediately
         (25, [None, "overdue", 25.0], [None, "no reply", 12.0]),
     ):
         clock.now_ns = now * PERIOD

@@ -80,7 +80,7 @@ def test_unknown_and_foreign_frames_give_a_whole_frame(times: Times) -> None:
 
 def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
     times.frames.note(7)
-    times.stopped["pump-1"] = times.now_ns  # the frame may be older: in doubt nothing is sent
+    times.stopped["pump-1"] = times.now_ns  # the frame may be older: in doubt the command is not sent
     assert times.rule(7) == OVERTAKEN
     assert times.rule(7, "pump-2") == ""
     times.now_ns += 1
@@ -130,7 +130,7 @@ def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]
 
 
 def answer(client: socket.socket, last: bytes = b"}") -> str:
-    """Let the last byte come, and return what the gateway says of the command."""
+    """Send the last byte, and return the gateway's answer to the command."""
     client.sendall(last)
     with client.makefile("rb") as received:
         assert received.readline().startswith(b"HTTP/1.1 200 ")

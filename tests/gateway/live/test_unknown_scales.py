@@ -84,7 +84,7 @@ def test_home_assistant_writes_raw_counts() -> None:
 
 
 class Transmitter(Drive):
-    """A user's own, of whose numbers each has its own digits."""
+    """A user's own device; each number has its own digits."""
 
     pressure = setting(1, "Pa", number_format=NumberFormat.F32, moves=False)
     level = setting(3, "m", step=0.01, moves=False)

@@ -107,7 +107,7 @@ def test_no_family_of_ours_has_anything_where_the_common_block_is() -> None:
         assert not unit.holding_addresses() & common
 
 
-# ---- what a unit has ----
+# ---- units ----
 
 
 @dataclass(frozen=True)

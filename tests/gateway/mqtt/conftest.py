@@ -41,7 +41,7 @@ def host(broker: Broker) -> Iterator[Host]:
 def start(
     request: pytest.FixtureRequest, broker: Broker, tmp_path: Path
 ) -> Iterator[Callable[..., tuple[Any, Running]]]:
-    """Start a part with these settings; return what it knows of its gateway, and the part."""
+    """Start a part with these settings; return its context, and the part."""
     running: list[Running] = []
     fan = FAN if request.node.path.stem == "test_mqtt" else PLAIN_FAN
 

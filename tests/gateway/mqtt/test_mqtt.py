@@ -131,7 +131,7 @@ def test_closing_publishes_offline(broker: Broker, listener: Listener, tmp_path:
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.close()
     listener.wait_for(has("multidrop/gateway", b"offline"))
-    for drive in ("pump-1", FAN.name):  # the next plant file may have it no more
+    for drive in ("pump-1", FAN.name):  # the next plant file may lack it
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
@@ -482,14 +482,14 @@ def test_without_the_key_only_rebirth_is_subscribed(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [speaker.topics() for speaker in part._speakers] == [
-        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # what was kept of drives that are no more
+        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # retained topics of removed drives
         [("spBv1.0/works/NCMD/line", 1)],
     ]
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
 async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
-    """It may send what nobody asked it for."""
+    """A broker may send messages without a subscription."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
     part: Any = build(MqttSettings(sparkplug="works", node="line"), known)

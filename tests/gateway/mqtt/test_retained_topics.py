@@ -55,7 +55,7 @@ def test_retained_messages_of_present_drives_stay() -> None:
     assert heard(GATEWAY, *mine) == []
     back = RetainedTopics("works", home_assistant=True)
     assert back.hear("works/old/available", b"offline", THERE) == []
-    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # it was adopted meanwhile
+    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # it was adopted since
 
 
 def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
@@ -122,7 +122,7 @@ def kept_at(broker: Broker) -> set[str]:
 
 
 def live_and_die(broker: Broker, folder: Path, listener: Listener) -> None:
-    """Let a gateway with pump and fan tell all that it has to, and take its connection away for ever."""
+    """Let a gateway with pump and fan publish everything, and cut its connection for good."""
     part: Any = build(MqttSettings(broker.address, home_assistant=True), inside(folder))
     with closing(Running(part)) as running:
         listener.wait_for(lambda one: one.topic == "multidrop/pump-1/available")

@@ -39,17 +39,17 @@ class FakeGateway:
 
     def __init__(self, port: int = 0) -> None:
         self.renamed: dict[str, str] = {}
-        self.stuck: dict[str, float] = {}  # drives whose values stay what they were at this time
+        self.stuck: dict[str, float] = {}  # drives whose values stay as at this time
         self.clocked: str | None = None  # a drive whose frequency is the time
         self.plant_changes: dict[str, Any] = {}  # keys of the plant with other values
         self.changes: dict[str, Any] = {}  # keys of the frame with other values
         self.drive_changes: dict[str, dict[str, Any]] = {}  # keys of a drive in it, by its name
-        self.posts: list[tuple[str, Any]] = []  # without what they had seen
+        self.posts: list[tuple[str, Any]] = []  # without their earlier values
         self.seen: list[int] = []  # the frames that commands named
         self.stops: dict[str, int] = {}  # that were called, by drive
         self.is_held: threading.Event | None = None  # for which answers to stops wait
-        self.confirms = False  # the head of such an answer waits for nothing
-        self.token: str | None = None  # POST wants it where it is set
+        self.confirms = False  # the head of such an answer is sent immediately
+        self.token: str | None = None  # POST requires it if it is set
         self.has_history = True
         self.recorded: dict[str, dict[str, object]] = {}  # by series, what else its history says of it
         self.knows_since = 0  # UTC, ms: it has no alarms of before

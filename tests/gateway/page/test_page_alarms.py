@@ -46,7 +46,7 @@ def test_the_gravest_alarm_comes_first(opened: Opener, alarmed: FakeGateway) -> 
     assert rows.locator(".who").all_inner_texts() == wanted
     kinds = ["fault", "stopped by itself", "port lost", "silent", "fault"]
     assert [kind.strip() for kind in rows.locator(".kind").all_inner_texts()] == kinds
-    assert page.locator("#count").inner_text() == "4"  # nobody has acknowledged these
+    assert page.locator("#count").inner_text() == "4"  # these are not acknowledged
     assert "acknowledged" in rows.last.inner_text()
     assert "by anna: fuse" in rows.last.inner_text()
     assert rows.last.get_by_role("button").count() == 0

@@ -26,7 +26,7 @@ VIEWS = (
 )
 LOOKS = [("desk", "light"), ("tablet", "light"), ("phone", "dark")]
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
-# What is no violation is a long list of all elements of the page, to be made and to be sent.
+# Results other than violations would be a long list of all elements of the page.
 RUN = """tags => axe.run(document, { runOnly: tags, resultTypes: ["violations"] })
   .then(found => found.violations)"""
 
@@ -48,13 +48,13 @@ def violations(page: Any) -> list[str]:
 def test_axe_finds_no_violation(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, request: pytest.FixtureRequest
 ) -> None:
-    if size == "tablet":  # the long list of all drives is looked at on a larger and on a smaller screen
+    if size == "tablet":  # the long list of all drives is checked on a larger and on a smaller screen
         request.getfixturevalue("few_drives")
     gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)
     page.evaluate(axe)
     found = {}
-    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # long lists scroll where there is little room
+    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # long lists scroll if there is little room
         if view == "settings":
             page.get_by_role("button", name="Settings").click()
         elif view == "stop":

@@ -1,4 +1,4 @@
-"""The page's files: no markup from texts, nothing forbidden by the CSP, no file missing."""
+"""The page's files: no markup from texts, no violation of the CSP, no file missing."""
 
 from __future__ import annotations
 

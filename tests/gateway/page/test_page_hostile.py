@@ -1,4 +1,4 @@
-"""Hostile pages in Chromium: they read nothing, and no write reaches the simulated wire."""
+"""Hostile pages in Chromium read no data, and no write of theirs reaches the simulated wire."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from watching import LIVE, until
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
-# Everything by which a page can send, or read what it may not. Each is [what, what came of it].
+# All ways by which a page can send or read data without permission. Each is [way, outcome].
 ATTACK = """async gateway => {
   const stop = '{"drives": null}', found = [];
   const note = (what, came) => found.push([what, came]);
@@ -127,7 +127,7 @@ def test_only_the_gateways_page_reads_or_sends(strange: Any, elsewhere: int, tmp
         setpoint = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
         start = {"drive": "pump-1", "verb": "start"}
         assert strange.evaluate(send, ["api/write", setpoint]) == 401
-        assert strange.evaluate(send, ["api/act", start]) == 403  # who may stop is known, and may no more
+        assert strange.evaluate(send, ["api/act", start]) == 403  # the token has the right to stop only
         assert strange.evaluate(send, ["api/reload", {"confirm": True}]) == 401
         assert written(gateway) == []
         assert (

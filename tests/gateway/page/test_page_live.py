@@ -64,7 +64,7 @@ def test_a_hanging_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> 
 def test_a_viewer_s_clock_that_is_set_back_makes_no_old_value_live(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer tells of the gateway's clock
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer shows the gateway's clock
     page = opened()
     gateway.is_silent = True
     page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
@@ -137,7 +137,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
 def test_values_of_a_slow_line_stay_fresh_for_seconds(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The period is what was asked for; how long a value holds, the gateway knows."""
+    """The period comes from the plant file; the gateway knows how long a value is current."""
     held = [one | {"holds_s": one["holds_s"] and 600.0} for one in fake_plant.REGISTERS]
     monkeypatch.setattr(fake_plant, "REGISTERS", held)
     gateway.stuck = {"pump-2": time.time() - 20}
@@ -177,7 +177,7 @@ def test_unknown_values_are_a_dash_and_never_zero(opened: Opener, gateway: FakeG
     assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
     shown = page.locator(".registers .number")
-    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # three looks
+    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # three readings
     assert page.locator("tr.head .wire").first.inner_text().split() == [
         "wire",
         DASH,
@@ -237,7 +237,7 @@ def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
     shown = "Number([...document.querySelectorAll('tr.drive .number')][0].textContent)"
     first = [page.evaluate(shown) for page in pages]
     for page, before in zip(pages, first, strict=True):
-        until(page, f"{shown} !== {before} && {LIVE}")  # it begins anew at 1000
+        until(page, f"{shown} !== {before} && {LIVE}")  # it starts again at 1000
         then = page.evaluate(shown)
         assert (time.time() - then) % 1000 < BUSY_S
     context.close()

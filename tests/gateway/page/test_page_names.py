@@ -1,4 +1,4 @@
-"""Names from a plant file are text: they run nothing, move nothing and cover nothing."""
+"""Names from a plant file are text: they run no code, and move or cover no element."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def test_the_key_is_taken_as_soon_as_the_dialog_is_closed(opened: Opener) -> Non
 
 
 def test_stop_all_takes_every_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
-    """Also the second click of a double click: it asks, and no more."""
+    """The same holds for the second click of a double click: it only asks."""
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -293,7 +293,7 @@ def test_a_second_click_signs_in_for_a_stop_alone(
     page.evaluate(SECOND_CLICK, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
     if sent:
         until_met(page, lambda: gateway.posts)
-    page.wait_for_timeout(300)  # nothing else is sent
+    page.wait_for_timeout(300)  # no other request is sent
     assert gateway.posts == sent
 
 

@@ -27,7 +27,7 @@ def asked(page: Any) -> list[dict[str, list[str]]]:
 
 
 def asked_width(questions: list[dict[str, list[str]]]) -> int:
-    """Return how many milliseconds were asked for last."""
+    """Return the milliseconds of the latest request."""
     return int(questions[-1]["to"][0]) - int(questions[-1]["from"][0])
 
 
@@ -168,7 +168,7 @@ def test_no_word_of_a_state_is_cut(opened: Opener, size: tuple[int, int]) -> Non
         too_wide, height = words.evaluate_all(parts)
         return bool(too_wide <= 0 and height <= 2 * 14 * 1.2 + 1)  # px: two lines, so no word is broken
 
-    until_met(page, is_whole)  # the page is laid out anew a moment after its size is another
+    until_met(page, is_whole)  # the page is laid out again a moment after its size has changed
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (768, 1024)])
@@ -228,7 +228,7 @@ def test_trends_zoom_by_dragging_and_go_back(opened: Opener) -> None:
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.3, y, steps=4)
     seen = len(questions)
-    until_met(page, lambda: len(questions) > seen + 1)  # an answer came meanwhile
+    until_met(page, lambda: len(questions) > seen + 1)  # an answer came in between
     page.mouse.move(box["x"] + box["width"] * 0.5, y, steps=4)
     page.mouse.up()
     until_met(page, lambda: abs(asked_width(questions) - width / 4) < width / 50)
@@ -328,7 +328,7 @@ def test_phone_selects_and_distinguishes_several_drives(opened: Opener) -> None:
     until_met(page, lambda: heads.first.locator("canvas").count() == 3)
     assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
     marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
-    assert heads.first.locator("canvas").evaluate_all(marks) == 3  # each line looks otherwise
+    assert heads.first.locator("canvas").evaluate_all(marks) == 3  # each line differs from the others
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     plot = page.locator("#trend-plots .plotbox").first
     before = plot.bounding_box()
@@ -435,7 +435,7 @@ def test_a_value_between_gaps_is_drawn(opened: Opener) -> None:
 
 
 def test_a_register_that_is_asked_seldom_has_no_gaps_between_its_answers(opened: Opener) -> None:
-    """Answers come each 0.6 s; one is missed, and nobody asks for 3 s: a value holds for a second here."""
+    """Answers come each 0.6 s, one is missed, and none is requested for 3 s. Values hold for a second."""
     answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # at ms
     times = list(range(0, 4801, 300))
     mean = [answers.get(at) for at in times]

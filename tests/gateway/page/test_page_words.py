@@ -105,7 +105,7 @@ def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: Fake
     until(page, "document.body.classList.contains('dead')")
     told = []
     for _ in range(2):
-        page.wait_for_timeout(5100)  # it is drawn anew after 5 s
+        page.wait_for_timeout(5100)  # it is drawn again after 5 s
         page.evaluate("import('/page/faults.js').then(m => m.show())")
         told.append(lasted.inner_text())
     assert told[0] == told[1]
@@ -190,7 +190,7 @@ def test_an_old_register_has_its_age_like_a_new_one(opened: Opener) -> None:
 
 
 def test_viewed_registers_grow_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
-    """It may be looked at once a minute, and is new for so long only while its drive answers."""
+    """It may be read once a minute, and stays current only while its drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
     until_met(page, lambda: value.inner_text() == "4012h")

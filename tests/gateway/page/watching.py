@@ -20,7 +20,7 @@ def missing(what: str) -> NoReturn:
     pytest.skip(what)
 
 
-PATIENCE_S = 60.0  # for what comes at once but on a machine that has much else to do
+PATIENCE_S = 60.0  # for events that are immediate on an idle machine
 LOOK_MS = 60  # each look takes four programs 2 ms of their processor
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
@@ -49,7 +49,7 @@ def until(page: Any, expression: str) -> None:
 
 
 def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
-    """Wait until a condition is met: what a page shows now it may show differently a moment later.
+    """Wait until a condition is met: the page may change a moment later.
 
     Raises AssertionError.
     """
@@ -75,7 +75,7 @@ def press_enter(page: Any) -> None:
 
 
 def told(page: Any) -> str:
-    """Return what the head says, for who reads of a failure."""
+    """Return the text of the head, for the message of a failure."""
     return str(
         page.evaluate("['link', 'notice'].map(id => document.getElementById(id).textContent).join(', ')")
     )
@@ -89,5 +89,5 @@ def cell(page: Any, drive: str, part: str) -> Any:
 
 
 def link(page: Any) -> str:
-    """Return what the head says of the way to the gateway."""
+    """Return the text of the head about the connection."""
     return str(page.locator("#link").inner_text().strip())
