@@ -37,7 +37,10 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 LANGUAGES = {"python", "toml", "sh", "console", "text", "c"}  # text and c blocks are not run
 PACKAGES = (
     "multidrop",
-    *(f"multidrop.{name}" for name in ("drive", "families.profiles", "sim", "recording", "capture", "scan")),
+    *(
+        f"multidrop.{name}"
+        for name in ("drive", "families.profiles", "sim", "recording", "capture", "scan", "params")
+    ),
 )
 
 # Commands that are not run, by their first words, and the reason.

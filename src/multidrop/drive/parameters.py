@@ -16,7 +16,7 @@ from typing import Any
 from multidrop.drive.register import HOLDING, Access, Kept, Register, Table
 from multidrop.errors import Unsupported
 
-MONITOR = "it is a monitor"
+READING = "this library only reads it; set it on the panel"
 LINE_PARAMETER = "it changes the drive's end of the line"
 PASSWORD = "it is a password"
 
@@ -71,7 +71,11 @@ class ParameterSpace:
                 match = re.search(self.named, register.place)
                 if match and register.access is Access.SETTING:
                     found[match[1]] = register.address, register.table
-        return {code: place for code, place in found.items() if not _matches(code, self.monitors)}
+        return {code: place for code, place in found.items() if not self.is_monitor(code)}
+
+    def is_monitor(self, code: str) -> bool:
+        """Return True if the drive itself changes this value."""
+        return _matches(code, self.monitors)
 
     def reason(self, code: str) -> str:
         """Return why this code is never written; "" if no field forbids it."""
@@ -144,10 +148,10 @@ def _parameters_of(family: Any) -> Mapping[str, Parameter]:
         if register is None:
             made = Parameter(address, Access.SETTING, table=table, kept=Kept.EEPROM, code=code, family=family)
             name = code
-        elif register.access is not Access.SETTING:
-            continue
         else:
             facts = {one.name: getattr(register, one.name) for one in fields(register) if one.init}
+            if register.access is not Access.SETTING:
+                facts |= {"access": Access.SETTING, "never": READING}
             if register.ram_address is not None:
                 facts |= {"ram_address": None, "kept": Kept.EEPROM}
             made = Parameter(**facts, code=code, family=family, is_declared=True)

@@ -64,9 +64,11 @@ def plan(
     code, or values out of range; then no parameter is written.
     """
     given = values if isinstance(values, ParameterSet) else ParameterSet("", values, source="values")
-    family = type(drive)
+    family: Any = type(drive)
     check_same_model(ParameterSet(drive.model, {}, source=drive.name), given)
-    known = {code: parameter_of(family, code) for code in given.values}
+    parameters_of(family)  # raises Unsupported for a family without a rule
+    space = family.parameter_space
+    known = {code: parameter_of(family, code) for code in given.values if not space.is_monitor(code)}
     _check_also(family, also, given)
     check_stands(drive, is_first=True)
     bounds = _bounds(family, known)

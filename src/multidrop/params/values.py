@@ -76,22 +76,26 @@ def read(
 ) -> ParameterSet:
     """Return all parameters of a drive, or those of `codes`; parameters that it does not have are left out.
 
-    Reads blocks of parameters, and splits a block that the drive refuses. Raises Unsupported if the family
-    has no rule for addresses, ValueError for an unknown code, WriteForbidden if the drive is of another
-    family, and NoReply, BadReply, DriveException or LineError if reading fails.
+    Monitors among `codes` are left out too. Reads blocks of parameters, and splits a block that the drive
+    refuses. Raises Unsupported if the family has no rule for addresses, ValueError for an unknown code,
+    WriteForbidden if the drive is of another family, and NoReply, BadReply, DriveException or LineError if
+    reading fails.
     """
     family: Any = type(drive)
     if drive.bus is None:
         raise NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
-    known = parameters_of(family)
-    wanted = [*known.values()] if codes is None else [parameter_of(family, code) for code in codes]
+    known, space = parameters_of(family), family.parameter_space
+    wanted = [
+        parameter_of(family, code)
+        for code in (known if codes is None else codes)
+        if not space.is_monitor(code)
+    ]
     drive.bus.check_identity(drive)
     reader = _Reader(drive, len(wanted), progress)
     reader.read(wanted)
     order = {code: at for at, code in enumerate(known)}
     values = {code: reader.values[code] for code in sorted(reader.values, key=order.__getitem__)}
-    space = family.parameter_space
-    firmware = space.firmware if space else ""
+    firmware = space.firmware
     return ParameterSet(
         drive.model,
         values,
@@ -248,10 +252,11 @@ def compare(first: ParameterSet, second: ParameterSet, family: Any = None) -> li
     """
     check_same_model(first, second)
     known = {} if family is None else parameters_of(family)
+    space = None if family is None else family.parameter_space
     found: list[Difference] = []
     for code in dict.fromkeys((*first.values, *second.values)):
         one, other = first.values.get(code), second.values.get(code)
-        if one == other:
+        if one == other or (space and space.is_monitor(code)):
             continue
         name = known[code].name if code in known and known[code].is_declared else ""
         found.append(
