@@ -204,8 +204,8 @@ def test_moves_with_an_unseen_start() -> None:
     moves = [MOVE | {"from": None}, MOVE | {"from": ""}, MOVE | {"to": ""}]
     assert [re.sub(" +", " ", row)[27:] for row in move_table(moves)] == [
         "to gw-2",
-        "from nobody to gw-2",
-        "from gw-1 to nobody",
+        "from none to gw-2",
+        "from gw-1 to none",
     ]
 
 

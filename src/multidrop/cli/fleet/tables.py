@@ -164,8 +164,8 @@ def move_table(moves: Iterable[FleetState], width: float = inf) -> list[str]:
 
 
 def _from_to(move: FleetState) -> tuple[str, str]:
-    before = "" if move["from"] is None else f"from {move['from'] or 'nobody'}"
-    return before, f"to {move['to'] or 'nobody'}"
+    before = "" if move["from"] is None else f"from {move['from'] or 'none'}"
+    return before, f"to {move['to'] or 'none'}"
 
 
 def trouble_sentences(fleet: FleetState) -> list[str]:
