@@ -63,10 +63,15 @@ def apply(
 
 
 def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report | None = None) -> Applied:
-    """Write the parameters of a plan, as `apply` does."""
+    """Write the parameters of a plan, as `apply` does.
+
+    First sends a stop to a drive that shows only an output frequency of 0.
+    """
     journal = _Journal(made.drive)
     result = Applied(made, earlier=journal.earlier())
     if made.writes:
+        if not check_stands(made.drive):  # it may run at 0 Hz, and would turn at the next setpoint
+            made.drive.stop()
         journal.begin(made)
     with commissioning_block() if commissioning else nullcontext():
         for number, change in enumerate(made.writes, 1):

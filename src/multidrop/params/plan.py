@@ -57,7 +57,7 @@ def plan(
     also: Collection[str] = (),
     progress: Progress | None = None,
 ) -> ApplyPlan:
-    """Return what `apply` would write; reads the drive, and sends a stop if its state is not known.
+    """Return the writes of `apply`; only reads the drive.
 
     `also` has codes of the line's own parameters, which are not written otherwise. Raises WriteForbidden if
     the motor runs or the drive is of another family. Raises ValueError for another model's values, an unknown
@@ -70,7 +70,7 @@ def plan(
     space = family.parameter_space
     known = {code: parameter_of(family, code) for code in given.values if not space.is_monitor(code)}
     _check_also(family, also, given)
-    check_stands(drive, is_first=True)
+    check_stands(drive)
     bounds = _bounds(family, known)
     present = read(drive, {*known, *bounds.values()}, progress=progress)
     left: dict[str, str] = {}
@@ -126,11 +126,10 @@ def _notes(given: ParameterSet, present: ParameterSet) -> tuple[str, ...]:
 # ---- the motor ----
 
 
-def check_stands(drive: Drive, *, is_first: bool = False) -> None:
-    """Raise WriteForbidden unless the drive reports a stopped motor that only the line commands.
+def check_stands(drive: Drive) -> bool:
+    """Raise WriteForbidden unless the motor stands and only the line commands it.
 
-    If the drive has no report of its state, but of its output frequency, `is_first` sends a stop first: a
-    motor at a setpoint of 0 Hz stands, and would turn at the next setpoint.
+    Return False if the drive shows only an output frequency of 0: it may run at a setpoint of 0 Hz.
     """
     try:
         state = drive.state()
@@ -142,11 +141,10 @@ def check_stands(drive: Drive, *, is_first: bool = False) -> None:
             raise _not_known(drive, f"its state is {state}")
         if drive.read(frequency) != 0:
             raise _runs(drive, "its output frequency is not 0")
-        if is_first:
-            drive.stop()
     elif state.condition not in (Condition.STOPPED, Condition.FAULT):
         raise _runs(drive, f"its state is {state}")
     _check_no_run_command(drive)
+    return state.condition is not Condition.UNKNOWN
 
 
 def _check_no_run_command(drive: Drive) -> None:
