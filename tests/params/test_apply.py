@@ -240,3 +240,12 @@ def test_motor_that_starts_ends_the_application(monkeypatch: pytest.MonkeyPatch)
     done = params.apply(drive, {"0009": 200, "0010": 200}, report=start)
     assert [change.parameter.code for change in done.written] == ["0009"]
     assert isinstance(done.failure, WriteForbidden)
+
+
+def test_refused_ramp_time_names_ways_that_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+    drive.write("acceleration_time", 20.0)
+    with pytest.raises(WriteForbidden, match=r"params\.apply") as refusal:
+        drive.write("acceleration_time", 30.0)
+    way = "wait, set it on the drive's panel, or use `multidrop params apply --commissioning`"
+    assert way in refusal.value.for_command_line()
