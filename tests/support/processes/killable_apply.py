@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 import traceback
 from pathlib import Path
 from typing import Any
@@ -21,18 +22,19 @@ TRIES = 20  # replies may be missed on a busy machine
 
 def apply(port: str, file: str, report: str) -> None:
     reported: list[str] = []
-    with Bus(port, expiry=60) as bus:
-        drive = bus.attach(DelixiNative, **DRIVE)
-        for _ in range(TRIES):
-            try:
+    for _ in range(TRIES):
+        try:
+            with Bus(port, expiry=60) as bus:
+                drive = bus.attach(DelixiNative, **DRIVE)
                 result = params.apply(drive, params.load(file), commissioning=True)
-            except BusError:
-                continue
-            reported += [*(change.parameter.code for change in result.written), *result.earlier]
-            if result.ok:
-                break
-        else:
-            raise SystemExit("the application does not end")
+        except BusError:
+            time.sleep(0.1)
+            continue
+        reported += [*(change.parameter.code for change in result.written), *result.earlier]
+        if result.ok:
+            break
+    else:
+        raise SystemExit("the application does not end")
     Path(report).write_text("\n".join(reported))
 
 
