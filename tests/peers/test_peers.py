@@ -1,4 +1,4 @@
-"""Read and write servers by other authors through a drive that a user declares."""
+"""Servers by other authors, on serial lines and Modbus TCP, and a client that reads our simulated drives."""
 
 from __future__ import annotations
 
@@ -6,18 +6,25 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import pytest
 from kills import BoundProcess
-from lines import patient
-from peers import build_with_libmodbus, require_module
+from lines import HOST_LATE, patient, rows_of, until
+from peers import build_with_libmodbus, require_module, require_program
 from ptys import linked_ptys
 
 from multidrop.bus import Bus
 from multidrop.cli import main
 from multidrop.errors import DriveException, NoReply
+from multidrop.families import InnovertIBD, InvtCHE
 from multidrop.families.registry import find_model
+from multidrop.plant.loader import load_plant
+from multidrop.poller import Poller
+from multidrop.sim import Simulator, Wire, simulated
 
 SERVERS = Path(__file__).parents[1] / "support" / "servers"
 DEVICE = f"{Path(__file__).parents[1] / 'support' / 'drives' / 'own_drives.py'}:Device"
@@ -25,59 +32,87 @@ Device = find_model(DEVICE)
 ADDRESS = 7
 
 
-def libmodbus(built: Path) -> list[str]:
-    return [str(build_with_libmodbus(SERVERS / "libmodbus_server.c", built)), "PORT", str(ADDRESS)]
-
-
-def pymodbus(framing: str) -> list[str]:
-    require_module("pymodbus")
-    return [sys.executable, str(SERVERS / "pymodbus_server.py"), "PORT", str(ADDRESS), framing]
-
-
-COMMANDS: dict[str, Callable[[Path], list[str]]] = {
-    "libmodbus rtu": libmodbus,
-    "pymodbus rtu": lambda _: pymodbus("rtu"),
-    "pymodbus ascii": lambda _: pymodbus("ascii"),
+HELD = {
+    "current": 101.0,  # input register 10 holds 1010
+    "voltage": 1011,
+    "temperature": 1012,
+    "frequency": 10.2,  # holding register 20 holds 1020
+    "energy": (1022 << 16 | 1023) / 100,
+    "relay": 1,  # coil 5
+    "door": 1,
 }
 
 
+class Server(NamedTuple):
+    """A running server: its port, and the framing that a serial one needs."""
+
+    port: str
+    framing: str | None = None
+
+    def attach(self, bus: Bus, *, family: str = "Device", address: int = ADDRESS) -> Any:
+        framing = {} if self.framing is None else {"framing": self.framing}
+        return bus.attach(find_model(DEVICE.replace("Device", family)), address, **framing)
+
+    @property
+    def words(self) -> list[str]:
+        """Return how a command names the device."""
+        framing = [] if self.framing is None else ["--framing", self.framing]
+        return [self.port, DEVICE, str(ADDRESS), *framing]
+
+
+def libmodbus(built: Path, name: str, *words: str) -> list[str]:
+    return [str(build_with_libmodbus(SERVERS / f"{name}.c", built)), *words]
+
+
+def pymodbus(name: str, *words: str) -> list[str]:
+    require_module("pymodbus")
+    return [sys.executable, str(SERVERS / f"{name}.py"), *words]
+
+
+COMMANDS: dict[str, Callable[[Path], list[str]]] = {
+    "libmodbus rtu": lambda built: libmodbus(built, "libmodbus_server", "PORT", str(ADDRESS)),
+    "pymodbus rtu": lambda _: pymodbus("pymodbus_server", "PORT", str(ADDRESS), "rtu"),
+    "pymodbus ascii": lambda _: pymodbus("pymodbus_server", "PORT", str(ADDRESS), "ascii"),
+    "libmodbus tcp": lambda built: libmodbus(built, "libmodbus_tcp_server"),
+    "pymodbus tcp": lambda _: pymodbus("modbus_tcp_server", str(ADDRESS)),
+}
+
+
+@contextmanager
+def running(name: str, folder: Path) -> Iterator[Server]:
+    command, framing = COMMANDS[name](folder), name.split()[1]
+    with ExitStack() as stack:
+        ours = ""
+        if framing != "tcp":
+            theirs, ours = stack.enter_context(linked_ptys())
+            command = [theirs if word == "PORT" else word for word in command]
+        process = stack.enter_context(BoundProcess(command, stdout=subprocess.PIPE, text=True))
+        assert process.stdout is not None
+        ready, *number = process.stdout.readline().split()
+        assert ready == "ready"
+        yield Server(ours, framing) if ours else Server(f"tcp://127.0.0.1:{number[0]}")
+        process.kill()
+
+
 @pytest.fixture(params=COMMANDS)
-def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, str]]:
-    """Give a port with a server behind it, and the server's framing."""
-    command = COMMANDS[request.param](tmp_path)
-    with linked_ptys() as (theirs, ours):
-        started = [theirs if word == "PORT" else word for word in command]
-        with BoundProcess(started, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n"
-            yield ours, request.param.split()[1]
-            process.kill()
+def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Server]:
+    with running(request.param, tmp_path) as made:
+        yield made
 
 
 @pytest.mark.slow
 @patient
-def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
-    port, framing = server
-    with Bus(port) as bus:
-        device = bus.attach(Device, ADDRESS, framing=framing)
-        assert device.read_many(Device.registers.values()) == {
-            "current": 101.0,  # input register 10 holds 1010
-            "voltage": 1011,
-            "temperature": 1012,
-            "frequency": 10.2,  # holding register 20 holds 1020
-            "energy": (1022 << 16 | 1023) / 100,
-            "relay": 1,  # coil 5
-            "door": 1,
-        }
+def test_registers_and_coils_are_read(server: Server) -> None:
+    with Bus(server.port) as bus:
+        assert server.attach(bus).read_many(Device.registers.values()) == HELD
 
 
 @pytest.mark.slow
 @patient
-def test_undeclared_addresses_can_be_read(server: tuple[str, str]) -> None:
+def test_undeclared_addresses_can_be_read(server: Server) -> None:
     """Check that undeclared registers and coils have the values of the servers' sources."""
-    port, framing = server
-    with Bus(port) as bus:
-        device = bus.attach(Device, ADDRESS, framing=framing)
+    with Bus(server.port) as bus:
+        device = server.attach(bus)
         for function in (3, 4):
             assert device.read_raw(function, 50, 3) == struct.pack(">3H", 1050, 1051, 1052)
         for function in (1, 2):
@@ -89,42 +124,83 @@ def test_undeclared_addresses_can_be_read(server: tuple[str, str]) -> None:
 
 @pytest.mark.slow
 @patient
-def test_written_values_are_read_back(server: tuple[str, str]) -> None:
-    port, framing = server
-    with Bus(port) as bus:
-        device = bus.attach(Device, ADDRESS, framing=framing)
+def test_written_values_are_read_back(server: Server) -> None:
+    with Bus(server.port) as bus:
+        device = server.attach(bus)
         for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
             assert device.write(device.register(name), value) == value
 
 
 @pytest.mark.slow
 @patient
-def test_exception_code_raises_drive_exception(server: tuple[str, str]) -> None:
-    port, framing = server
-    with Bus(port) as bus:
-        device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS, framing=framing)
+def test_exception_code_raises_drive_exception(server: Server) -> None:
+    with Bus(server.port) as bus:
+        device = server.attach(bus, family="Mistaken")
         with pytest.raises(DriveException, match="illegal address") as refusal:
             device.read(device.register("absent"))
         assert refusal.value.code == 2
 
 
 @pytest.mark.long
-def test_another_address_times_out(server: tuple[str, str]) -> None:
-    port, framing = server
-    with Bus(port) as bus:
-        device = bus.attach(Device, ADDRESS + 1, framing=framing)
-        with pytest.raises(NoReply):
+@pytest.mark.parametrize(
+    "name", [name for name in COMMANDS if name != "libmodbus tcp"]
+)  # answers to any unit
+def test_another_address_times_out(name: str, tmp_path: Path) -> None:
+    advice = r"name the port socket://127\.0\.0\.1:\d+" if "tcp" in name else "does not answer"
+    with running(name, tmp_path) as server, Bus(server.port) as bus:
+        device = server.attach(bus, address=ADDRESS + 1)
+        with pytest.raises(NoReply, match=advice):
             device.read(device.register("current"))
 
 
 @pytest.mark.slow
 @patient
-def test_command_line_reads_and_writes(server: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    port, framing = server
-    where = [port, DEVICE, str(ADDRESS), "--framing", framing]
-    assert main(["write", *where, "frequency", "31.4", "--yes"]) == 0
-    assert main(["read", *where, "frequency", "current"]) == 0
+def test_command_line_reads_and_writes(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["write", *server.words, "frequency", "31.4", "--yes"]) == 0
+    assert main(["read", *server.words, "frequency", "current"]) == 0
     shown = capsys.readouterr().out
     assert "frequency = 31.40 Hz" in shown
     assert ["frequency", "31.40", "Hz"] in map(str.split, shown.splitlines())
     assert ["current", "101.0", "A"] in map(str.split, shown.splitlines())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["libmodbus tcp", "pymodbus tcp"])
+def test_poll_reads_all_values_of_the_server(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    with running(name, tmp_path) as server:
+        path.write_text(
+            f'[[line]]\nname = "net"\nport = "{server.port}"\n'
+            f'[[line.drive]]\nname = "meter"\nmodel = "{DEVICE}"\naddress = {ADDRESS}\n'
+            f"poll = {list(HELD)}\n"
+        )
+        rows = []
+        with Poller(load_plant(path)) as poller:
+            until(lambda: rows.extend(rows_of(poller)) or len(rows) > 500)
+    assert {row.status for row in rows} <= {"ok"} | HOST_LATE
+    assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
+
+
+# ---- a client that we did not write reads simulated drives ----
+
+
+def mbpoll(port: str, address: int, options: str, *values: int) -> subprocess.CompletedProcess[str]:
+    place = urlsplit(port)
+    command = [require_program("mbpoll"), "-q", "-m", "tcp", "-p", str(place.port), "-o", "5", "-0"]
+    command += ["-a", str(address), *options.split(), str(place.hostname), *map(str, values)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def test_mbpoll_reads_and_writes_a_simulated_family_over_tcp() -> None:
+    pump, fan = simulated(InnovertIBD(1)), simulated(InvtCHE(247))
+    pump["output_current"], fan["output_voltage"] = 2.5, 231
+    with Simulator([Wire([pump, fan], port="tcp://127.0.0.1:0", unpaced=True)]) as line:
+        port = line.wires[0].path
+        read = mbpoll(port, 1, "-r 3 -c 1 -t 4 -1")
+        assert ("[3]:", "25") in [tuple(row.split()) for row in read.stdout.splitlines()], read.stderr
+        read = mbpoll(port, 247, "-r 12291 -c 1 -t 4 -1")
+        assert ("[12291]:", "231") in [tuple(row.split()) for row in read.stdout.splitlines()], read.stderr
+        refused = mbpoll(port, 247, "-r 32779 -c 1 -t 4 -1")
+        assert "Illegal data address" in refused.stderr
+        assert mbpoll(port, 1, "-r 107 -t 4", 200).returncode == 0
+    assert pump["acceleration_time"] == 20
