@@ -340,6 +340,7 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_patient")
 def test_all_drives_of_a_plant_are_tried(run: Run, port: str, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'

@@ -110,7 +110,7 @@ def check_failing(
 @pytest.mark.parametrize(
     "step",
     [
-        1009,
+        4001,
         pytest.param(61, marks=[pytest.mark.slow, pytest.mark.long]),
     ],
 )
