@@ -378,7 +378,7 @@ def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_confirmation_that_is_lost_and_cannot_be_looked_up() -> None:
+def test_a_lost_confirmation_of_an_unreadable_register_is_unconfirmed() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
@@ -391,7 +391,7 @@ def test_a_confirmation_that_is_lost_and_cannot_be_looked_up() -> None:
 
 
 @pytest.mark.slow
-def test_a_confirmation_that_is_lost_and_nothing_can_be_read_back() -> None:
+def test_a_write_on_a_line_without_replies_is_sent_once() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x03, 0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
@@ -598,7 +598,7 @@ def when_asked(bus: Bus, act: Callable[[], object]) -> None:
     vars(bus.line)["carry_out"] = act_and_carry_out
 
 
-def test_a_read_of_several_requests_ends_where_its_drive_leaves() -> None:
+def test_a_read_of_several_requests_ends_if_its_drive_is_detached() -> None:
     with Simulator([Wire([simulated(Single(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         pump = bus.attach(Single, 1)
         peer = bus.peer(pump)

@@ -187,7 +187,7 @@ def test_a_failing_act_does_not_delay_others(caught: list[int], caplog: pytest.L
     assert "the drives could not be stopped" in caplog.text
 
 
-def test_it_may_be_finished_on_any_thread(caught: list[int]) -> None:
+def test_a_last_act_may_be_finished_on_any_thread(caught: list[int]) -> None:
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
     act.go_on.set()

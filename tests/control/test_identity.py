@@ -79,7 +79,7 @@ def test_a_replaced_drive_is_not_started() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
-def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
+def test_a_silent_drive_is_identified_once_before_the_next_write(
     model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
@@ -98,7 +98,7 @@ def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
-def test_a_drive_of_which_nothing_was_heard_for_ten_seconds_is_looked_at_once(
+def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
     model: str, pause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)

@@ -109,7 +109,7 @@ def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: p
         ("/dev/../dev/null", "/dev/null"),
     ],
 )
-def test_what_a_name_means(name: str, identity: str) -> None:
+def test_a_port_name_is_resolved_to_its_device(name: str, identity: str) -> None:
     assert port_identity.of_name(name) == identity
     assert port_identity.of_name(identity) == identity
 

@@ -103,7 +103,7 @@ def ramped(monkeypatch: pytest.MonkeyPatch, family: type[Drive], **options: floa
     return line, line.attach(family(1, **options)), sim
 
 
-def test_a_ramp_whose_setpoint_is_looked_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_reads_an_unknown_setpoint_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if the last step, which is checked first, writes no setpoint."""
     line, drive, _ = ramped(monkeypatch, Ramped)
     ramp(drive, 2.0, rate=1.0, every=1.0)

@@ -491,7 +491,7 @@ def test_coils_have_no_value_that_is_written_twice() -> None:
                 assert {part for name in names for part in name.split("|")} <= allowed
 
 
-def test_a_family_of_one_s_own_is_looked_at_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_s_family_is_identified_too(monkeypatch: pytest.MonkeyPatch) -> None:
     class Mine(Drive):
         """A family that cannot say who it is."""
 

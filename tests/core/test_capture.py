@@ -93,7 +93,7 @@ def test_every_byte_is_reported_exactly_once(pieces: list[bytes]) -> None:
     assert b"".join(span.raw for span in split(*pieces)) == b"".join(pieces)
 
 
-def test_a_time_is_that_of_the_piece_in_which_a_frame_begins() -> None:
+def test_a_frame_has_the_time_of_its_first_piece() -> None:
     spans = split(READ[:3], READ[3:] + ANSWER[:2], ANSWER[2:], b"\xff")
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
@@ -102,7 +102,7 @@ def test_confirming_copies_differ_from_requests_by_their_order() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
-def test_a_copy_is_neither_where_its_order_is_lost() -> None:
+def test_a_copy_without_a_known_order_is_neither_request_nor_reply() -> None:
     assert kinds(split(WRITE)) == [Kind.EITHER]
     assert kinds(split(READ, ANSWER, WRITE[:-1], WRITE, READ)) == [
         *(Kind.REQUEST, Kind.REPLY, Kind.JUNK, Kind.EITHER, Kind.REQUEST)

@@ -172,7 +172,7 @@ def test_a_reply_is_found_after_a_late_one_that_interrupts_its_request(line: Lin
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_found_where_the_line_babbled_before_its_request(line: LineDriver, drive: Peer) -> None:
+def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive: Peer) -> None:
     """A late reply was among the received bytes."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":

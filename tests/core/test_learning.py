@@ -503,7 +503,7 @@ def test_a_late_reply_is_not_reported_as_another_address(line: LineDriver, drive
     assert other.late_until_ns > line.now
 
 
-def test_data_that_look_like_a_late_reply_are_part_of_the_reply(line: LineDriver, drive: Peer) -> None:
+def test_data_like_a_late_reply_stay_part_of_the_reply(line: LineDriver, drive: Peer) -> None:
     """It comes at once or byte by byte: the bar stays, and the reply is read."""
     time_out(line, drive)
     until = drive.late_until_ns

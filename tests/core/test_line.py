@@ -433,9 +433,7 @@ def test_reply_behind_4096_bytes_of_noise(line: LineDriver, seed: int, piece: in
 
 
 @pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
-def test_endless_garbage_is_looked_at_again_only_within_a_frames_length(
-    line: LineDriver, received: bytes
-) -> None:
+def test_endless_garbage_is_searched_again_within_a_frame_s_length(line: LineDriver, received: bytes) -> None:
     ask(line, Message(1, 0x03, 0, 125))
     garbage = received * 20_000
     for at in range(0, len(garbage), 64):
@@ -622,7 +620,7 @@ def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> No
     assert (line.completion.reply.data, line.completion.skipped) == (words(7), 8)
 
 
-def test_where_no_adapter_echoes_the_first_confirmation_is_believed_until_an_echo_shows(
+def test_the_first_confirmation_is_believed_until_an_echo_shows(
     line: LineDriver,
 ) -> None:
     line.set_echo(lib.MD_NO_ECHO)

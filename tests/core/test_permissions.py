@@ -53,13 +53,13 @@ def until_of(process: subprocess.Popen[str]) -> int:
     return int(process.stdout.readline())
 
 
-def test_it_does_not_hold_before_it_is_extended() -> None:
+def test_a_new_permission_does_not_hold() -> None:
     mastership = Mastership()
     assert (mastership.until_ns, mastership.holds, mastership.guard_s) == (0, False, 0.7)
     assert repr(mastership) == "<Mastership not held, guard 0.7 s>"
 
 
-def test_it_holds_until_its_deadline() -> None:
+def test_a_permission_holds_until_its_deadline() -> None:
     mastership = Mastership(guard_s=100)
     until_ns = now_ns() + S // 20
     mastership.extend(until_ns)
@@ -84,7 +84,7 @@ def test_a_deadline_never_goes_backwards() -> None:
     mastership.end()
 
 
-def test_it_can_be_extended_after_its_end() -> None:
+def test_an_ended_permission_can_be_extended() -> None:
     mastership = Mastership()
     mastership.extend(now_ns() + 200 * S)
     mastership.end()

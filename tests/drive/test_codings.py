@@ -422,7 +422,7 @@ def test_a_power_of_ten_is_that_of_the_scale_register(
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cases=st.lists(numbers(), min_size=1, max_size=20))
-def test_a_recording_holds_what_the_core_made(
+def test_a_recording_has_the_values_of_the_core(
     tmp_path: Path, suffix: str, cases: list[tuple[NumberFormat, str, float, float, float]]
 ) -> None:
     columns = Columns(len(cases))

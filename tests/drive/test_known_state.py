@@ -93,7 +93,7 @@ def test_a_fault_is_known_by_a_status_alone(
     assert found is None or found.fault is None
 
 
-def test_a_faults_code_tells_its_name_when_it_comes() -> None:
+def test_a_fault_gets_its_name_when_its_code_arrives() -> None:
     reader = StateReader(MODELS["invt-che"](1))
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)

@@ -118,7 +118,7 @@ def test_a_number_is_written_held_and_read_back(
 @given(st.floats(-3e38, 3e38))
 @example(12.1)
 @example(16_777_217)
-def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> None:
+def test_a_written_float_is_taken_as_the_nearest_float32(attached: Any, value: float) -> None:
     _, meter, sim = attached
     (nearest,) = struct.unpack(">f", struct.pack(">f", value))
     assert meter.write(Meter.f32, value) == nearest == sim["f32"]
@@ -138,7 +138,7 @@ def test_value_outside_the_number_format_is_refused(attached: Any, name: str, va
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @example(struct.unpack(">f", struct.pack(">f", 1e-45))[0])
 @pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda each: each.name)
-def test_a_float_is_shown_as_what_it_holds(register: Register[float], raw: float) -> None:
+def test_a_float_is_shown_with_the_digits_it_holds(register: Register[float], raw: float) -> None:
     shown = register.format(register.decode(raw)).partition(" ")[0]
     assert register.encode(register.parse(shown)) == raw
     assert len(shown.lstrip("-").replace(".", "").partition("e")[0].strip("0")) <= 9

@@ -103,7 +103,7 @@ def test_pandas_by_pyarrow_has_the_same_times() -> None:
 
 
 @pytest.mark.parametrize("library", ["pandas", "numpy"])
-def test_what_would_take_times_for_numbers_is_told_what_to_take(library: str) -> None:
+def test_a_consumer_without_time_types_gets_advice(library: str) -> None:
     """pandas' constructor does not know Arrow's interface, and goes through rows one by one."""
     taker = pytest.importorskip(library, reason=f"needs {library}")
     take = taker.DataFrame if library == "pandas" else taker.asarray

@@ -102,7 +102,7 @@ def test_a_silent_drive_that_leaves_takes_its_rest_along(port: str) -> None:
         until(lambda: len(seen.of("pump-1")) > before + 50)
 
 
-def test_what_cannot_come_or_go(port: str) -> None:
+def test_invalid_additions_and_removals_are_errors(port: str) -> None:
     with Poller(plant(line(port, pump(1)))) as poller:
         for polled_drive, sentence in (
             (pump(1, "other"), "address 1 is taken by pump-1"),
@@ -119,7 +119,7 @@ def test_what_cannot_come_or_go(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_of_which_nothing_is_polled_disturbs_nobody(port: str) -> None:
+def test_an_unpolled_drive_does_not_disturb_others(port: str) -> None:
     with Poller(plant(line(port, pump(1), polled(Toy(3, name="pump-3"), [])))) as poller:
         seen = Seen(poller)
         until(lambda: len(seen.of("pump-1")) > 50)
@@ -199,7 +199,7 @@ def test_many_threads_do_all_of_it_at_once() -> None:
     assert done.stdout.endswith("\nnothing misattributed, nothing lost, nothing grows\n")
 
 
-def test_statistics_may_be_looked_at_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_statistics_can_be_read_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader does not fail when a drive leaves during its read."""
     with Bus(port) as bus:
         ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
@@ -232,7 +232,7 @@ poll = ["output_frequency"]
 
 
 @pytest.mark.slow
-def test_it_is_beside_the_polled_ones(tmp_path: Path) -> None:
+def test_an_added_drive_is_polled_beside_the_others(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     with Simulator([Wire([simulated(YD1000(1)), simulated(YD1000(9))])]) as simulator:
         path.write_text(PLANT.format(port=simulator.wires[0].path))

@@ -142,7 +142,7 @@ def test_a_line_that_failed_is_sound_again_after_a_while(two: Two, monkeypatch: 
     until(lambda: two.poller.line_failures == {})
 
 
-def test_a_line_that_goes_on_failing_is_tried_ever_more_rarely(
+def test_a_failing_line_is_retried_at_growing_intervals(
     two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(polled_line, "RETRY_NS", 5_000_000)
@@ -155,7 +155,9 @@ def test_a_line_that_goes_on_failing_is_tried_ever_more_rarely(
     assert delays[:6] == [0.005, 0.01, 0.02, 0.04, 0.08, 0.1]
 
 
-def test_what_was_queued_when_a_line_failed_is_carried_out(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests_queued_when_a_line_failed_are_carried_out(
+    two: Two, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A failure right after requests were queued: their number is not known to the poller."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
@@ -181,7 +183,7 @@ def test_what_was_queued_when_a_line_failed_is_carried_out(two: Two, monkeypatch
 # ---- the poller's own thread ----
 
 
-def test_a_short_want_of_memory_ends_nothing(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_brief_lack_of_memory_does_not_end_polling(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as short:
         left = [MemoryError()] * 3
         awaited = RowQueue.await_calls
@@ -242,7 +244,7 @@ def test_a_poller_that_failed_polls_nothing_more_and_commands_go_on(failed: Two)
     assert failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2  # one was under way
 
 
-def test_who_waits_for_rows_wakes_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     ended = threading.Event()
 
     def wait() -> None:
@@ -359,7 +361,9 @@ def test_a_function_that_a_call_does_not_carry_out_is_refused(two: Two, function
 
 
 @pytest.mark.parametrize("function", [wait, give, give_later])
-def test_one_that_is_hidden_fails_with_its_first_batch(two: Two, function: Callable[[object], Any]) -> None:
+def test_a_wrapped_async_callback_fails_with_its_first_batch(
+    two: Two, function: Callable[[object], Any]
+) -> None:
     two.poller.on_batch(lambda batch: function(batch))
     caller = two.poller._caller
     assert caller is not None

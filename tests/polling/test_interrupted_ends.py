@@ -101,7 +101,7 @@ def test_a_poller_is_closed_though_its_closing_is_interrupted(hall: Received, st
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_a_poller_that_is_interrupted_as_it_begins_is_closed(hall: Received, step: int) -> None:
+def test_a_poller_interrupted_at_its_start_is_closed(hall: Received, step: int) -> None:
     places: set[str] = set()
 
     def act(nth: int) -> bool:

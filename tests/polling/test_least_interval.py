@@ -60,9 +60,7 @@ def quick(address: int) -> tuple[Drive, Picky]:
 @pytest.mark.long
 @table("every", [None, 0.01, 0.5])
 @table("others", [0, 2])
-def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(
-    every: float | None, others: int
-) -> None:
+def test_a_drive_s_registers_share_its_least_interval(every: float | None, others: int) -> None:
     drive, sim = slow()
     rest = [quick(address) for address in range(2, 2 + others)]
     drives = [
@@ -120,7 +118,7 @@ def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> No
     assert sim.early == 0
 
 
-def test_reads_by_hand_wait_their_turn_while_others_are_polled() -> None:
+def test_manual_reads_keep_the_least_interval() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as clocked:
         bus = clocked.poller.bus("line")

@@ -210,7 +210,7 @@ def test_nothing_is_sent_while_the_master_before_may_still_be_there(port: str) -
 
 @pytest.mark.long
 @paces
-def test_another_master_is_told_and_polling_begins_when_it_is_silent(
+def test_another_master_is_reported_and_polling_starts_after_it(
     mastership: Mastership, every: float | None
 ) -> None:
     hold(mastership)

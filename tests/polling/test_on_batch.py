@@ -148,7 +148,7 @@ def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
     assert len(rows) == summary["samples"] + summary["misses"]
 
 
-def test_what_on_batch_does_not_take(poller: Poller) -> None:
+def test_on_batch_rejects_invalid_callbacks(poller: Poller) -> None:
     with pytest.raises(TypeError, match="on_batch takes a function of one batch, not 3"):
         poller.on_batch(3)  # type: ignore[arg-type]
     with poller:

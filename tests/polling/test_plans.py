@@ -90,7 +90,7 @@ def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_chosen_anew_where_nothing_else_would_be_quicker(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_are_kept_unless_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     """Delays may be those of the host alone, and never the same."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)

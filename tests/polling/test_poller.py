@@ -225,7 +225,7 @@ def test_an_asyncio_program_needs_no_second_api(port: str) -> None:
     assert {row.value for row in rows if row.register == "output_current"} - {None} == {3.25}
 
 
-def test_rows_nobody_takes_are_bounded_and_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_untaken_rows_are_bounded_and_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poller_module, "RowQueue", lambda: RowQueue(chunk_rows=200, most_chunks=2))
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         until(lambda: poller.dropped > 0)
@@ -329,7 +329,7 @@ PIECES = {  # the status of a prefix, if this machine delivered the rest too lat
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_the_poll_says_of_a_reply(fault: str, pump: SimulatedDrive) -> None:
+def test_a_polled_reply_has_its_status(fault: str, pump: SimulatedDrive) -> None:
     fate, said = FAULTS[fault]
     # A pty would have no room for so much noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
@@ -428,7 +428,7 @@ def queued_before_a_stop(hall: PolledLine) -> int:
 
 
 @pytest.mark.slow
-def test_polling_goes_on_where_a_stop_has_opened_the_port_again(port: str) -> None:
+def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
     """The poller may have missed the loss of the port; it repeats the queued requests on the new one."""
     every = 0.01
     with Polling(line(port, polled(drive(), ONE, every))) as polling:
@@ -520,7 +520,7 @@ def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
 # ---- the end ----
 
 
-def test_a_plant_without_lines_is_polled_in_peace() -> None:
+def test_a_plant_without_lines_can_be_polled() -> None:
     with Poller(plant()) as poller:
         assert poller.fileno() >= 0
         assert poller.take() is None
@@ -568,7 +568,7 @@ def responder() -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
-def test_what_is_under_way_at_the_end_is_waited_for(
+def test_closing_waits_for_exchanges_in_flight(
     responder: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     master, path = responder
@@ -587,7 +587,7 @@ def test_what_is_under_way_at_the_end_is_waited_for(
     polling.check_summary()
 
 
-def test_what_is_not_answered_by_the_end_has_a_row(
+def test_a_request_unanswered_at_the_end_has_a_row(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request that is under way, and a slot behind it that is over; not one that lasts longer."""

@@ -99,7 +99,7 @@ def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_refused_for_a_while_is_read_as_a_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_temporarily_refused_block_is_read_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
@@ -280,7 +280,7 @@ class Moody(SimulatedDrive):
     ("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"]
 )
 @pytest.mark.parametrize("registers", [[Toy.output_current, Toy.fault], [Toy.fault]], ids=["two", "one"])
-def test_what_is_read_after_all_is_polled_as_before(
+def test_a_block_that_is_readable_again_is_polled_as_before(
     says: Reason, is_set_aside: bool, registers: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
@@ -343,7 +343,7 @@ def test_all_of_a_meter_is_one_request() -> None:
     assert (block.start, block.count, len(block.registers)) == (0, 11, 8)
 
 
-def test_parts_of_a_word_are_one_request_where_nothing_else_may_be() -> None:
+def test_parts_of_a_word_share_one_request() -> None:
     class Single(Drive):
         """A device whose registers are read singly."""
 
@@ -357,7 +357,7 @@ def test_parts_of_a_word_are_one_request_where_nothing_else_may_be() -> None:
     assert [(block.start, block.count, len(block.registers)) for block in found] == [(7, 1, 3), (8, 1, 1)]
 
 
-def test_a_scale_register_comes_with_what_it_scales() -> None:
+def test_a_scale_register_is_read_with_its_register() -> None:
     (block,) = blocks(Meter(1), [Meter.power])
     assert (block.start, block.count, block.offset(Meter.power)) == (8, 2, 0)
 
@@ -381,7 +381,7 @@ def test_values_of_a_meter_are_polled() -> None:
     assert {row.status for row in last.values()} == {"ok"}
 
 
-def test_what_is_no_value_is_a_miss_with_its_reason() -> None:
+def test_an_invalid_value_is_a_miss_with_its_reason() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = math.nan, None, None, None
     sim["power_scale"] = -32768

@@ -227,7 +227,7 @@ def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> No
 
 
 @pytest.mark.slow
-def test_what_is_no_rate_changes_nothing(two: ClockedLines) -> None:
+def test_an_invalid_rate_changes_nothing(two: ClockedLines) -> None:
     for drive, register, every, sentence in (
         ("pump-3", None, 1.0, r"pump-3 is not polled here; did you mean pump-\d"),
         ("zzz", None, 1.0, "zzz is not polled here; there are pump-1, pump-2"),

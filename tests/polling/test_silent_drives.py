@@ -32,7 +32,7 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
 
 
 @pytest.mark.parametrize(("is_silent", "looks"), [(False, 20), (True, 40)])
-def test_a_line_is_looked_at_more_often_while_a_drive_of_it_is_silent(
+def test_a_line_is_checked_more_often_while_a_drive_is_silent(
     monkeypatch: pytest.MonkeyPatch, is_silent: bool, looks: int
 ) -> None:
     """All that a line with a period needs while its drives answer is that it is kept busy."""

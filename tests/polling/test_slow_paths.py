@@ -129,7 +129,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), READS)
-def test_what_a_bus_reads_over_a_slow_path_is_true(
+def test_reads_over_a_slow_path_are_true(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
     path_of: Callable[..., tuple[Bus, PathLine]],
@@ -143,7 +143,7 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ASKED)
-def test_what_a_bus_is_asked_for_over_a_slow_path_is_true(
+def test_raw_reads_over_a_slow_path_are_true(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
     path_of: Callable[..., tuple[Bus, PathLine]],
@@ -184,7 +184,7 @@ WRITTEN = {
 
 @pytest.mark.parametrize("seconds", usually(0.6, 0.0, 0.3, 4.0))
 @pytest.mark.parametrize("name", WRITTEN)
-def test_what_became_of_a_write_over_a_slow_path_is_true(
+def test_write_results_over_a_slow_path_are_true(
     name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(WRITTEN[name])
@@ -322,7 +322,7 @@ def test_a_stalled_gateway_costs_no_truth(story_of: type[Path]) -> None:
 
 
 @pytest.mark.long
-def test_what_is_provably_late_holds_nothing_up() -> None:
+def test_a_provably_late_reply_delays_no_request() -> None:
     """No request waits for a late reply, and none is sent to prove anything."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
     story.run_over(stalling(3.0))
@@ -344,7 +344,7 @@ def gateway_path_of(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
-def test_what_a_bus_reads_over_a_slow_gateway_is_true(
+def test_reads_over_a_slow_gateway_are_true(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
     gateway_path_of: Callable[..., tuple[Bus, PathLine]],
@@ -356,7 +356,7 @@ def test_what_a_bus_reads_over_a_slow_gateway_is_true(
 
 @pytest.mark.slow
 @table("seconds", [0.0, 0.6, 4.0])
-def test_what_became_of_a_write_over_a_slow_gateway_is_true(
+def test_write_results_over_a_slow_gateway_are_true(
     seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(InnovertIBD(1, ram=["acceleration_time"]))

@@ -60,7 +60,7 @@ def test_polars_gets_times_with_their_type() -> None:
         ),
     ],
 )
-def test_a_library_that_is_missing_is_told_with_its_extra(
+def test_a_missing_library_is_named_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, method: str, missing: str, sentence: str
 ) -> None:
     pytest.importorskip("pandas", reason="needs pandas")
@@ -138,7 +138,7 @@ def test_chosen_columns_come_in_their_order_and_are_always_there() -> None:
     assert table.column(PUMP).to_pylist() == [49.99]
 
 
-def test_what_is_no_column_is_told() -> None:
+def test_an_unknown_column_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"no column 'pump-1\.motor_sped'; did you mean pump-1\.motor_"):
         example().wide("pump-1.motor_sped")
     with pytest.raises(ValueError, match=r"there is no column 'x'; a column is DRIVE\.REGISTER"):
@@ -155,7 +155,7 @@ def test_rows_are_in_the_order_of_their_times_whatever_order_they_came_in() -> N
     assert table.column("monotonic_ns").to_pylist() == [SECOND, 2 * SECOND, 3 * SECOND]
 
 
-def test_times_are_joined_only_where_they_are_the_same() -> None:
+def test_only_equal_times_are_joined() -> None:
     early = row(1.0, "pump", "a", 1.0)
     rows = [
         early,
@@ -190,7 +190,7 @@ def test_an_empty_batch_has_an_empty_wide_form() -> None:
     assert pa.table(Batch(Columns(4), Names(["p"]), Names(["r"])).wide("p.r")).num_rows == 0
 
 
-def test_drives_whose_columns_would_be_one_are_told() -> None:
+def test_drives_with_equal_columns_are_an_error() -> None:
     rows = from_rows([row(1.0, "a.b", "c", 1.0), row(1.0, "a", "b.c", 2.0)])
     with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a register that is called 'a\.b\.c'"):
         rows.wide()

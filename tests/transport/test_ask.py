@@ -39,7 +39,7 @@ def test_the_frame_and_the_words_are_modbus(simulated: SimulatedBus) -> None:
     assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
 
 
-def test_it_is_no_write(simulated: SimulatedBus, tmp_path: Path) -> None:
+def test_a_read_request_is_not_a_write(simulated: SimulatedBus, tmp_path: Path) -> None:
     """Neither audited nor retried nor in doubt, and no identity check goes before it."""
     (toy,) = simulated.bus.drives
     simulated.loses = lambda request: True
@@ -56,7 +56,7 @@ def test_an_exception_is_the_drives_refusal(simulated: SimulatedBus) -> None:
     assert refusal.value.code == 2
 
 
-def test_it_must_begin_in_time(simulated: SimulatedBus) -> None:
+def test_a_read_must_start_in_time(simulated: SimulatedBus) -> None:
     (toy,) = simulated.bus.drives
     simulated.queue_time = 0.3
     with pytest.raises(Expired, match=r"a read of 2 from 1 by function 03H was not sent: .* within 0.2 s"):
@@ -104,7 +104,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("asked", WRONG)
-def test_what_cannot_be_asked_is_told_and_nothing_is_sent(
+def test_an_impossible_read_is_an_error_before_any_frame(
     simulated: SimulatedBus, asked: tuple[int, int, int]
 ) -> None:
     (toy,) = simulated.bus.drives
@@ -114,7 +114,9 @@ def test_what_cannot_be_asked_is_told_and_nothing_is_sent(
 
 
 @pytest.mark.parametrize("asked", [(True, 1, 1), (3, 1.0, 1), (3, 1, "2")])
-def test_what_is_no_number_is_told(simulated: SimulatedBus, asked: tuple[int, int, int]) -> None:
+def test_a_count_that_is_not_a_number_is_an_error(
+    simulated: SimulatedBus, asked: tuple[int, int, int]
+) -> None:
     (toy,) = simulated.bus.drives
     with pytest.raises(TypeError, match="is not a whole number"):
         toy.read_raw(*asked)

@@ -116,14 +116,16 @@ def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
     until(lambda: made() != first)  # their times are some ms apart, and less than any time-out
 
 
-def test_what_nobody_owes_is_not_kept(wire: HoldingWire) -> None:
+def test_a_peer_without_owed_replies_is_not_kept(wire: HoldingWire) -> None:
     before = dict(peers._former)
     with Bus(wire.path) as bus:
         bus.attach(Quick, 1).read(Quick.output_current)
     assert peers._former == before
 
 
-def test_it_is_forgotten_as_the_core_forgets_it(wire: HoldingWire, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_owed_reply_is_forgotten_when_the_core_forgets_it(
+    wire: HoldingWire, monkeypatch: pytest.MonkeyPatch
+) -> None:
     leave_a_reply_behind(wire, wire.path)
     names = peers.identities_of(wire.path)
     assert names <= peers._former.keys()
@@ -160,7 +162,7 @@ def answer_to_another(drive: Drive) -> bytes:
 
 @pytest.mark.long
 @table("name", LINES)
-def test_its_answer_is_taken_for_no_other_register_s(name: str) -> None:
+def test_a_late_answer_to_an_earlier_process_is_not_misread(name: str) -> None:
     """Every value is the register's own, from the first on."""
     drives = of_one_variant(LINES[name])
     wire = PathWire([EncodedDrive(drive) for drive in drives], Faults())

@@ -82,7 +82,7 @@ def test_a_network_that_stalls_hands_on_nothing_later(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("echo", ["auto", "on", "off"])
-def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
+def test_the_echo_option_is_kept_when_the_port_is_reopened(
     echo: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Echo] = []
@@ -92,7 +92,7 @@ def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
         assert told == [Echo(echo)] * 2
 
 
-def test_a_port_settles_after_each_opening_and_what_came_is_discarded(
+def test_a_port_discards_bytes_and_settles_after_each_opening(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A gateway that restarts when its port is opened prints that, and is deaf for a while."""
@@ -121,7 +121,7 @@ def test_a_port_settles_for_a_number_of_seconds(settle: object) -> None:
         Bus("/dev/nowhere", settle=settle)  # type: ignore[arg-type]
 
 
-def test_an_echo_is_told_in_one_of_three_words() -> None:
+def test_an_echo_option_is_one_of_three_words() -> None:
     with pytest.raises(ValueError, match='echo \'loud\' is none of "auto", "on" and "off"'):
         Bus("/dev/null", echo="loud")
 
@@ -143,7 +143,7 @@ def test_a_pty_at_settings_that_it_cannot_have() -> None:
                 read_and_write(bus)
 
 
-def test_a_port_is_told_to_hold_no_bytes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_is_set_to_low_latency(monkeypatch: pytest.MonkeyPatch) -> None:
     """USB adapters do it for 16 ms."""
     told: list[bool] = []
     monkeypatch.setattr(Serial, "set_low_latency_mode", lambda port, wanted: told.append(wanted))
@@ -154,7 +154,7 @@ def test_a_port_is_told_to_hold_no_bytes_back(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
-def test_a_port_that_does_hold_bytes_back_is_opened(
+def test_a_port_without_low_latency_is_opened(
     monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
 ) -> None:
     def refuse(port: Serial, wanted: bool) -> None:
@@ -231,7 +231,7 @@ def os_words_of_an_unknown_zone() -> str:
         ("spy://{tmp}/absent", "there is no such port"),
     ],
 )
-def test_what_cannot_be_opened_is_a_sentence(tmp_path: Path, port: str, reason: str) -> None:
+def test_an_unopenable_port_is_one_sentence(tmp_path: Path, port: str, reason: str) -> None:
     (tmp_path / "file").write_text("no port")
     with socket.create_server(("127.0.0.1", 0)) as listener:
         closed = listener.getsockname()[1]
@@ -423,7 +423,7 @@ def test_a_closed_bus_says_so() -> None:
         assert str(caught.value) == f"{sim.wires[0].path}: it is closed"
 
 
-def test_closing_ends_what_waits_for_a_reply() -> None:
+def test_closing_ends_exchanges_that_wait_for_a_reply() -> None:
     """One thread waits for a silent drive, another closes the bus."""
     failures: list[LineError] = []
     master, slave = os.openpty()

@@ -150,7 +150,7 @@ def test_a_handler_that_hangs_keeps_no_stop_from_being_repeated(
         stop.join(PATIENCE)
 
 
-def test_what_waits_for_a_handler_that_hangs_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_waiting_for_a_hanging_handler_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     aside = aside_log.AsideThread("log")
     monkeypatch.setattr(aside_log, "_log_thread", aside)
     handler, logger = Hanging(), logging.getLogger("multidrop.line")

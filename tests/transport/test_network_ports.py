@@ -78,7 +78,7 @@ def test_a_stream_means_the_same_in_any_pieces(stream: list[bytes], cuts: list[i
     assert split(pieces(whole, cuts)) == split([whole])
 
 
-def test_what_a_stream_says() -> None:
+def test_a_stream_is_decoded_to_data_and_commands() -> None:
     stream = b"ab" + IAC + rfc2217.DO + b"\x2c" + IAC + SB + b"\x2c\x65" + IAC + IAC + IAC + SE + b"c"
     assert split([stream]) == [
         (b"", b"ab"),
@@ -139,7 +139,7 @@ def flooding() -> Iterator[tuple[str, threading.Event]]:
 
 @pytest.mark.slow
 @pyserials_own
-def test_a_flood_that_nobody_reads_fills_no_memory() -> None:
+def test_an_unread_flood_does_not_fill_the_memory() -> None:
     with flooding() as (url, sent):
         port = RFC2217Port()
         port.port = url
@@ -209,7 +209,7 @@ class AsOnWindows:
 
 
 @pytest.mark.slow
-def test_a_bridge_passes_requests_on_where_sockets_tell_no_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bridge_forwards_requests_without_socket_timestamps(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     monkeypatch.setattr(bridge_module, "_STAMPED", False)
     monkeypatch.setattr(bridge_module, "_pair", lambda: (AsOnWindows(ours), theirs))
@@ -239,7 +239,7 @@ def test_a_bridge_for_which_there_are_no_threads_is_a_port_that_failed(
     assert not started[0].is_alive()
 
 
-def test_what_comes_is_handed_over_in_pieces_that_the_core_reads_whole() -> None:
+def test_a_bridge_passes_pieces_that_the_core_reads_whole() -> None:
     port = HeldUp()
     arrived = bytes(range(256)) * 20
     chunks = [arrived[:1], b""]
@@ -259,7 +259,7 @@ def test_what_comes_is_handed_over_in_pieces_that_the_core_reads_whole() -> None
     assert taken == arrived
 
 
-def test_a_bridge_closes_while_nobody_takes_what_comes() -> None:
+def test_a_bridge_with_unread_data_closes() -> None:
     port = HeldUp()
     port.read = lambda size: bytes(1024)  # type: ignore[method-assign]
     bridge = Bridge(port)  # type: ignore[arg-type]
@@ -423,7 +423,7 @@ def test_a_network_is_given_up_before_a_write_is() -> None:
     assert MOST_AGE + MOST_STALL_MS / 1000 <= WRITE_TIMEOUT
 
 
-def test_every_connection_is_told_to_hand_on_nothing_late() -> None:
+def test_every_connection_limits_unacknowledged_data() -> None:
     """Without a network to cut: the socket options."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         near = socket.create_connection(listener.getsockname())

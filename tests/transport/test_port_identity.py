@@ -75,7 +75,7 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
 )
-def test_what_is_told_of_a_device(
+def test_a_device_is_described_by_its_adapter(
     tmp_path: Path, device: str, serial: str, port_number: str, adapter: USBAdapter | None
 ) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:

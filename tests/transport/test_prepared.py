@@ -112,7 +112,7 @@ def test_a_drive_that_left_leaves_nothing_behind(bus: Bus, counted: Counted) -> 
     assert counted.since() == (1, 2)
 
 
-def test_a_port_that_was_opened_again_is_asked_anew(bus: Bus, counted: Counted) -> None:
+def test_a_reopened_port_has_its_reads_planned_again(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
     drive.read_many(WANTED)
     bus.line.reopen()
@@ -125,7 +125,7 @@ def test_a_port_that_was_opened_again_is_asked_anew(bus: Bus, counted: Counted) 
     ("name", "value"),
     [("settings", Settings(19200, "8N1")), ("agreed_silence", 0.01), ("response_delay", 0.2), ("address", 3)],
 )
-def test_what_a_drive_is_told_meanwhile_is_heeded(bus: Bus, name: str, value: object) -> None:
+def test_a_planned_read_follows_changed_settings(bus: Bus, name: str, value: object) -> None:
     drive = bus.attach(PatientToy, 1)
     before = bus._exchanges._prepare(drive)
     assert bus._exchanges._prepare(drive) is before
@@ -267,7 +267,7 @@ def test_a_reply_that_ends_too_soon_has_the_values_that_are_whole(data: bytes) -
     assert found["fine"] is None
 
 
-def test_the_core_reads_what_a_float_holds() -> None:
+def test_the_core_decodes_floats() -> None:
     assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 

@@ -56,7 +56,9 @@ def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch
 
 
 @given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
-def test_all_comes_or_what_is_refused_is_named(refused: set[int], most: int, asked: set[int]) -> None:
+def test_a_read_is_complete_or_names_the_refused_register(
+    refused: set[int], most: int, asked: set[int]
+) -> None:
     drive = family(6)(1, name="pump-1")
     with pytest.MonkeyPatch.context() as monkeypatch:
         bus = SimulatedBus(monkeypatch, Picky(drive, refused, most)).bus
@@ -83,7 +85,7 @@ def test_busy_splits_nothing(code: int, monkeypatch: pytest.MonkeyPatch) -> None
     assert sim.asked == [(0, WIDE)]
 
 
-def test_no_register_is_named_where_several_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_of_several_registers_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
     scaled = {"flow": reading(2, scale_register="power"), "power": reading(3, number_format=NumberFormat.I16)}
     drive = family(2, **scaled)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, sim := Picky(drive))
@@ -95,7 +97,7 @@ def test_no_register_is_named_where_several_were_asked_for(monkeypatch: pytest.M
     assert caught.value.register is None
 
 
-def test_silence_to_a_long_request_splits_where_a_short_one_is_answered(
+def test_a_long_request_without_a_reply_is_split(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drive = family(WIDE)(1, name="pump-1")
@@ -124,7 +126,9 @@ def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
-def test_bytes_that_came_for_one_attempt_are_told(monkeypatch: pytest.MonkeyPatch, silent: set[int]) -> None:
+def test_bytes_received_for_one_attempt_are_reported(
+    monkeypatch: pytest.MonkeyPatch, silent: set[int]
+) -> None:
     """A read is split and retried: the first values are kept."""
     drive = family(2)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, Picky(drive))

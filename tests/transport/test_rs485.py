@@ -124,7 +124,7 @@ def test_the_driver_s_own_mode_is_switched_on_as_it_was_set_up(driver: Path) -> 
 
 
 @pytest.mark.long
-def test_a_driver_that_refuses_is_told_of_in_a_sentence_and_nothing_is_sent(driver: Path) -> None:
+def test_a_driver_without_rs485_is_an_error_before_any_frame(driver: Path) -> None:
     for mode, variables, why in (
         ("kernel", {}, f"has no RS-485 mode ({os.strerror(errno.ENOTTY)})"),
         ("rts-up", {"RS485_CALLS": 0}, f"does not switch RTS ({os.strerror(errno.ENOTTY)})"),
@@ -146,7 +146,7 @@ def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -
 # ---- without that driver: a pseudo-terminal's has no RTS ----
 
 
-def test_a_poller_is_told_at_once_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_poller_fails_immediately_and_leaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
         Bus(sim.wires[0].path).close()  # the core's thread starts with the first port, and stays
@@ -201,9 +201,7 @@ def test_a_plant_file_says_it_of_a_line(tmp_path: Path) -> None:
         ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one; remove it"),
     ],
 )
-def test_what_no_line_can_be_told_is_one_mistake(
-    tmp_path: Path, port: str, value: str, sentence: str
-) -> None:
+def test_an_invalid_line_option_is_one_mistake(tmp_path: Path, port: str, value: str, sentence: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT.format(port, value))
     with pytest.raises(PlantError) as wrong:

@@ -70,7 +70,7 @@ def test_no_reply_has_no_delay() -> None:
     assert (found.replies, found.p50, found.p99, found.longest) == (0, 0, 0, 0)
 
 
-def test_what_is_counted_is_the_drives_own_delay(line: LineDriver, drive: Peer) -> None:
+def test_statistics_count_the_drive_s_own_delay(line: LineDriver, drive: Peer) -> None:
     for delay in (10, 10, 10, 15):
         answer(line, drive, delay * MS)
     found = Statistics(1.0, drive.counters()).delays
@@ -79,7 +79,7 @@ def test_what_is_counted_is_the_drives_own_delay(line: LineDriver, drive: Peer) 
 
 
 @pytest.mark.parametrize("delay_ms", [0, 3, 20])
-def test_a_wire_is_used_for_what_its_settings_say(line: LineDriver, drive: Peer, delay_ms: int) -> None:
+def test_utilisation_follows_the_wire_s_settings(line: LineDriver, drive: Peer, delay_ms: int) -> None:
     for _ in range(10):
         answer(line, drive, delay_ms * MS)
     characters = (8 + 7) * CHARACTER
@@ -159,14 +159,14 @@ def test_a_late_reply_is_a_message_of_its_own(line: LineDriver, drive: Peer) -> 
     assert Statistics(1.0, drive.counters()).late_replies == 1
 
 
-def test_what_never_left_is_no_message(line: LineDriver, drive: Peer) -> None:
+def test_unsent_requests_are_not_counted(line: LineDriver, drive: Peer) -> None:
     line.begin(exchange(READ, drive, Framing.RTU))
     line.lose(5)
     assert counted(drive) == Counter()
     assert Statistics(1.0, drive.counters()).misses == {"port lost": 1}
 
 
-def test_what_the_port_lost_is_read_from_its_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overruns_are_read_from_the_port_s_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     def counts(fd: int, request: int, answer: bytearray) -> None:
         assert request == 0x545D  # TIOCGICOUNT of asm-generic/ioctls.h
         # linux/serial.h: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
@@ -239,7 +239,7 @@ def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
 
 
 @pytest.mark.slow
-def test_a_poller_counts_what_its_rows_say(toy: SimulatedDrive) -> None:
+def test_a_poller_counts_its_rows_by_status(toy: SimulatedDrive) -> None:
     toys = [polled(Toy(1, name="pump"), [Toy.output_current]), polled(Toy(9, name="none"), [Toy.fault], 0.01)]
     with Simulator([Wire([toy], unpaced=True)]) as sim:
         poller = Poller(plant(a_line(sim.wires[0].path, *toys)))

@@ -85,7 +85,7 @@ def test_a_name_without_a_place_is_a_sentence(name: str) -> None:
         Bus(name)
 
 
-def test_nothing_that_listens_is_told() -> None:
+def test_a_port_without_a_listener_is_reported() -> None:
     with pytest.raises(LineError, match="nothing listens there"):
         Bus("tcp://127.0.0.1:1")
 
@@ -173,7 +173,7 @@ def test_nothing_is_broadcast() -> None:
     assert [sim.counters.broadcasts for sim in sims] == [0, 0]
 
 
-def test_a_plant_file_tells_each_mistake(tmp_path: Path) -> None:
+def test_every_mistake_of_a_plant_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         '[[line]]\nname = "a"\nport = "tcp://10.0.0.7"\ntransaction = "skip"\n'
@@ -247,7 +247,7 @@ def test_one_unit_is_on_one_line_of_its_gateway(tmp_path: Path) -> None:
 READ = Message(1, 3, 3, 1)
 
 
-def test_rtu_over_tcp_behind_tcp_is_told_and_ends_the_connection() -> None:
+def test_rtu_frames_behind_a_tcp_url_are_reported_and_end_the_connection() -> None:
     answer = build_reply(Framing.RTU, Message(1, 3, data=b"\0\7"))
     with responder(answer) as (place, came), Bus(f"tcp://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
@@ -260,7 +260,7 @@ def test_rtu_over_tcp_behind_tcp_is_told_and_ends_the_connection() -> None:
         until(lambda: len(came) == 2)  # on a connection of its own
 
 
-def test_modbus_tcp_behind_socket_is_told() -> None:
+def test_modbus_tcp_behind_a_socket_url_is_reported() -> None:
     answer = build_reply(Framing.TCP, Message(1, 3, data=b"\0\7", transaction=3))
     with responder(answer) as (place, _), Bus(f"socket://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
@@ -279,7 +279,7 @@ def test_silence_names_the_other_way() -> None:
                     drive.read(drive.output_current)
 
 
-def test_what_a_gateway_cannot_reach_is_no_reply() -> None:
+def test_a_gateway_s_unreachable_drive_gives_no_reply() -> None:
     """Its connection answers each request with 0BH, under the request's own id."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
@@ -374,7 +374,7 @@ def test_a_read_goes_on_when_the_peer_closes_after_each_reply() -> None:
         assert len(asked) <= 12
 
 
-def test_a_read_raises_where_the_peer_closes_before_any_reply() -> None:
+def test_a_read_raises_if_the_peer_closes_before_any_reply() -> None:
     with closing_peer(0) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))
         with pytest.raises(PortLost):
