@@ -203,7 +203,7 @@ def test_a_stop_that_follows_a_failed_start_is_its_callers(audited: Audited) -> 
     assert ("stop", "anna", None) in audited.noted()
 
 
-def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
+async def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
     drive, turn = audited.drive, asyncio.Lock()  # the simulated bus bears one caller at a time
 
     async def write(name: str, hz: float, mine: asyncio.Event, other: asyncio.Event) -> None:
@@ -213,11 +213,8 @@ def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
             async with turn:
                 await asyncio.to_thread(drive.set_frequency, hz)
 
-    async def both() -> None:
-        first, second = asyncio.Event(), asyncio.Event()
-        await asyncio.gather(write("anna", 20, first, second), write("boris", 30, second, first))
-
-    asyncio.run(both())
+    first, second = asyncio.Event(), asyncio.Event()
+    await asyncio.gather(write("anna", 20, first, second), write("boris", 30, second, first))
     with written_by("carla"):
         thread = threading.Thread(target=drive.set_frequency, args=[10])
         thread.start()

@@ -171,12 +171,12 @@ class Motors:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
+async def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
     threads: Threads, failure: Exception
 ) -> None:
     threads.threads, threads.failure = 1, failure
     motors = Motors(a=1, b=3, c=2)
-    assert asyncio.run(motors.stop_all()) == {"a": STANDS, "b": STANDS, "c": STANDS}
+    assert await motors.stop_all() == {"a": STANDS, "b": STANDS, "c": STANDS}
     without = [noted for noted in motors.noted if noted != ("a", None)]
     assert without == [("b", 0.0), ("c", 0.0), ("b", TURN_S), ("c", TURN_S), ("b", TURN_S)]
 
@@ -201,17 +201,19 @@ def test_without_threads_the_loop_runs_and_free_threads_are_used(threads: Thread
     assert turns > 2
 
 
-def test_a_stop_without_effect_ends_as_unknown(threads: Threads, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_stop_without_effect_ends_as_unknown(
+    threads: Threads, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(commands, "STOP_S", 0.0)
     motors = Motors(a=1000)
-    assert asyncio.run(motors.stop_all()) == {"a": UNKNOWN}
+    assert await motors.stop_all() == {"a": UNKNOWN}
     assert motors.noted == [("a", 0.0)]
 
 
 @pytest.mark.slow
-def test_a_motor_is_stopped_without_a_thread(threads: Threads, tmp_path: Path) -> None:
+async def test_a_motor_is_stopped_without_a_thread(threads: Threads, tmp_path: Path) -> None:
     with desks(tmp_path) as desk:
-        stopped = asyncio.run(desk.stop(drives=["pump"]))
+        stopped = await desk.stop(drives=["pump"])
     assert stopped is not None
     assert stopped.ok
     assert {name for name, _ in desk.writes} == {"control"}
@@ -226,17 +228,14 @@ def test_without_a_thread_a_command_is_not_sent(threads: Threads) -> None:
     assert result.text == "can't start new thread"
 
 
-def test_stops_without_threads_go_on_if_their_callers_are_cancelled(threads: Threads) -> None:
+async def test_stops_without_threads_go_on_if_their_callers_are_cancelled(threads: Threads) -> None:
     motors = Motors(a=2)
 
-    async def main() -> None:
-        (stopping,) = begin_stops([partial(motors.stop, "a")])
-        await asyncio.sleep(0)
-        stopping.cancel()
-        while len(motors.noted) < 2:
-            await asyncio.sleep(0.01)
-
-    asyncio.run(main())
+    (stopping,) = begin_stops([partial(motors.stop, "a")])
+    await asyncio.sleep(0)
+    stopping.cancel()
+    while len(motors.noted) < 2:
+        await asyncio.sleep(0.01)
     assert motors.noted == [("a", 0.0), ("a", TURN_S)]
 
 
@@ -280,48 +279,42 @@ def on_threads(works: Sequence[StopWork]) -> list[StopFuture]:
     return [asyncio.get_running_loop().run_in_executor(None, work, None) for work in works]
 
 
-def test_a_stop_during_a_repeated_one_is_sent_once() -> None:
-    async def live() -> None:
-        pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
-        drive: Any = pump
-        repeated = asyncio.get_running_loop().create_future()
-        stops.note([drive], repeated)
-        called = [stops.send_once(drive) for _ in range(5)]
-        await until_met(lambda: pump.calls == [0.0])  # the first one's; the others wait for it, together
-        pump.turns.release()
-        await until_met(lambda: pump.calls == [0.0, 0.0])
-        called.append(stops.send_once(drive))  # it comes too late for that one
-        pump.turns.release(2)
-        await until_met(lambda: pump.calls == [0.0, 0.0, 0.0] and not stops._sent)
-        await asyncio.sleep(0.05)  # all of them await the one that is repeated
-        assert not any(one.done() for one in called)
-        called[1].cancel()  # its client is gone
-        repeated.set_result({"pump": STANDS})
-        assert all([(await one)["pump"].ok for one in called if one is not called[1]])
-        assert stops.of(drive) is None
-
-    asyncio.run(live())
+async def test_a_stop_during_a_repeated_one_is_sent_once() -> None:
+    pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
+    drive: Any = pump
+    repeated = asyncio.get_running_loop().create_future()
+    stops.note([drive], repeated)
+    called = [stops.send_once(drive) for _ in range(5)]
+    await until_met(lambda: pump.calls == [0.0])  # the first one's; the others wait for it, together
+    pump.turns.release()
+    await until_met(lambda: pump.calls == [0.0, 0.0])
+    called.append(stops.send_once(drive))  # it comes too late for that one
+    pump.turns.release(2)
+    await until_met(lambda: pump.calls == [0.0, 0.0, 0.0] and not stops._sent)
+    await asyncio.sleep(0.05)  # all of them await the one that is repeated
+    assert not any(one.done() for one in called)
+    called[1].cancel()  # its client is gone
+    repeated.set_result({"pump": STANDS})
+    assert all([(await one)["pump"].ok for one in called if one is not called[1]])
+    assert stops.of(drive) is None
 
 
-def test_a_stop_is_repeated_further_if_the_earlier_one_gives_up() -> None:
-    async def live() -> None:
-        pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
-        drive: Any = pump
-        before = asyncio.get_running_loop().create_future()
-        stops.note([drive], before)
-        pump.turns.release()
-        stops.send_once(drive).cancel()  # its client is gone, and it goes on
-        called = stops.send_once(drive)
-        pump.turns.release()
-        await until_met(lambda: len(pump.calls) == 2 and not stops._sent)
-        await asyncio.sleep(0.05)
-        before.set_result({"pump": SILENT})
-        await until_met(lambda: pump.calls[-1] is None)  # repeated as if it had been called alone
-        assert pump.calls.count(None) == 1  # for both
-        pump.turns.release()
-        assert (await called)["pump"].ok is False
-
-    asyncio.run(live())
+async def test_a_stop_is_repeated_further_if_the_earlier_one_gives_up() -> None:
+    pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
+    drive: Any = pump
+    before = asyncio.get_running_loop().create_future()
+    stops.note([drive], before)
+    pump.turns.release()
+    stops.send_once(drive).cancel()  # its client is gone, and it goes on
+    called = stops.send_once(drive)
+    pump.turns.release()
+    await until_met(lambda: len(pump.calls) == 2 and not stops._sent)
+    await asyncio.sleep(0.05)
+    before.set_result({"pump": SILENT})
+    await until_met(lambda: pump.calls[-1] is None)  # repeated as if it had been called alone
+    assert pump.calls.count(None) == 1  # for both
+    pump.turns.release()
+    assert (await called)["pump"].ok is False
 
 
 def test_a_stop_counts_as_repeated_from_its_call_to_its_end() -> None:

@@ -219,26 +219,23 @@ def test_a_for_loop_gets_batches_until_the_poller_is_closed(poller: Poller) -> N
     assert rows > 50
 
 
-def test_an_async_loop_gets_every_row_also_beside_a_cancelled_one(poller: Poller) -> None:
+async def test_an_async_loop_gets_every_row_also_beside_a_cancelled_one(poller: Poller) -> None:
     found: list[Row] = []
 
     async def collect() -> None:
         async for batch in poller:
             found.extend(batch)
 
-    async def main() -> None:
-        first = asyncio.create_task(collect())
-        await asyncio.sleep(0.2)
-        first.cancel()
-        with suppress(asyncio.CancelledError):
-            await first
-        second = asyncio.create_task(collect())
-        await asyncio.sleep(0.2)
-        second.cancel()
-        with suppress(asyncio.CancelledError):
-            await second
-
-    asyncio.run(main())
+    first = asyncio.create_task(collect())
+    await asyncio.sleep(0.2)
+    first.cancel()
+    with suppress(asyncio.CancelledError):
+        await first
+    second = asyncio.create_task(collect())
+    await asyncio.sleep(0.2)
+    second.cancel()
+    with suppress(asyncio.CancelledError):
+        await second
     poller.close()
     for batch in poller:
         found.extend(batch)
