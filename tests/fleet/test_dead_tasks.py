@@ -241,7 +241,7 @@ def test_a_spool_continues_after_unexpected_failures(
     assert "no memory" in caplog.text
 
 
-def test_a_failed_start_of_compaction_is_retried(
+async def test_a_failed_start_of_compaction_is_retried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     require_module("duckdb")
@@ -251,14 +251,11 @@ def test_a_failed_start_of_compaction_is_retried(
         tried.append(words)
         raise BlockingIOError("no process is left")
 
-    async def main() -> None:
-        merging = asyncio.create_task(parquet_sink.compact_for_ever(tmp_path, every=0.0))
-        while len(tried) < 3:
-            await asyncio.sleep(0)
-        merging.cancel()
-
     monkeypatch.setattr(parquet_sink, "_compact", fail_to_begin)
-    asyncio.run(main())
+    merging = asyncio.create_task(parquet_sink.compact_for_ever(tmp_path, every=0.0))
+    while len(tried) < 3:
+        await asyncio.sleep(0)
+    merging.cancel()
     assert "no process is left" in caplog.text
 
 
@@ -310,7 +307,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
 
 
 @pytest.mark.parametrize("failure", [Ill("amid it"), MemoryError(), SystemExit("of a user")], ids=repr)
-def test_a_line_that_fails_to_open_is_not_polled(
+async def test_a_line_that_fails_to_open_is_not_polled(
     taken: Taken, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
     """Another gateway may be its master before long."""
@@ -322,7 +319,7 @@ def test_a_line_that_fails_to_open_is_not_polled(
 
     monkeypatch.setattr(taken.lines.poller, "add_line", add)
     with pytest.raises(RuntimeError if isinstance(failure, SystemExit) else type(failure)):
-        asyncio.run(taken.lines.take(LINE, taken.description))
+        await taken.lines.take(LINE, taken.description)
     assert taken.lines.poller.buses == {}
 
 

@@ -233,7 +233,7 @@ def test_init_creates_and_shows_the_fleet(run: Run, nats: Cluster, tmp_path: Pat
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 
 
-def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
+async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from multidrop.cli.fleet import commands
@@ -254,5 +254,5 @@ def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
     monkeypatch.setattr(commands, "_asker", lambda *given: Endless())
     arguments = argparse.Namespace(drives=["pump-1"], all=False, line=None, json=False)
     with pytest.raises(asyncio.CancelledError):
-        asyncio.run(commands._stop(arguments))
+        await commands._stop(arguments)
     assert "the stop of pump-1: it is not known whether it was sent" in capsys.readouterr().err

@@ -104,9 +104,9 @@ def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch:
     assert len(line.written) == told.ok
 
 
-def test_a_command_that_was_not_carried_out_has_no_end() -> None:
+async def test_a_command_that_was_not_carried_out_has_no_end() -> None:
     commands = Commands(UnopenedLines(), MAY)
-    asyncio.run(commands.write("fan", "setpoint", 10.0, CALLER))
+    await commands.write("fan", "setpoint", 10.0, CALLER)
     assert commands.ended_ns("fan") == 0
 
 
@@ -142,7 +142,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     assert commands.stopped_ns(fan) is not None
 
 
-def test_a_drive_s_view_is_found_by_another_spelling(tmp_path: Path) -> None:
+async def test_a_drive_s_view_is_found_by_another_spelling(tmp_path: Path) -> None:
     gateway: Any = SimpleNamespace(
         plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
         ledger=Ledger(tmp_path / "wear.sqlite"),
@@ -150,6 +150,6 @@ def test_a_drive_s_view_is_found_by_another_spelling(tmp_path: Path) -> None:
         side_reads=SimpleNamespace(look=lambda plant, name: {"of": name}),
         recent=SimpleNamespace(drive=lambda line, name: None),
     )
-    found = asyncio.run(drive_view(gateway, "Lu\u0308fter"))
+    found = await drive_view(gateway, "Lu\u0308fter")
     assert found["drive"] == "L\u00fcfter"
     assert found["values"] == {"of": "L\u00fcfter"}

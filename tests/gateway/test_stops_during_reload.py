@@ -122,7 +122,7 @@ async def test_a_stop_by_a_name_of_the_new_plant_is_sent_when_its_drive_is_attac
     assert lines.begun == [None, new]
 
 
-def test_without_a_reload_only_the_named_drives_are_stopped() -> None:
+async def test_without_a_reload_only_the_named_drives_are_stopped() -> None:
     lines = Lines(plant_of(PUMP, FAN))
-    assert told(asyncio.run(stop_meant(lines, ["fan", "nobody"], lines.stop))) == {"fan": FAN}
+    assert told(await stop_meant(lines, ["fan", "nobody"], lines.stop)) == {"fan": FAN}
     assert lines.begun == [FAN, None]

@@ -49,7 +49,7 @@ def test_a_number_without_end_is_null() -> None:
     assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
 
 
-def test_large_answers_are_refused_and_made_outside_the_loop(
+async def test_large_answers_are_refused_and_made_outside_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stop comes through the loop: it would wait for whatever is reckoned there."""
@@ -59,26 +59,23 @@ def test_large_answers_are_refused_and_made_outside_the_loop(
         makers.append(threading.get_ident())
         return as_json(made)
 
-    async def live() -> None:
-        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
-        part = build(HistorySettings(), inside)
-        try:
-            many = [f"pump-{at}.speed" for at in range(3)]
-            found = json.loads(await part.series([*many, *many], 0, 1000, MOST_BUCKETS // 1000))
-            assert list(found["series"]) == many
-            assert len(makers) == 3
-            assert threading.get_ident() not in makers
-            with pytest.raises(ValueError, match="3 series of 70000 points: an answer has 200000"):
-                await part.series(many, 0, 1000, 70_000)
-        finally:
-            await part.close()
-
     monkeypatch.setattr(historian, "as_json", noted)
-    asyncio.run(live())
+    inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+    part = build(HistorySettings(), inside)
+    try:
+        many = [f"pump-{at}.speed" for at in range(3)]
+        found = json.loads(await part.series([*many, *many], 0, 1000, MOST_BUCKETS // 1000))
+        assert list(found["series"]) == many
+        assert len(makers) == 3
+        assert threading.get_ident() not in makers
+        with pytest.raises(ValueError, match="3 series of 70000 points: an answer has 200000"):
+            await part.series(many, 0, 1000, 70_000)
+    finally:
+        await part.close()
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_no_export_starts_in_the_loop(tmp_path: Path, kind: str) -> None:
+async def test_no_export_starts_in_the_loop(tmp_path: Path, kind: str) -> None:
     """Reading the metadata of thousands of files takes seconds."""
     readers: list[int] = []
 
@@ -87,21 +84,18 @@ def test_no_export_starts_in_the_loop(tmp_path: Path, kind: str) -> None:
             readers.append(threading.get_ident())
             return super().parting_of(*of)
 
-    async def live() -> None:
-        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
-        part = build(HistorySettings(), inside)
-        try:
-            part.history = Noted(part.history.folder)
-            await Exports().respond(part, [], 0, 1000, kind)
-            assert readers
-            assert threading.get_ident() not in readers
-        finally:
-            await part.close()
-
-    asyncio.run(live())
+    inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+    part = build(HistorySettings(), inside)
+    try:
+        part.history = Noted(part.history.folder)
+        await Exports().respond(part, [], 0, 1000, kind)
+        assert readers
+        assert threading.get_ident() not in readers
+    finally:
+        await part.close()
 
 
-def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path) -> None:
+async def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     left = tmp_path / "history" / ".export-x1y2"
     left.mkdir(parents=True)
     (left / "export.parquet").write_bytes(b"PAR1")
@@ -110,43 +104,40 @@ def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path) -> N
     try:
         assert not left.exists()
     finally:
-        asyncio.run(part.close())
+        await part.close()
 
 
 @pytest.mark.slow
-def test_the_historian_records_and_answers(tmp_path: Path) -> None:
-    async def live() -> None:
-        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
-        part = build(HistorySettings(folder="kept"), inside)
-        running = asyncio.create_task(part.run())
-        taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)
-        part.take(taken)
-        for _ in range(600):
-            if part.state.rows:
-                break
-            await asyncio.sleep(0.1)
-        assert part.state == (100, 0, None)
-        begin, end = NOON // MS, NOON // MS + 100_000
-        found = json.loads(await part.series(["pump-1.speed", "fan.speed"], begin, end, 10))
-        assert found["step_ms"] == 10_000
-        pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
-        assert pump["time"] == [begin + 10_000 * number for number in range(10)]
-        assert pump["least"] == [10.0 * number for number in range(10)]  # each tenth is a miss
-        assert pump["most"] == [10.0 * number + 8 for number in range(10)]
-        assert pump["mean"] == [10.0 * number + 4 for number in range(10)]
-        assert fan["mean"] == [None] * 10
-        for kind in ("csv", "parquet"):
-            path = tmp_path / f"got.{kind}"
-            path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
-            assert [row for rows in open_recording(path) for row in rows] == list(taken)
-        with pytest.raises(ValueError, match="invalid series"):
-            part.export(["pump"], begin, end, "csv")
-        with pytest.raises(ValueError, match="neither csv nor parquet"):
-            part.export([], begin, end, "xlsx")
-        await part.close()
-        await asyncio.wait_for(running, 60)
-
-    asyncio.run(live())
+async def test_the_historian_records_and_answers(tmp_path: Path) -> None:
+    inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+    part = build(HistorySettings(folder="kept"), inside)
+    running = asyncio.create_task(part.run())
+    taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)
+    part.take(taken)
+    for _ in range(600):
+        if part.state.rows:
+            break
+        await asyncio.sleep(0.1)
+    assert part.state == (100, 0, None)
+    begin, end = NOON // MS, NOON // MS + 100_000
+    found = json.loads(await part.series(["pump-1.speed", "fan.speed"], begin, end, 10))
+    assert found["step_ms"] == 10_000
+    pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
+    assert pump["time"] == [begin + 10_000 * number for number in range(10)]
+    assert pump["least"] == [10.0 * number for number in range(10)]  # each tenth is a miss
+    assert pump["most"] == [10.0 * number + 8 for number in range(10)]
+    assert pump["mean"] == [10.0 * number + 4 for number in range(10)]
+    assert fan["mean"] == [None] * 10
+    for kind in ("csv", "parquet"):
+        path = tmp_path / f"got.{kind}"
+        path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
+        assert [row for rows in open_recording(path) for row in rows] == list(taken)
+    with pytest.raises(ValueError, match="invalid series"):
+        part.export(["pump"], begin, end, "csv")
+    with pytest.raises(ValueError, match="neither csv nor parquet"):
+        part.export([], begin, end, "xlsx")
+    await part.close()
+    await asyncio.wait_for(running, 60)
     assert [path.name for path in (tmp_path / "kept").glob("*.arrows")] == ["rows.00000001.arrows"]
 
 

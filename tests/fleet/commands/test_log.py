@@ -59,9 +59,9 @@ async def _write_and_stop(desk: Desks) -> None:
     assert desk.written == {"control"}
 
 
-def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
+async def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     with desks(tmp_path) as desk, patch.object(CommandLog, "_add", side_effect=SystemExit("killed")):
-        asyncio.run(_write_and_stop(desk))
+        await _write_and_stop(desk)
 
 
 async def test_records_are_in_the_order_of_the_calls_and_none_follows_the_closing(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 
 @pytest.mark.long
-def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: int) -> None:
+async def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: int) -> None:
     """Rows that are kept, and rows that the spool counts as lost, are all that there were."""
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:
@@ -79,7 +79,7 @@ def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: i
             spool.close()
             return await kept(tmp_path / "hub", servers), spool.state()
 
-        state, spooled = asyncio.run(live())
+        state, spooled = await live()
     assert 8 <= 40 - state.missing <= 10
     assert state.rows + spooled.lost == MESSAGES * EXCHANGES * 10
     assert (state.alarms, state.doubled) == (2, 0)  # missing messages, and rows that the gateway says it lost
