@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from delixi_tables import MONITORS
-from scripts import Wire, frame, rows, typed
+from scripts import DELIXI_MONITORS, Wire, frame, rows, typed
 from tables import table
 
 from multidrop.drive import (
@@ -48,7 +47,7 @@ TABLE = """
 
 
 def test_the_registers_are_those_of_part_2() -> None:
-    shared = "\n".join(f"03/06 {line}" for line in MONITORS.strip().splitlines())
+    shared = "\n".join(f"03/06 {line}" for line in DELIXI_MONITORS.strip().splitlines())
     assert rows(DelixiModbus) == typed(TABLE + shared)
 
 

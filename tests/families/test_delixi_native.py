@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from delixi_tables import MONITORS
-from scripts import Wire, frame, rows, typed
+from scripts import DELIXI_MONITORS, Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
@@ -57,7 +56,7 @@ TABLE = """
 
 
 def test_the_registers_are_those_of_part_3() -> None:
-    own = MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
+    own = DELIXI_MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
     shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
     assert rows(DelixiNative) == typed(TABLE + shared)
 

@@ -64,17 +64,17 @@ def libmodbus(built: Path, name: str, *words: str) -> list[str]:
     return [str(build_with_libmodbus(SERVERS / f"{name}.c", built)), *words]
 
 
-def pymodbus(name: str, *words: str) -> list[str]:
+def pymodbus(*words: str) -> list[str]:
     require_module("pymodbus")
-    return [sys.executable, str(SERVERS / f"{name}.py"), *words]
+    return [sys.executable, str(SERVERS / "pymodbus_server.py"), str(ADDRESS), *words]
 
 
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
     "libmodbus rtu": lambda built: libmodbus(built, "libmodbus_server", "PORT", str(ADDRESS)),
-    "pymodbus rtu": lambda _: pymodbus("pymodbus_server", "PORT", str(ADDRESS), "rtu"),
-    "pymodbus ascii": lambda _: pymodbus("pymodbus_server", "PORT", str(ADDRESS), "ascii"),
+    "pymodbus rtu": lambda _: pymodbus("rtu", "PORT"),
+    "pymodbus ascii": lambda _: pymodbus("ascii", "PORT"),
     "libmodbus tcp": lambda built: libmodbus(built, "libmodbus_tcp_server"),
-    "pymodbus tcp": lambda _: pymodbus("modbus_tcp_server", str(ADDRESS)),
+    "pymodbus tcp": lambda _: pymodbus("tcp"),
 }
 
 

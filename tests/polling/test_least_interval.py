@@ -7,10 +7,9 @@ from itertools import pairwise
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled
-from picky import Picky, family
 from simulated_bus import SimulatedBus
 from tables import table
-from toy import Toy
+from toy import Picky, Toy, family
 
 from multidrop.control.call import Call
 from multidrop.control.stops import StopAttempt, stop_together

@@ -13,8 +13,7 @@ from examples import examples, usually
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from lines import line, patient, plant, polled, rows_of, until
-from picky import Picky, expected_values, family
-from toy import Toy
+from toy import Picky, Toy, expected_values, family
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive

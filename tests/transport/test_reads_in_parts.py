@@ -8,8 +8,8 @@ import checksums
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from picky import Picky, expected_values, family
 from simulated_bus import SimulatedBus
+from toy import Picky, expected_values, family
 
 from multidrop.core import NumberFormat
 from multidrop.drive.register import reading
