@@ -115,9 +115,10 @@ def _title(plant: LivePlant, width: int, now_ns: int) -> TextLine:
 
 def _line_states(plant: LivePlant, width: int) -> list[TextLine]:
     lines = []
+    longest = max((columns_of(line.name) for line in plant.plant.lines), default=0)
     for line in plant.plant.lines:
         recent = plant.recent[line.name]
-        text = f" {line.name}  {recent.utilisation:4.0%} of the wire used  "
+        text = f" {padded(line.name, '<', longest)}  {recent.utilisation:4.0%} of the wire used  "
         text += f"{recent.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
         lines.append(TextLine(cut(text, width)))
     return lines

@@ -38,10 +38,11 @@ class SimulatedCHE(MotorDrive):
         Reason.DAMAGED: 0x11,  # 11.1: a receive error is answered with a fault frame
     }
 
+    storing = 0.0
+    _busy_until = 0.0
+    _modbus_fault = 0
+
     def prepare(self) -> None:
-        self.storing = 0.0
-        self._busy_until = 0.0
-        self._modbus_fault = 0
         self.memory.make_readable(HOLDING, [CONTROL])
 
     @property

@@ -68,8 +68,7 @@ class SimulatedDelixiNative(MotorDrive):
 
     begins = BY_LINE
 
-    def prepare(self) -> None:
-        self.locked = False
+    locked = False
 
     def takes_broadcast(self, request: Message) -> bool:
         return request.function == COMMAND

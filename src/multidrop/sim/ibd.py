@@ -42,8 +42,7 @@ class SimulatedIBD(MotorDrive):
         328: FAULT,
     }
 
-    def prepare(self) -> None:
-        self._jogs = False
+    _jogs = False
 
     @property
     def most_gap(self) -> float:

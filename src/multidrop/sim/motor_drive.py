@@ -140,14 +140,16 @@ class ProfileDrive(MotorDrive):
     everything except settings in EEPROM.
     """
 
+    is_local = False
+    word_before = 0  # the control word before the present one
+
     def prepare(self) -> None:
-        self.is_local = False
-        self.word_before = 0  # the control word before the present one
         if "signature" in self.drive.registers:
             values: Any = self.drive.register("signature").values
             self["signature"] = next(iter(values))
         if "station" in self.drive.registers:
             self["station"] = self.drive.address
+        self.powered_up()
 
     def setpoint(self) -> float:
         held = self._known("reference") or 0.0

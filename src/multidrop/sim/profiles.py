@@ -40,10 +40,7 @@ class SimulatedProfidrive(ProfileDrive):
     motor coast. The three ramp bits are simulated only in part: the motor runs if all three are 1.
     """
 
-    def prepare(self) -> None:
-        super().prepare()
-        self.off2 = self.off3 = False
-        self.powered_up()
+    off2 = off3 = False
 
     def powered_up(self) -> None:
         self._is_inhibited = True
@@ -122,10 +119,7 @@ class SimulatedCiA402(ProfileDrive):
     drive in local control ignores all words. `stays_off` prevents switching on, as missing mains do.
     """
 
-    def prepare(self) -> None:
-        super().prepare()
-        self.stays_off = False
-        self.powered_up()
+    stays_off = False
 
     def powered_up(self) -> None:
         self._state = DISABLED
@@ -182,10 +176,6 @@ class SimulatedDanfossFC(ProfileDrive):
 
     `is_locked`: the present trip cannot be reset.
     """
-
-    def prepare(self) -> None:
-        super().prepare()
-        self.is_locked = False
 
     def powered_up(self) -> None:
         self.is_locked = False
@@ -266,10 +256,8 @@ _STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, In
 class SimulatedInvt(ProfileDrive):
     """INVT: a start during a fault is refused. `jog_needs_own_stop`: a normal stop does not end a jog."""
 
-    def prepare(self) -> None:
-        super().prepare()
-        self.jog_needs_own_stop = False
-        self._jogs = False
+    jog_needs_own_stop = False
+    _jogs = False
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         if cell.name == "control" and self._canonical(raw) in _STARTS and self.motor.fault:
@@ -310,10 +298,8 @@ class SimulatedOptidrive(ProfileDrive):
     fault code in the low byte and the state in the high byte.
     """
 
-    def prepare(self) -> None:
-        super().prepare()
-        self.is_enabled = True
-        self.is_first_reading = False
+    is_enabled = True
+    is_first_reading = False
 
     def _control(self, word: int) -> None:
         if self.is_local:

@@ -41,10 +41,11 @@ class SimulatedYD1000(MotorDrive):
     functions = (0x03, 0x06)
     needs_silence = True  # 4.3
 
+    _panel_runs = False
+    _in_force = 0  # the control word in force
+    _message_at = math.inf  # the timeout starts with the first message
+
     def prepare(self) -> None:
-        self._panel_runs = False
-        self._in_force = 0  # the control word in force
-        self._message_at = math.inf  # the timeout starts with the first message
         self.memory.make_readable(HOLDING, [CONTROL])
 
     @property
