@@ -51,7 +51,7 @@ DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
 POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line has time for two requests at 9600 bit/s
 SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings that explain terminals
-EVERY, SLOW = "400 ms", "2 s"
+EVERY, SLOW = "450 ms", "2 s"
 MAXIMUM_HZ = 50
 TROUBLE = {  # faults of single drives
     "fan-1": 'trip = "30 s"\nfirst = "3 s"',
@@ -61,7 +61,7 @@ TROUBLE = {  # faults of single drives
     "fan-3": "loss = 0.02",
 }
 DRIFT = 0.25  # of every load
-STEP_S = 0.6  # between two looks of the operator at a drive of each line
+STEP_S = 0.8  # between two looks of the operator at a drive of each line
 CALM = 3  # of so many looks at a running motor, one changes its setpoint
 
 
