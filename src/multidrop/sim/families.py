@@ -10,7 +10,16 @@ from multidrop.families.delixi_native import DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
-from multidrop.families.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
+from multidrop.families.profiles import (
+    CiA402,
+    DanfossFC,
+    Delta,
+    Inovance,
+    Invt,
+    Optidrive,
+    Profidrive,
+    Yaskawa,
+)
 from multidrop.families.yd1000 import YD1000
 from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.delixi import SimulatedDelixi, SimulatedDelixiNative
@@ -21,9 +30,11 @@ from multidrop.sim.profiles import (
     SimulatedCiA402,
     SimulatedDanfossFC,
     SimulatedDelta,
+    SimulatedInovance,
     SimulatedInvt,
     SimulatedOptidrive,
     SimulatedProfidrive,
+    SimulatedYaskawa,
 )
 from multidrop.sim.yd1000 import SimulatedYD1000
 
@@ -38,8 +49,10 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
     CiA402: SimulatedCiA402,
     DanfossFC: SimulatedDanfossFC,
     Delta: SimulatedDelta,
+    Inovance: SimulatedInovance,  # before Invt, from which it derives
     Invt: SimulatedInvt,
     Optidrive: SimulatedOptidrive,
+    Yaskawa: SimulatedYaskawa,
 }
 
 

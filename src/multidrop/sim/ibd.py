@@ -79,6 +79,12 @@ class SimulatedIBD(MotorDrive):
         bits = (bit for address, bit in OUTPUTS.items() if says.get(self.word(address)))
         return sum(bits, ALWAYS_SEEN)
 
+    def _run_state(self) -> int:
+        """Return PA28 of the siblings that have it."""
+        if not self.motor.energised:
+            return 0
+        return 2 if self.motor.frequency < 0 else 1
+
     def _format(self) -> int:
         first_rtu = 0 if self.drive.framing is Framing.ASCII else len(FORMATS)
         return first_rtu + FORMATS.index(self.drive.settings.format)
@@ -86,6 +92,7 @@ class SimulatedIBD(MotorDrive):
     obeys = {"control": _control}
     shows = {
         "terminals": _terminals,
+        "run_state": _run_state,
         "baudrate_setting": lambda self: BAUDRATES.index(self.drive.settings.baudrate),
         "format_setting": _format,
         "address_setting": lambda self: self.drive.address,

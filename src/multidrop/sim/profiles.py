@@ -1,4 +1,4 @@
-"""PROFIdrive's state machine, simulated (ACS550-02/U2 manual p. 246, ACS355 p. 319, G120C p. 195 and 235)."""
+"""The state machines of the profiles, simulated, by the manuals that each profile names."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from multidrop.families.profiles.delta import (
     DeltaReset,
     DeltaStatus,
 )
-from multidrop.families.profiles.invt import InvtControl, InvtStatus
+from multidrop.families.profiles.invt import InovanceStatus, InvtControl, InvtStatus
 from multidrop.families.profiles.optidrive import OptidriveControl, OptidriveStatus
 from multidrop.families.profiles.profidrive import ProfidriveControl, ProfidriveStatus
+from multidrop.families.profiles.yaskawa import YaskawaControl, YaskawaStatus
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import COMMANDS, ProfileDrive
@@ -286,6 +287,57 @@ class SimulatedInvt(ProfileDrive):
         if not self.motor.energised:
             return InvtStatus.STANDBY
         return InvtStatus.REVERSE if self.motor.frequency < 0 else InvtStatus.FORWARD
+
+    obeys = {"control": _control}
+    shows = {"status": _state}
+
+
+class SimulatedInovance(SimulatedInvt):
+    """Inovance and its copies: the status shows no fault."""
+
+    def _state(self) -> int:
+        if not self.motor.energised:
+            return InovanceStatus.STOPPED
+        return InovanceStatus.REVERSE if self.motor.frequency < 0 else InovanceStatus.FORWARD
+
+    shows = {"status": _state}
+
+
+class SimulatedYaskawa(ProfileDrive):
+    """Yaskawa: the motor runs while a run bit is set, also right after a reset.
+
+    A read of more than `most_answered` registers is refused with exception 03, as on an A1000.
+    """
+
+    most_answered = 16
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.most[0x03] = self.most_answered
+
+    def _control(self, word: int) -> None:
+        if self.is_local:
+            return
+        if self.rises(word, YaskawaControl.RESET):
+            self.motor.reset()
+        runs = word & (YaskawaControl.FORWARD | YaskawaControl.REVERSE)
+        if runs in (YaskawaControl.FORWARD, YaskawaControl.REVERSE):
+            self.motor.run(1 if runs == YaskawaControl.FORWARD else -1)
+        else:
+            self.motor.stop()
+
+    def _state(self) -> int:
+        fault, runs = bool(self.motor.fault), self.motor.energised
+        bits = {
+            YaskawaStatus.RUNS: runs,
+            YaskawaStatus.ZERO_SPEED: not runs,
+            YaskawaStatus.REVERSE: self.motor.frequency < 0,
+            YaskawaStatus.READY: not fault,
+            YaskawaStatus.FAULT: fault,
+            YaskawaStatus.REFERENCE_BY_LINE: not self.is_local,
+            YaskawaStatus.COMMANDED_BY_LINE: not self.is_local,
+        }
+        return sum(bit for bit, is_set in bits.items() if is_set)
 
     obeys = {"control": _control}
     shows = {"status": _state}

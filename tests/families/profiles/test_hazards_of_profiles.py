@@ -5,20 +5,23 @@ from __future__ import annotations
 from contextlib import suppress
 
 import pytest
-from profile_families import ALL, MAKE, SHIPPED_AS, STARTS
-from simulated_bus import is_write, one
+from examples import usually
+from profile_families import ALL, MAKE, STARTS
+from simulated_bus import SimulatedBus, is_write, one
+from tables import table
 
 from multidrop.control.ramp import ramp
 from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive
-from multidrop.errors import NotVerified, Unconfirmed, WriteForbidden
-from multidrop.families.profiles.invt import InvtControl
+from multidrop.errors import DriveException, NoReply, NotVerified, Unconfirmed, WriteForbidden
+from multidrop.families import YD1000, InnovertIBD, InvtCHE
+from multidrop.families.profiles.invt import Invt, InvtControl
+from multidrop.sim import simulated
 
 FAULT = 4
-KIND = {**{name: name for name in MAKE}, **{f"shipped {name}": kind for name, kind in SHIPPED_AS.items()}}
 
 
-@pytest.fixture(params=ALL)
+@pytest.fixture(params=MAKE)
 def model(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -32,9 +35,15 @@ class Line:
     """A simulated bus with one drive; `starts` are the requests that turn its motor."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-        self.is_start = STARTS[KIND[model]]
+        self.is_start = STARTS[model]
         self.bus, self.drive, self.sim = one(monkeypatch, ALL[model](1))
-        self.sim.motor.acceleration_time = self.sim.motor.deceleration_time = 1.0
+        self.set_ramps(1.0)
+
+    def set_ramps(self, seconds: float) -> None:
+        for name in ("acceleration_time", "deceleration_time"):
+            setattr(self.sim.motor, name, seconds)
+            if name in self.drive.registers:
+                self.sim[name] = seconds
 
     @property
     def starts(self) -> list[Message]:
@@ -66,9 +75,52 @@ def test_a_start_and_a_stop(line: Line) -> None:
     assert line.sim.motor.energised
 
 
+def test_a_start_whose_reply_is_lost_is_sent_once(line: Line) -> None:
+    line.drive.set_frequency(20)
+    line.bus.loses = line.starts_it
+    with pytest.raises(Unconfirmed, match="no reply"):
+        line.drive.start()
+    assert len(line.starts) == 1
+    assert line.sim.motor.energised  # it took effect, and the caller knows that it may have
+
+
+def test_a_start_that_never_arrives_is_sent_once(line: Line) -> None:
+    line.drive.set_frequency(20)
+    line.bus.deafens = line.starts_it
+    with pytest.raises(Unconfirmed):
+        line.drive.start()
+    assert len(line.starts) == 1
+    assert not line.sim.motor.energised
+
+
+@pytest.mark.parametrize("lost", usually(7, 1, 2, 3))
+@pytest.mark.parametrize("how", ["loses", "deafens"])
+def test_stop_is_repeated_if_its_replies_are_lost(line: Line, lost: int, how: str) -> None:
+    """It is sent until it is confirmed and the motor stands."""
+    line.runs()
+    begun = len(line.writes)
+    setattr(line.bus, how, lambda request: is_write(request) and len(line.writes) <= begun + lost)
+    line.drive.stop()
+    stops = line.writes[begun:]
+    assert len(stops) > lost
+    of_a_jog = {InvtControl.STOP_JOG} if isinstance(line.drive, Invt) else set()
+    assert stops[0].data[-1] not in of_a_jog
+    assert all(stop == stops[0] or stop.data[-1] in of_a_jog for stop in stops[: lost + 1])
+    assert not any(line.starts_it(stop) for stop in stops)
+    assert not line.sim.motor.energised
+
+
+def test_a_stop_is_sent_to_a_drive_that_never_answers(line: Line) -> None:
+    line.bus.deafens = lambda request: True
+    with pytest.raises((NoReply, Unconfirmed)):
+        line.drive.stop(seconds=3)
+    assert len(line.writes) > 3
+    assert not line.starts
+
+
 def test_a_stop_is_watched(line: Line) -> None:
     line.runs()
-    line.sim.motor.deceleration_time = 20.0
+    line.set_ramps(20.0)
     before = line.bus.seconds
     line.drive.stop()
     assert line.bus.seconds - before > 5
@@ -157,7 +209,7 @@ def test_a_power_cycle_forgets_the_setpoint(line: Line, model: str) -> None:
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
     begun = len(line.writes)
-    if KIND[model] == "danfoss-fc51":  # whose reference cannot be read
+    if model == "danfoss-fc51":  # whose reference cannot be read
         line.drive.start()
         return
     with pytest.raises(WriteForbidden, match="set_frequency"):
@@ -173,6 +225,7 @@ LOCAL = {
     "schneider-atv320": "from the line",
     "danfoss-fc51": "hand mode",
     "delta-vfd-el": "from the line",
+    "yaskawa-a1000": "from the line",
 }
 
 
@@ -187,12 +240,36 @@ def test_a_drive_in_local_control_is_not_started(model: str, monkeypatch: pytest
     assert line.writes[begun:] == []
 
 
+OTHERS: dict[str, Callable[[int], Drive]] = {
+    "invt-che": lambda address: InvtCHE(address, maximum_frequency=50),
+    "innovert-ibd": InnovertIBD,
+    "yd1000": YD1000,
+    **MAKE,
+}
+
+
+@table("other", OTHERS)
+def test_a_drive_of_another_make_is_not_written_to(
+    model: str, other: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if other == model:
+        return  # its own make
+    there = simulated(OTHERS[other](1))
+    bus = SimulatedBus(monkeypatch, there)
+    drive: Any = bus.attach(ALL[model](1))
+    for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
+        with pytest.raises((WriteForbidden, NoReply, DriveException)):
+            call()
+    assert bus.frames
+    assert bus.written == []
+
+
 NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
 
 
 def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.drive.set_frequency(20)
-    if KIND[model] in NO_DIRECTION:
+    if model in NO_DIRECTION:
         with pytest.raises(WriteForbidden, match="direction"):
             line.drive.start(Direction.REVERSE)
         assert not line.starts
@@ -201,7 +278,7 @@ def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.bus.sleep(2)
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
-    if KIND[model] in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
+    if model in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
         with pytest.raises(WriteForbidden, match="cannot say which way"):
             line.drive.start()
     else:
@@ -293,7 +370,7 @@ def test_stop_jog_is_not_sent_to_another_make(monkeypatch: pytest.MonkeyPatch) -
     line = Line(monkeypatch, "invt-goodrive")
     checked: list[Drive] = []
 
-    def withhold(drive: Drive) -> None:
+    def withhold(drive: Drive, *word: object) -> None:
         checked.append(drive)
         raise WriteForbidden("another family is there")
 
@@ -394,6 +471,6 @@ def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_dri
 def test_a_stop_of_a_drive_that_was_known_is_never_kept_back(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     line.runs()
-    line.sim["signature"] = 0x0101
+    line.sim["device"] = 0
     line.drive.stop()
     assert not line.sim.motor.energised

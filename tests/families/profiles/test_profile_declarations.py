@@ -41,7 +41,7 @@ def test_profile_completes_the_family_roles() -> None:
     assert control.name == "control"
     assert control is Acs355.registers["control"]
     assert control.harmless == (0x047E, 0x047C, 0x0476)
-    assert control.place == "40001"
+    assert control.place.startswith("ACS355 p. 313")
     assert control.commands
     assert not Acs355.reference.commands
 
@@ -136,7 +136,7 @@ def test_signed_status_is_refused() -> None:
 
 
 def test_percentage_needs_maximum_frequency() -> None:
-    drive = Fc51(1)
+    drive = Fc51(1, confirmed=1)
     wire = Wire(drive)
     with pytest.raises(WriteForbidden, match="maximum_frequency = HZ") as refusal:
         drive.set_frequency(20)
@@ -152,17 +152,20 @@ WELL = {
     "abb-acs355": {"status": 0x0231, "station": 1.0, "signature": 2},
     "danfoss-fc51": {"status": 0x0607, "station": 1.0, "signature": 2},
     "delta-vfd-el": {"status": 0x0500, "station": 1.0},
-    "invt-goodrive": {"status": 3, "signature": 0x010C},
+    "invt-goodrive": {"status": 3, "device": 0x0107},
+    "powtran-pi130": {"status": 3, "fault": 0},
+    "delixi-e": {"status": 3, "station": 1.0},
+    "yaskawa-a1000": {"status": 0xC022, "signature": 0x4130},
     "optidrive-e3": {"status": 0x0040, "signature": 3},
     "schneider-atv320": {"status": 0x0250},
-    "siemens-v20": {"status": 0x0231},
+    "siemens-v20": {"status": 0x0231, "base_frequency": 5000},
 }
 
 
 def identify(model: str, **says: Any) -> Wire:
     drive = MAKE[model](1)
     said = {
-        name: drive.registers[name].decode(value) if not isinstance(value, Exception) else value
+        name: value if isinstance(value, Exception) else drive.registers[name].decode(int(value))
         for name, value in {**WELL[model], **says}.items()
     }
     wire = Wire(drive, said)
@@ -181,15 +184,22 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
     ("abb-acs355", {"status": 0x0241}, "switched on and inhibited"),
     ("abb-acs355", {"status": 0x0202}, "ready to operate and not to be switched on"),
     ("abb-acs355", {"station": 7}, "says that its address is 7"),
-    ("abb-acs355", {"signature": 1}, "known as ABB ACS355: signature is 1, and none of DRV_LIM, DRV_FULL"),
+    ("abb-acs355", {"signature": 1}, "signature is 1, and none of drv_lim, drv_full"),
     ("danfoss-fc51", {"status": 0x0E08}, "run and be tripped"),
     ("danfoss-fc51", {"signature": 0}, "signature"),
-    ("delta-vfd-el", {"status": 0x8000}, "reserved bits"),
+    ("delta-vfd-el", {"status": 0xA000}, "bits 15 to 13 are none of its modes"),
     ("delta-vfd-el", {"station": 12}, "address is 12"),
     ("invt-goodrive", {"status": 0}, "no such number"),
-    ("invt-goodrive", {"signature": 0x0101}, "GD200L"),
+    ("invt-goodrive", {"device": 0}, "device is 0"),
+    ("powtran-pi130", {"status": 0}, "no such number"),
+    ("powtran-pi130", {"fault": 100}, "fault is 100"),
+    ("delixi-e", {"station": 4}, "address is 4"),
+    ("siemens-v20", {"base_frequency": 0}, "base_frequency is 0"),
+    ("yaskawa-a1000", {"status": 0}, "no bit is set"),
+    ("yaskawa-a1000", {"status": 0xC083}, "run and have a fault"),
+    ("yaskawa-a1000", {"signature": 0x5630}, "none of a1000"),
     ("optidrive-e3", {"status": 0x0080}, "reserved bits"),
-    ("optidrive-e3", {"signature": 0}, "none of MODBUS"),
+    ("optidrive-e3", {"signature": 0}, "none of modbus, modbus_and_ramp"),
     ("schneider-atv320", {"status": 0x0202}, "none of the states"),
 ]
 

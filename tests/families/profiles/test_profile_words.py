@@ -36,6 +36,8 @@ DELTA = "01 06 20 00 "
 RESET = "01 06 20 02 "
 E3 = "01 06 00 00 "
 ATV = "01 06 21 35 "  # 8501
+DELIXI = "01 06 A0 00 "
+A1000 = "01 10 00 01 00 01 02 "  # 0001H by function 10 (A1000 manual p. 559)
 
 ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS = 0x0270, 0x0231, 0x0233, 0x0237  # ACS355 manual p. 319
 ABB_FAULT = 0x0238
@@ -43,6 +45,8 @@ FC_READY, FC_RUNS, FC_TRIP, FC_LOCK = 0x0607, 0x0E07, 0x0604 | 8, 0x0604 | 0x48
 DELTA_STOP, DELTA_RUNS, DELTA_REVERSE = 0x0500, 0x0503, 0x051B
 DELTA_TO_REVERSE = 0x0513  # it still turns forward
 GD_STANDBY, GD_RUNS, GD_FAULT = 3, 1, 4
+MD_STOPPED, MD_RUNS = 3, 1  # PI130 p. 116: 3000H
+YK_OFF, YK_RUNS, YK_REVERSE, YK_FAULT = 0xC022, 0xC031, 0xC035, 0xC082  # A1000 27C p. 494
 E3_READY, E3_RUNS, E3_TRIP = 0x0040, 0x0041, 0x0302
 ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS, ATV_FAULT = 0x0250, 0x0231, 0x0233, 0x0237, 0x0218
 
@@ -82,6 +86,9 @@ STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
     "delta-vfd-el": ([DELTA_STOP, DELTA_RUNS], (DELTA + "00 12",)),  # CP2000 p. 12.1-09-8: run and forward
     "invt-goodrive": ([GD_STANDBY, GD_RUNS], (DELTA + "00 01",)),  # Goodrive100 p. 167
     "optidrive-e3": ([E3_READY, E3_RUNS], (E3 + "00 01",)),  # ODE-3 user guide p. 33
+    "powtran-pi130": ([MD_STOPPED, MD_RUNS], (DELTA + "00 01",)),  # PI130 p. 116
+    "delixi-e": ([MD_STOPPED, MD_RUNS], (DELIXI + "00 01",)),
+    "yaskawa-a1000": ([YK_OFF, YK_RUNS], (A1000 + "00 01",)),
 }
 
 
@@ -114,6 +121,9 @@ STOPS = {
     "delta-vfd-el": (DELTA_STOP, DELTA + "00 01", None),
     "invt-goodrive": (GD_STANDBY, DELTA + "00 05", DELTA + "00 06"),
     "optidrive-e3": (E3_READY, E3 + "00 00", E3 + "00 08"),
+    "powtran-pi130": (MD_STOPPED, DELTA + "00 06", DELTA + "00 05"),
+    "delixi-e": (MD_STOPPED, DELIXI + "00 06", DELIXI + "00 05"),
+    "yaskawa-a1000": (YK_OFF, A1000 + "00 00", None),
 }
 
 
@@ -149,6 +159,9 @@ RESETS: Mapping[str, tuple[list[int], dict[str, Any], tuple[str, ...]]] = {
     ),
     "invt-goodrive": ([GD_FAULT, GD_STANDBY], {}, (DELTA + "00 05", DELTA + "00 07")),
     "optidrive-e3": ([E3_TRIP, E3_READY], {}, (E3 + "00 00", E3 + "00 04", E3 + "00 00")),
+    "powtran-pi130": ([MD_STOPPED], {"fault": [9, 0]}, (DELTA + "00 06", DELTA + "00 07")),
+    "delixi-e": ([MD_STOPPED], {"fault": [8, 0]}, (DELIXI + "00 06", DELIXI + "00 07")),
+    "yaskawa-a1000": ([YK_FAULT, YK_OFF], {}, (A1000 + "00 00", A1000 + "00 08", A1000 + "00 00")),
 }
 
 
@@ -172,6 +185,9 @@ REVERSES = {
     "delta-vfd-el": ([DELTA_STOP, DELTA_REVERSE], DELTA + "00 22"),
     "invt-goodrive": ([GD_STANDBY, 2], DELTA + "00 02"),
     "schneider-atv320": ([ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS], ATV + "08 0F"),
+    "powtran-pi130": ([MD_STOPPED, 2], DELTA + "00 02"),
+    "delixi-e": ([MD_STOPPED, 2], DELIXI + "00 02"),
+    "yaskawa-a1000": ([YK_OFF, YK_REVERSE], A1000 + "00 02"),
 }
 
 
@@ -216,6 +232,9 @@ SETPOINTS = {
     "delta-vfd-el": "01 06 20 01 09 C4",
     "invt-goodrive": "01 06 20 01 09 C4",
     "optidrive-e3": "01 06 00 01 00 FA",  # "100 = 10.0 Hz" (ODE-3 user guide p. 33)
+    "powtran-pi130": "01 06 10 00 13 88",  # 5000 of 10000 (PI130 p. 116)
+    "delixi-e": "01 06 A0 01 13 88",
+    "yaskawa-a1000": "01 10 00 02 00 01 02 09 C4",
 }
 
 
@@ -237,6 +256,8 @@ HINDRANCES = [
     ("optidrive-e3", 0x0000, "is not ready to run"),
     ("optidrive-e3", 0x0100, "is not ready to run"),  # "running", as the first guide prints it
     ("invt-goodrive", 5, "has no mains"),
+    ("yaskawa-a1000", 0x4022, "does not take its commands from the line"),
+    ("yaskawa-a1000", 0x8002, "is not ready"),
 ]
 
 
@@ -269,6 +290,11 @@ STATES = [
     ("invt-goodrive", 2, {}, Condition.RUNNING),
     ("invt-goodrive", 5, {}, Condition.STOPPED),
     ("optidrive-e3", E3_TRIP, {}, Condition.FAULT),
+    ("powtran-pi130", 2, {}, Condition.RUNNING),
+    ("powtran-pi130", MD_STOPPED, {"fault": 9}, Condition.FAULT),
+    ("delixi-e", MD_STOPPED, {"output_frequency": 3.0}, Condition.DECELERATING),
+    ("yaskawa-a1000", YK_REVERSE, {}, Condition.RUNNING),
+    ("yaskawa-a1000", YK_FAULT, {}, Condition.FAULT),
     ("schneider-atv320", 0x0217, {}, Condition.DECELERATING),  # quick stop
     ("schneider-atv320", ATV_ON, {}, Condition.STOPPED),
 ]
@@ -372,7 +398,7 @@ class Clone(Goodrive):
 
 
 def test_renumbered_words_are_sent() -> None:
-    drive: Any = Clone(1)
+    drive: Any = Clone(1, confirmed=1)
     drive.commanded = 40.0
     found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
     drive.stop()
@@ -383,7 +409,7 @@ def test_renumbered_words_are_sent() -> None:
 
 
 def test_renumbered_stop_is_the_only_stop_of_a_turning_motor_without_jogs() -> None:
-    drive: Any = Clone(1)
+    drive: Any = Clone(1, confirmed=1)
     found = Wire(drive, {**FREE, "status": [drive.status.values(GD_RUNS), drive.status.values(GD_STANDBY)]})
     drive.stop()
     assert sent(found) == [DELTA + "00 06"]
@@ -391,7 +417,7 @@ def test_renumbered_stop_is_the_only_stop_of_a_turning_motor_without_jogs() -> N
 
 def test_words_that_a_family_leaves_out_are_unsupported() -> None:
     control = numbered({"forward": 1, "stop": 0, "reset_fault": 9})
-    drive: Any = type("Short", (Goodrive,), {"control": control})(1)
+    drive: Any = type("Short", (Goodrive,), {"control": control})(1, confirmed=1)
     drive.commanded = 40.0
     found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
     for call in (drive.coast, drive.jog, lambda: drive.start(Direction.REVERSE)):

@@ -28,7 +28,8 @@ def frame(drive: Drive, register: Register[Any], value: Any) -> str:
     elif register.table.carrier is Carrier.LONG:
         message = Message(drive.address, function, address, data=struct.pack(">I", raw))
     else:
-        message = Message(drive.address, function, address, data=struct.pack(">H", raw))
+        count = 1 if function == 16 else 0
+        message = Message(drive.address, function, address, count, data=struct.pack(">H", raw))
     sent = build_request(drive.framing, message)
     return sent.decode().strip() if sent.startswith(b":") else sent.hex(" ").upper()
 

@@ -9,21 +9,24 @@ from collections.abc import Mapping
 from multidrop.families.profiles.cia402 import CiA402
 from multidrop.families.profiles.danfoss_fc import DanfossFC
 from multidrop.families.profiles.delta import Delta
-from multidrop.families.profiles.invt import Invt
+from multidrop.families.profiles.invt import Inovance, Invt
 from multidrop.families.profiles.optidrive import Optidrive
 from multidrop.families.profiles.profidrive import Profidrive
 from multidrop.families.profiles.profile import Profile, Role
+from multidrop.families.profiles.yaskawa import Yaskawa
 
 __all__ = [
     "PROFILES",
     "CiA402",
     "DanfossFC",
     "Delta",
+    "Inovance",
     "Invt",
     "Optidrive",
     "Profidrive",
     "Profile",
     "Role",
+    "Yaskawa",
 ]
 
 PROFILES: Mapping[str, type[Profile]] = {
@@ -32,5 +35,7 @@ PROFILES: Mapping[str, type[Profile]] = {
     "danfoss-fc": DanfossFC,
     "delta": Delta,
     "invt": Invt,
+    "inovance": Inovance,
     "optidrive": Optidrive,
+    "yaskawa": Yaskawa,
 }

@@ -54,7 +54,7 @@ class DeltaStatus(IntFlag):
     BIT_15 = 1 << 15
 
 
-RESERVED = 0xE000  # bits 13 to 15, of every manual
+MODES = range(5)  # bits 15 to 13: reserved, or a C2000 Plus's HOA and LOC/REM mode (its manual, p. A-10)
 
 
 class Delta(Profile):
@@ -81,7 +81,7 @@ class Delta(Profile):
     }
 
     def _impossible(self, status: int) -> str:
-        return "its reserved bits are set" if status & RESERVED else ""
+        return "" if status >> 13 in MODES else "bits 15 to 13 are none of its modes"
 
     def _code(self) -> Script[int]:
         return int((yield from read(self.register("fault")))) & 0xFF

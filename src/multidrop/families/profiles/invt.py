@@ -1,4 +1,4 @@
-"""INVT's words 1, 2, 5, 7, which several makes have copied."""
+"""INVT's words 1, 2, 5, 7, which several makes have copied; Inovance and others have 5 and 6 exchanged."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any, ClassVar, cast
 
 from multidrop.drive import BusError, DriveException, WriteForbidden
 from multidrop.drive.register import Access
-from multidrop.drive.script import Script, insist, write
+from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import verb
-from multidrop.families.profiles.profile import COMMON, Profile, Role
+from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 
 class InvtControl(IntEnum):
@@ -71,7 +71,7 @@ class Invt(Profile):
     _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
 
     def _impossible(self, status: int) -> str:
-        return "" if status in tuple(InvtStatus) else "the profile has no such number"
+        return "" if status in tuple(cast(Any, self.status.values)) else "the profile has no such number"
 
     def _is_tripped(self, status: int) -> bool:
         return status == InvtStatus.FAULT
@@ -139,3 +139,61 @@ class Invt(Profile):
     def _take_reset_back(self) -> Script[None]:
         """Do nothing: the drive acts on a word once, so the reset need not be cleared."""
         yield from ()
+
+
+class InovanceControl(IntEnum):
+    """2000H: Powtran PI130 manual p. 122 and Inovance MD500 manual p. 703. 5 and 6 are not INVT's."""
+
+    FORWARD = 1
+    REVERSE = 2
+    JOG_FORWARD = 3
+    JOG_REVERSE = 4
+    COAST = 5
+    STOP = 6
+    RESET_FAULT = 7
+    STOP_JOG = 8
+
+
+class InovanceStatus(IntEnum):
+    """3000H: Powtran PI130 manual p. 122. A Delixi E's 0, "none" (B000H), is not used: it proves nothing."""
+
+    FORWARD = 1
+    REVERSE = 2
+    STOPPED = 3
+
+
+class Inovance(Invt):
+    """The words of Inovance MD, Powtran PI and their copies: 5 coasts, 6 stops along the ramp.
+
+    - `fault` is needed: the status does not show a fault. A fault is any value but 0.
+    - The status has three numbers, 1 forward, 2 reverse and 3 stopped; a drive that shows another one is not
+      known, and is never taken for stopped.
+    - A family may give its own numbers in `control`, as in the profile `invt`. A word that it leaves out is
+      never sent.
+    """
+
+    roles = {
+        **Invt.roles,
+        "control": Role(
+            (Access.COMMAND,),
+            values=InovanceControl,
+            harmless=(InovanceControl.STOP, InovanceControl.COAST, InovanceControl.STOP_JOG),
+            renumbered=("forward", "stop", "reset_fault"),
+        ),
+        "status": Role((Access.READING,), values=InovanceStatus),
+        "fault": READING,
+    }
+
+    def _tripped(self, status: int) -> Script[bool]:
+        return bool((yield from read(self.register("fault"))) != 0)
+
+    def _is_tripped(self, status: int) -> bool:
+        return False  # the status does not show it
+
+    def _turns(self, status: int) -> bool:
+        return status != InovanceStatus.STOPPED
+
+    @property
+    def identity_is_weak(self) -> bool:
+        """True: its stop runs makes with Delta's words, which may not answer to its registers."""
+        return True

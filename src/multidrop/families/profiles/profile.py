@@ -210,8 +210,8 @@ class Profile(Drive):
     is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is
     refused in a fault, in local control, and without a setpoint in force. A reset is refused while the
     motor turns, never has a bit that runs it, and comes after a stop. `identify` only reads. It withholds a
-    stop only if the status is another profile's, and `station` or `signature` another drive's: these two
-    are settings, and may not be in force yet.
+    stop only if the status is another profile's and not 0, and `station` or `signature` another drive's:
+    these two are settings, and may not be in force yet.
     """
 
     roles: ClassVar[Mapping[str, Role]] = {}
@@ -256,6 +256,11 @@ class Profile(Drive):
     def readings(cls) -> tuple[Register[Any], ...]:
         """Return the registers that are polled by default: not those that only identify the family."""
         return tuple(one for one in super().readings() if one.name not in PROOFS)
+
+    @property
+    def identity_is_weak(self) -> bool:
+        """True without a `signature` and [[identify]]: a status or an address may coincide."""
+        return "signature" not in self.registers and not self.identity_proofs
 
     # ---- for each profile ----
 
@@ -334,7 +339,7 @@ class Profile(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that the status word is one of this profile, and `station` and `signature` if declared."""
+        """Check that the status is one of this profile, and `station`, `signature` and [[identify]]."""
         wrong: list[str] = []
         status = yield from self._status()
         if impossible := self._impossible(status):
@@ -349,9 +354,14 @@ class Profile(Drive):
             if not isinstance(held, signature.values):
                 names = ", ".join(value.name for value in signature.values)
                 wrong.append(f"{signature.name} is {held:g}, and none of {names}")
+        for proof in self.identity_proofs:
+            register = self.register(proof.register)
+            value = yield from read(register)
+            if not proof.holds(value):
+                wrong.append(f"{register.name} is {register.format(value)}")
         if wrong:
             kind = self.title or type(self).__name__
-            rule = ANOTHER_FAMILY if impossible and len(wrong) > 1 else ""
+            rule = ANOTHER_FAMILY if impossible and status and len(wrong) > 1 else ""
             raise WriteForbidden(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
 
     @verb
