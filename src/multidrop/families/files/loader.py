@@ -12,6 +12,7 @@ from typing import Any
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.register import Access
+from multidrop.families import MODELS
 from multidrop.families.files import FamilyError
 from multidrop.families.files.notation import Counting
 from multidrop.families.files.registers import (
@@ -146,12 +147,13 @@ def _family(
     if len(declared.places) > MOST_REGISTERS:
         place.wrong(f"declares more than {MOST_REGISTERS} registers; remove unused ones")
         return None
+    base = _base(given, of_family)
     namespace: dict[str, Any] = {
         "__module__": __name__,
         "model": path.name,
         "declared_in": path.name,
-        "options": options,
-        "broadcasts": any(register.broadcast for register in declared.registers.values()),
+        "options": {**base.options, **options},
+        "broadcasts": base.broadcasts or any(one.broadcast for one in declared.registers.values()),
         **facts,
         **declared.registers,
         **texts,
@@ -161,21 +163,33 @@ def _family(
         namespace["parameter_space"] = rule
     if "identify" in document:
         proofs = proofs_of(document["identify"], declared.registers, place)
-        namespace["identity_proofs"], namespace["identify"] = proofs, identify_by(proofs)
-    return _made(_base(given.get("profile"), of_family), namespace, declared, place)
+        namespace["identity_proofs"] = proofs
+        if base.identify is Drive.identify:
+            namespace["identify"] = identify_by(proofs)
+    return _made(base, namespace, declared, place)
 
 
-def _base(profile: str | None, place: TomlPlace) -> type[Drive]:
-    """Return the class that the family derives from: a profile's, which then has all of its verbs."""
-    if profile is None:
-        return Drive
+def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
+    """Return the class whose verbs the family inherits: a profile, a built-in family, or Drive."""
+    if "profile" in given and "extends" in given:
+        place.wrong("has profile and extends; name one of them")
+    for key in ("profile", "extends"):
+        if key in given:
+            classes = _bases(key)
+            if given[key] in classes:
+                return classes[given[key]]
+            near = difflib.get_close_matches(given[key], classes, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(classes)}"
+            place.wrong(f"{key} = {shown(given[key])} is not known; {hint}")
+    return Drive
+
+
+def _bases(key: str) -> Mapping[str, type[Drive]]:
+    if key == "extends":
+        return MODELS
     from multidrop.families.profiles import PROFILES  # few files name one
 
-    if profile not in PROFILES:
-        near = difflib.get_close_matches(profile, PROFILES, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(PROFILES)}"
-        place.wrong(f"profile = {shown(profile)} is not known; {hint}")
-    return PROFILES.get(profile, Drive)
+    return PROFILES
 
 
 def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:

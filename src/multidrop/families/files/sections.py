@@ -46,6 +46,7 @@ FAMILY_KEYS = {
     "write": Key(str, 'write = "single" (function 06H) or "multiple" (10H)'),
     "registers": Key(list, 'registers = ["meter.csv"]'),
     "profile": Key(str, 'profile = "profidrive"'),
+    "extends": Key(str, 'extends = "innovert-ibd", a built-in family whose registers and verbs it has too'),
     "note": Key(str, 'note = "Further facts."'),
 }
 _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
