@@ -107,6 +107,8 @@ class InnovertIBD(Drive):
       cannot be read: `start` and `jog` are refused while it turns, and want a stop first.
     - A reset has "no action" in bits 1 and 0, which may leave a run of before the fault in force: a stop is
       sent before it, and without that no reset.
+    - A family file that extends this one may declare `run_state` (0 at rest), `output_frequency` and `fault`,
+      as siblings have them. `state`, `stop` and `start` then read these, and not the outputs.
     - No state word is documented. The state is unknown unless the outputs are programmed as in the
       example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
       Otherwise `stop` goes by current and speed.
@@ -222,16 +224,34 @@ class InnovertIBD(Drive):
         """Check that PrH.00 and PrH.02 are its own baud rate and address; these places are inferred.
 
         A drive with other values there may still be an IBD: its owner then declares confirmed = 1 in the
-        plant file.
+        plant file. A sibling with a state of its own may show that instead.
         """
-        if self.option.get("confirmed"):
+        if self.identity_is_weak or (yield from self._shows_its_line()):
             return
-        if not (yield from self._shows_its_line()):
+        if not (self._has_state and (yield from self._shows_its_state())):
             raise WriteForbidden(
                 f"{self.name} does not show its own baud rate at 02BCH and its address at 02BEH: look at its "
                 "name plate, and declare confirmed = 1 if it is an IBD",
                 advice=Advice.declare("confirmed", 1),
             )
+
+    @property
+    def identity_is_weak(self) -> bool:
+        """True if the owner has confirmed what it is, which no register then shows."""
+        return bool(self.option.get("confirmed")) and not self.declared_in
+
+    def _shows_its_state(self) -> Script[bool]:
+        """Return True if a sibling's state is one that it has, and it is commanded by the line."""
+        try:
+            state = yield from read(self.register("run_state"))
+            source = yield from read(self.frequency_source)
+            return (
+                state in (0, *SHOWN_STATES)
+                and source == FrequencySource.LINE
+                and (yield from read(self.run_source)) == IBDRunSource.LINE
+            )
+        except DriveException:
+            return False
 
     def _shows_its_line(self) -> Script[bool]:
         try:
@@ -265,7 +285,10 @@ class InnovertIBD(Drive):
     def _command(self, word: IBDControl, direction: Direction | None) -> Script[None]:
         sent = word if direction is None else IBDControl(word | self._bit(direction))
         yield from self._commanded_by_line()
-        if (yield from self._programmed()) and (yield from read(self.terminals)) & Terminals.VIRTUAL:
+        if self._has_state:
+            if fault := (yield from self._code()):
+                raise self._reset_first(self.register("fault").format(fault))
+        elif (yield from self._programmed()) and (yield from read(self.terminals)) & Terminals.VIRTUAL:
             raise self._reset_first()
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
@@ -299,13 +322,26 @@ class InnovertIBD(Drive):
         """Stop along the ramp: by the outputs, or else when neither current nor speed is shown."""
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
-        look = self._is_off if (yield from self._programmed()) else self._stands
+        look = self._stands
+        if not self._has_state and (yield from self._programmed()):
+            look = self._is_off
         yield from self._stopped(look, limit)
 
     def _is_off(self) -> Script[bool]:
         return not (yield from read(self.terminals)) & Terminals.M01
 
+    @property
+    def _has_state(self) -> bool:
+        """True for a sibling that shows its state, output frequency and fault."""
+        return {"run_state", "output_frequency", "fault"} <= self.registers.keys()
+
+    def _code(self) -> Script[int]:
+        return int((yield from read(self.register("fault"))))
+
     def _stands(self) -> Script[bool]:
+        if self._has_state:
+            at_rest = bool((yield from read(self.register("run_state"))) == 0)
+            return at_rest and bool((yield from read(self.register("output_frequency"))) == 0)
         return (yield from read(self.motor_speed)) == 0 and (yield from read(self.output_current)) == 0
 
     @verb
@@ -323,7 +359,9 @@ class InnovertIBD(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the state shown by the outputs if they are programmed for it; else unknown."""
+        """Return the state shown by `run_state`, or by the outputs if programmed for it; else unknown."""
+        if self._has_state:
+            return (yield from self._shown_state())
         terminals = yield from read(self.terminals)
         if not (yield from self._programmed()):
             return State(
@@ -334,6 +372,15 @@ class InnovertIBD(Drive):
             if terminals & bit:
                 return State(condition)
         return State(Condition.STOPPED)
+
+    def _shown_state(self) -> Script[State]:
+        if fault := (yield from self._code()):
+            return State(Condition.FAULT, fault=self.register("fault").format(fault))
+        shown = int((yield from read(self.register("run_state"))))
+        if shown == 0:
+            stands = (yield from read(self.register("output_frequency"))) == 0
+            return State(Condition.STOPPED if stands else Condition.DECELERATING)
+        return SHOWN_STATES.get(shown, State(Condition.UNKNOWN, note=f"run_state {shown} is not explained"))
 
     def _programmed(self) -> Script[bool]:
         """Check that the outputs work as in the example; their addresses are inferred, but four match."""
@@ -356,4 +403,9 @@ OUTPUTS = {  # the gravest first
     Terminals.YABC: Condition.DECELERATING,
     Terminals.M02: Condition.ACCELERATING,
     Terminals.M01: Condition.RUNNING,
+}
+
+SHOWN_STATES = {
+    1: State(Condition.RUNNING, Direction.FORWARD),
+    2: State(Condition.RUNNING, Direction.REVERSE),
 }

@@ -11,32 +11,48 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from profile_families import SHIPPED_AS, shipped
+from profile_families import COMMANDED, EXTENDED, OF_PROFILE, READ_ONLY, shipped
 from scripts import rows, typed
 from simulated_bus import SimulatedBus, one
 
 from multidrop import Bus, Plant
 from multidrop.cli import main
 from multidrop.drive import Condition, Drive, Unsupported, WriteForbidden
-from multidrop.drive.register import Access
+from multidrop.drive.register import Access, Register
 from multidrop.families import MODELS, YD1000
 from multidrop.families.profiles import PROFILES, Profile
 from multidrop.families.registry import GROUP, SHIPPED, find_model, shipped_family
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 every_family = pytest.mark.parametrize("name", SHIPPED)
-every_profile_family = pytest.mark.parametrize("name", SHIPPED_AS)
-READ_ONLY = "erman-er-g-220-03"
+every_profile_family = pytest.mark.parametrize("name", OF_PROFILE)
+every_commanded_family = pytest.mark.parametrize("name", COMMANDED)
 
-# How the places name the editions that [family].manual lists.
+# How the places name the editions and public programs that [family].manual lists.
 EDITIONS = {
     "abb-acs355": ("ACS355", "ACS550-02/U2", "ACS550-01", "ACS550 p. 209"),
     "danfoss-fc51": ("FC 51", "FC 101", "FC 202", "MG02A4", "MG02C6"),
     "delta-vfd-el": ("VFD-EL", "VFD-EL-W", "CP2000"),
-    READ_ONLY: ("2026",),
+    "delta-cp2000": ("CP2000", "C2000 Plus", "energy-management"),
+    "erman-er-g-220-03": ("2026",),
+    "erman-er-g-220-05": ("erman.py",),
+    "erman-er-g-220-02": ("wb-community",),
+    "innovert-idd-mini-plus": ("stand_drive.py",),
     "delta-ms300": ("MS300",),
     "optidrive-e3": ("ODE-3", "E3 advanced technical manual"),
+    "invt-goodrive": ("Goodrive200A", "Goodrive10", "Goodrive350", "GD100-PV"),
+    "invt-chf100a": ("CHE100", "energy-management"),
+    "fuling-dzb": ("modbus.c", "manual, sheet 5"),
+    "delixi-e": ("DelixiProtocol.h", "DelixiCDIE100.cpp", "vfd_controller.c"),
+    "powtran-pi130": ("PI130", "PI500", "MD500", "H300"),
+    "yaskawa-a1000": ("A1000", "energy-management"),
+    "yaskawa-v1000": ("A1000", "energy-management"),
+    "schneider-atv320": ("ATV312.yaml",),
+    "siemens-v20": ("V20", "S120"),
 }
+PAGE_OR_FILE = re.compile(
+    r"\bp\. (A-)?\d|sheet \d|\.(py|h|c|cpp|yaml)\b|wb-community|energy-management|H300|GD100-PV"
+)
 
 # Function codes, address on the wire, name, step, unit.
 TABLES = {
@@ -77,7 +93,7 @@ TABLES = {
 03/06 210A heatsink_temperature 1 °C
 03/06 0900 station              1
 """,
-    READ_ONLY: """
+    "erman-er-g-220-03": """
 03/06 0001 output_frequency   0.1 Hz
 03/06 0002 output_current     0.1 A
 03/06 0003 input_voltage      1 V
@@ -122,12 +138,190 @@ TABLES = {
 03/06 0017 heatsink_temperature 1 °C
 03/06 008B signature            - Signature
 """,
+    "delta-cp2000": """
+03/06 2000 control              - DeltaControl
+03/06 2001 reference            0.01 Hz
+03/06 2002 reset                - DeltaReset
+03/06 2100 fault                1
+03/06 2101 status               - DeltaStatus
+03/06 2102 reference_in_force   0.01 Hz
+03/06 2103 output_frequency     0.01 Hz
+03/06 210B output_torque        0.1 %
+03/06 2200 output_current       0.01 A
+03/06 2201 counter              1
+03/06 2202 display_frequency    0.01 Hz
+03/06 2203 dc_bus_voltage       0.1 V
+03/06 2204 output_voltage       0.1 V
+03/06 220E heatsink_temperature 0.1 °C
+03/06 0900 station              1
+""",
+    "invt-goodrive": """
+03/06 2000 control             - InvtControl
+03/06 2001 reference           0.01 Hz
+03/06 2100 status              - InvtStatus
+03/06 2101 status_2            1
+03/06 2102 fault               - Fault
+03/06 2103 device              1
+03/06 3000 output_frequency    0.01 Hz
+03/06 3001 reference_frequency 0.01 Hz
+03/06 3002 dc_bus_voltage      0.1 V
+03/06 3003 output_voltage      1 V
+03/06 3004 output_current      0.1 A
+03/06 3005 motor_speed         1 rpm
+03/06 3006 output_power        0.1 %
+03/06 3007 output_torque       0.1 %
+03/06 300A inputs              1
+03/06 300B outputs             1
+03/06 300C analog_input_1      0.01 V
+03/06 300D analog_input_2      0.01 V
+""",
+    "invt-chf100a": """
+03/06 1000 control             - InvtControl
+03/06 1001 status              - InvtStatus
+03/06 2000 reference           0.01 %
+03/06 3000 output_frequency    0.01 Hz
+03/06 3001 reference_frequency 0.01 Hz
+03/06 3002 dc_bus_voltage      0.1 V
+03/06 3003 output_voltage      1 V
+03/06 3004 output_current      0.1 A
+03/06 3005 motor_speed         1 rpm
+03/06 3006 output_power        0.01 kW
+03/06 3007 output_torque       0.1 %
+03/06 3016 device              1
+03/06 5000 fault               - Fault
+""",
+    "fuling-dzb": """
+03/06 1000 control             - InvtControl
+03/06 1001 status              - InvtStatus
+03/06 2000 reference           0.01 %
+03/06 3000 reference_frequency 0.1 Hz
+03/06 3001 output_frequency    0.1 Hz
+03/06 3002 output_current      ? A
+03/06 3003 output_voltage      ? V
+03/06 3004 motor_speed         ? rpm
+03/06 3005 output_power        ?
+03/06 3006 output_torque       ?
+03/06 3007 dc_bus_voltage      ? V
+03/06 300A inputs              1
+03/06 300B outputs             1
+03/06 5000 fault               1
+03/06 5001 communication_fault 1
+""",
+    "delixi-e": """
+03/06 A000 control             - control
+03/06 A001 reference           0.01 %
+03/06 B000 status              - InovanceStatus
+03/06 B001 fault               - Fault
+03/06 9000 output_frequency    0.01 Hz
+03/06 9001 reference_frequency 0.01 Hz
+03/06 9002 output_current      0.01 A
+03/06 9003 output_voltage      1 V
+03/06 9004 dc_bus_voltage      0.1 V
+03/06 901B reference_by_line   0.01 %
+03/06 0007 highest_frequency   0.01 Hz
+03/06 000B acceleration_time   0.1 s
+03/06 000C deceleration_time   0.1 s
+03/06 4102 station             1
+""",
+    "powtran-pi130": """
+03/06 2000 control             - InovanceControl
+03/06 1000 reference           0.01 %
+03/06 3000 status              - InovanceStatus
+03/06 8000 fault               - Fault
+03/06 1001 output_frequency    0.01 Hz
+03/06 1002 dc_bus_voltage      ? V
+03/06 1003 output_voltage      ? V
+03/06 1004 output_current      ? A
+03/06 1005 output_power        ?
+03/06 1006 output_torque       ?
+03/06 1007 motor_speed         ? rpm
+03/06 1008 inputs              1
+03/06 1009 outputs             1
+""",
+    "yaskawa-a1000": """
+03/10 0001 control            - YaskawaControl
+03/10 0002 reference          0.01 Hz
+03/10 0023 reference_in_force 0.01 Hz
+03/10 0024 output_frequency   0.01 Hz
+03/10 0025 output_voltage     0.1 V
+03/10 0026 output_current     0.1 A
+03/10 0027 output_power       0.01 kW
+03/10 0034 signature          - Signature
+03/10 0046 dc_bus_voltage     1 V
+03/10 004B status             - YaskawaStatus
+03/10 0080 fault              1
+""",
+    "schneider-atv320": """
+03/06 2135 control             - CiA402Control
+03/06 2136 reference           0.1 Hz
+03/06 0C81 status              - CiA402Status
+03/06 0C82 output_frequency    0.1 Hz
+03/06 0C83 reference_frequency 0.1 Hz
+03/06 0C84 output_current      0.1 A
+03/06 0C85 output_torque       1 %
+03/06 0C87 mains_voltage       0.1 V
+03/06 0C89 thermal_state       1 %
+03/06 0C8B output_power        1 %
+03/06 1BD1 fault               - Fault
+""",
+    "siemens-v20": """
+03/06 0063 control           - ProfidriveControl
+03/06 0064 reference         0.006103515625 %
+03/06 006D status            - ProfidriveStatus
+03/06 006E main_actual_value 0.006103515625 %
+03/06 000F base_frequency    0.01 Hz
+03/06 0017 output_frequency  0.01 Hz
+03/06 0018 motor_speed       1 rpm
+03/06 0019 output_current    0.01 A
+03/06 001A motor_torque      0.01 Nm
+03/06 001B output_power      0.01 kW
+03/06 001C energy            1 kWh
+03/06 001D dc_bus_voltage    1 V
+""",
+    "erman-er-g-220-05": """
+04/00 07D0 output_frequency 0.1 Hz
+04/00 07D1 output_current   0.1 A
+04/00 07D2 input_voltage    1 V
+04/00 07D3 temperature      1 °C
+04/00 07D4 state_word       - StateWord
+04/00 07D5 fault            - Fault
+04/00 07D6 pressure         0.01 atm
+04/00 07D7 software_version 1
+04/00 07D8 analog_input_1   1 %
+04/00 07D9 analog_input_2   1 %
+03/06 044C operating_mode     - OperatingMode
+03/06 045D start_method       - StartMethod
+03/06 045E output_y1_function - OutputY1Function
+03/06 0460 output_y2_function - OutputY2Function
+03/06 0465 power_on_state     - PowerOnState
+03/06 03E9 pressure_setpoint        0.01 kgf/cm²
+03/06 03EA proportional_coefficient 0.01
+03/06 03EB integration_time         0.01 s
+03/06 03EE pressure_sensor_limit    0.01 kgf/cm²
+03/06 044D manual_frequency         0.1 Hz
+03/06 044E upper_frequency          0.1 Hz
+03/06 044F lower_frequency          0.1 Hz
+03/06 0459 dry_run_pressure         0.01 kgf/cm²
+03/06 045A dry_run_time             1 s
+03/06 045B start_pressure_difference 0.01 kgf/cm²
+""",
+    # beside the registers of the built-in family
+    "erman-er-g-220-02": """
+03/06 0062 pressure_setpoint 0.01 bar
+04/00 001A water_pressure    0.01 bar
+""",
+    "innovert-idd-mini-plus": """
+03/06 0002 output_frequency 0.1 Hz
+03/06 001B fault            1
+03/06 001C run_state        - RunState
+""",
 }
+TABLES["yaskawa-v1000"] = TABLES["yaskawa-a1000"].replace("03/10 0034 signature          - Signature\n", "")
 
 
 def test_the_families_by_name() -> None:
     assert list(SHIPPED) == sorted(TABLES)
-    assert {*SHIPPED} == {*SHIPPED_AS, READ_ONLY}
+    assert {*SHIPPED} == {*COMMANDED, *READ_ONLY}
     assert not set(SHIPPED) & set(MODELS)
     assert all(find_model(name).model == name for name in SHIPPED)
     with pytest.raises(ValueError, match=r"no model 'abb-acs35'; did you mean abb-acs355\?"):
@@ -136,17 +330,24 @@ def test_the_families_by_name() -> None:
 
 @every_family
 def test_the_registers_are_those_of_the_manual(name: str) -> None:
-    assert rows(shipped_family(name)) == typed(TABLES[name])
+    inherited = rows(MODELS[EXTENDED[name]]) if name in EXTENDED else set()
+    assert rows(shipped_family(name)) - inherited == typed(TABLES[name])
+
+
+def own_registers(name: str) -> list[Register[Any]]:
+    family = shipped_family(name)
+    inherited = MODELS[EXTENDED[name]].registers if name in EXTENDED else {}
+    return [one for one in family.registers.values() if one.name not in inherited]
 
 
 @every_family
 def test_shipped_family_names_its_sources_and_is_marked_untested(name: str) -> None:
     family = shipped_family(name)
-    assert issubclass(family, Profile) is (name != READ_ONLY)
+    assert issubclass(family, Profile) is (name in OF_PROFILE)
     assert "not tried on hardware" in family.title
     assert "Not tried on hardware" in (family.__doc__ or "")
     assert family.line_parameters
-    if name != READ_ONLY:
+    if name in OF_PROFILE:
         assert family.watchdog != Drive.watchdog
         assert family.remote != Drive.remote
 
@@ -154,16 +355,17 @@ def test_shipped_family_names_its_sources_and_is_marked_untested(name: str) -> N
 @every_family
 def test_every_register_names_a_page_of_an_edition(name: str) -> None:
     family = shipped_family(name)
-    assert all(edition.partition(" p. ")[0] in family.manual for edition in EDITIONS[name])
-    for register in family.registers.values():
-        assert re.search(r"\bp\. \d", register.place), (register.name, register.place)
+    words = [edition.partition(" p. ")[0].partition(", sheet")[0] for edition in EDITIONS[name]]
+    assert all(word in family.manual or word in "Schneider_ATV312.yaml" for word in words)
+    for register in own_registers(name):
+        assert PAGE_OR_FILE.search(register.place), (register.name, register.place)
         assert any(edition in register.place for edition in EDITIONS[name]), (register.name, register.place)
 
 
 def test_pump_controller_is_only_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    family = shipped_family(READ_ONLY)
+    family = shipped_family("erman-er-g-220-03")
     assert {register.access for register in family.registers.values()} == {Access.READING}
     assert "confirmed" not in family.options
     bus, drive, sim = (SimulatedBus(monkeypatch, sim := simulated(family(63))), family(63), sim)
@@ -180,7 +382,7 @@ def test_pump_controller_is_only_read(
         drive.perform(drive.identify.script())
 
 
-@every_profile_family
+@every_commanded_family
 def test_no_command_is_sent_before_confirmation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     family = shipped_family(name)
     bus, drive, _ = one(monkeypatch, family(1))
@@ -200,7 +402,7 @@ def test_identification_registers_are_not_polled(name: str) -> None:
 
 
 @pytest.mark.slow
-@every_profile_family
+@every_commanded_family
 def test_a_motor_is_commanded_through_the_engine(name: str) -> None:
     drive: Any = shipped(name, 1)
     sim = simulated(shipped(name, 1))
@@ -221,17 +423,19 @@ def test_a_motor_is_commanded_through_the_engine(name: str) -> None:
 
 def test_a_plant_file_names_them(tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
+    names = [name for name in SHIPPED if 9600 in shipped_family(name).baudrates]
+    assert len(names) > len(SHIPPED) - 3
     plant.write_text(
         '[[line]]\nname = "hall"\nport = "hall"\n'
         + "".join(
             f'[[line.drive]]\nname = "d{address}"\nmodel = "{name}"\naddress = {address}\nbaudrate = 9600\n'
             f'format = "{"8N1" if "8N1" in next(iter(shipped_family(name).formats.values())) else "8N2"}"\n'
-            f"{'confirmed = 1' if name in SHIPPED_AS else ''}\n"
-            for address, name in enumerate(SHIPPED, 1)
+            f"{'confirmed = 1' if name in COMMANDED else ''}\n"
+            for address, name in enumerate(names, 1)
         )
     )
     (line,) = Plant.load(plant).lines
-    assert [type(polled.drive).model for polled in line.drives] == list(SHIPPED)
+    assert [type(polled.drive).model for polled in line.drives] == names
 
 
 def test_the_command_line_lists_and_checks_them(capsys: pytest.CaptureFixture[str]) -> None:
@@ -240,7 +444,7 @@ def test_the_command_line_lists_and_checks_them(capsys: pytest.CaptureFixture[st
     assert all(f"\n{name} " in listed for name in (*MODELS, *SHIPPED)[1:])
     for name in SHIPPED:
         assert main(["check", name]) == 0
-        assert ("is untested" in capsys.readouterr().out) is (name in SHIPPED_AS)
+        assert ("is untested" in capsys.readouterr().out) is (name in COMMANDED)
 
 
 @pytest.mark.long
@@ -365,3 +569,37 @@ def test_a_package_that_cannot_be_used_is_one_sentence(
     installed(monkeypatch, **values)
     with pytest.raises(ValueError, match=sentence):
         find_model("acme")
+
+
+# ---- what users' logs and lines show ----
+
+# A row of pjbardolia/energy-management, gateway/vfd_log.csv, as the drive's keypad shows it.
+CHF100A_LOG = {
+    "output_frequency": (3137, 31.37),
+    "dc_bus_voltage": (5564, 556.4),
+    "output_voltage": (293, 293),
+    "output_current": (70, 7.0),
+    "motor_speed": (1882, 1882),
+    "output_power": (262, 2.62),
+    "output_torque": (198, 19.8),
+}
+
+
+def test_a_log_of_a_chf100a_decodes_to_the_keypads_values() -> None:
+    family = shipped_family("invt-chf100a")
+    registers = family.registers
+    assert {name: registers[name].decode(raw) for name, (raw, _) in CHF100A_LOG.items()} == {
+        name: value for name, (_, value) in CHF100A_LOG.items()
+    }
+    assert [registers[name].address for name in CHF100A_LOG] == [0x3000, *range(0x3002, 0x3008)]
+    assert 60 * 31.37 == pytest.approx(1882, abs=0.5)
+
+
+@pytest.mark.parametrize("name", ["delixi-e", "powtran-pi130"])
+def test_stop_and_coast_are_the_other_way_round_than_in_an_invt(name: str) -> None:
+    words = shipped_family(name).register("control").values
+    assert words is not None
+    assert (int(words["COAST"]), int(words["STOP"])) == (5, 6)
+    invt = shipped_family("invt-goodrive").register("control").values
+    assert invt is not None
+    assert (int(invt["STOP"]), int(invt["COAST"])) == (5, 6)
