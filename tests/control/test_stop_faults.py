@@ -374,7 +374,7 @@ def test_a_port_name_that_is_not_text_prevents_no_stop(
 FAMILIES: dict[str, Callable[[int], Drive]] = {
     **MAKE,
     "a profile": ALL["abb-acs355"],
-    "a shipped file": ALL["shipped delta-ms300"],
+    "a shipped file": ALL["delta-ms300"],
 }
 
 

@@ -6,13 +6,14 @@ its adapter's echo, because many confirmations are, like an echo, copies of thei
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
-from multidrop.drive.script import Read, Step, Wait, carry_out
+from multidrop.drive.register import Register
+from multidrop.drive.script import Read, Script, Step, Wait, carry_out
 from multidrop.errors import (
     ANOTHER_FAMILY,
     BadReply,
@@ -27,13 +28,21 @@ from multidrop.errors import (
     WriteForbidden,
 )
 from multidrop.families import MODELS
+from multidrop.families.makes import MAKES, Evidence, Make, easily_mistaken_for, run_by
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 
 SURE = 2  # number of checks in a row that must find another family before a stop is withheld
 
 Timed = Callable[[], AbstractContextManager[None]]
-Suspicion = tuple[str, bool]  # why a drive may be of another family; whether that is certain
+
+
+class Suspicion(NamedTuple):
+    """Why a drive may be of another family; whether that is certain, and the make that it shows."""
+
+    why: str
+    is_certain: bool = False
+    make: Make | None = None
 
 
 class EchoCheck:
@@ -95,7 +104,8 @@ class IdentityCheck:
         self._exchanges = exchanges
         self._echo = echo
         self._known: dict[Drive, _Confirmed] = {}  # confirmed drives
-        self._stoppable: dict[Drive, object] = {}  # the open port on which a stop is allowed
+        self._stoppable: dict[Drive, tuple[object, set[float]]] = {}  # the open port, and the allowed words
+        self._doubted: dict[Drive, tuple[object, str]] = {}  # the open port, and why it may be another make
         self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
 
     def is_known(self, drive: Drive) -> bool:
@@ -119,6 +129,7 @@ class IdentityCheck:
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
         self._stoppable.pop(drive, None)
+        self._doubted.pop(drive, None)
         self._suspected.pop(drive, None)
 
     # ---- before a write that may move a motor ----
@@ -144,12 +155,24 @@ class IdentityCheck:
         port, silences = self._exchanges.line.queue, self._exchanges.peer(drive).silences
         try:
             carry_out(drive.identify.script(), do)
+        except WriteForbidden as refusal:
+            with timed():
+                make = self._shown(drive, _of_same_register(drive))
+            if make is None:
+                raise
+            raise WriteForbidden(f"{refusal}; {_declare(make)}", rule=refusal.rule) from refusal
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
                 f"nothing is written to {drive.name}: it refuses what every {kind} answers ({refusal})",
                 rule="it does not last like its family",
             ) from refusal
+        if drive.identity_is_weak and (rivals := easily_mistaken_for(drive)):
+            with timed():
+                make = self._shown(drive, rivals)
+            if make is not None:
+                why = f"nothing is written to {drive.name}: {_declare(make)}"
+                raise WriteForbidden(why, rule="it shows another make")
         if not self._exchanges.has_answered(drive):
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
@@ -169,38 +192,53 @@ class IdentityCheck:
 
     # ---- before a stop ----
 
-    def check_before_stop(self, drive: Drive) -> None:
-        """Check once per open port, without waits. Raises WriteForbidden only on proof of another family.
+    def check_before_stop(self, drive: Drive, register: Register[Any], count: float) -> None:
+        """Check once per open port, without waits. Raises WriteForbidden only on proof of another make.
 
         Raises CheckAgain after the first suspicion: call this again after the stops of other drives.
 
         A stop word of one family may mean run in another. But a failed check is not proof: a parameter such
         as an address or a baud rate may hold a value that is not in force yet, and a reply may belong to an
         earlier request. In such a case the stop is sent. The stop is withheld only if `identify` fails SURE
-        times in a row, every request was answered so far, and either another built-in family recognises the
-        drive, or `identify` is certain (it raised WriteForbidden with the rule ANOTHER_FAMILY).
+        times in a row, every request was answered so far, and one of these holds: another built-in family
+        recognises the drive; the drive shows a make whose motor this count would run; or `identify` is
+        certain (it raised WriteForbidden with the rule ANOTHER_FAMILY).
         """
         port = self._exchanges.line.queue
-        if self.is_known(drive) or self._stoppable.get(drive, self) is port:
+        on_port, allowed = self._stoppable.get(drive, (None, set()))
+        if self.is_known(drive) or (on_port is port and count in allowed):
             return
-        suspicion = self._suspicion(drive) if self._is_in_step(drive) else None
+        rivals = run_by(register, count)
+        suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         on, before = self._suspected.pop(drive, (port, None))
+        if suspicion is not None and suspicion.make is not None:  # which was shown SURE times
+            raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and (before is None or on is not port):
             self._suspected[drive] = port, suspicion
             raise CheckAgain
         if suspicion is not None and suspicion == before:
-            (why, is_certain), other = suspicion, self._lookalike(drive)
-            if other is not None or is_certain:
-                raise _withheld(drive, why, other)  # it is checked again before the next stop
-        self._stoppable[drive] = port
+            other = self._lookalike(drive, register, count) or self._shown(drive, rivals)
+            if other is not None or suspicion.is_certain:
+                raise _withheld(drive, suspicion.why, other)  # it is checked again before the next stop
+        if suspicion is not None:
+            self._doubted[drive] = port, suspicion.why
+        self._stoppable[drive] = port, (allowed if on_port is port else set()) | {count}
+
+    def doubt(self, drive: Drive) -> str:
+        """Return why a drive that was sent a stop may be of another family; "" if nothing suggests it."""
+        port, why = self._doubted.get(drive, (None, ""))
+        return why if port is self._exchanges.line.queue and not self.is_known(drive) else ""
 
     def _is_in_step(self, drive: Drive) -> bool:
         """Return True if a reply from the drive's address can only belong to the present request."""
         peer = self._exchanges.peer(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
-    def _suspicion(self, drive: Drive) -> Suspicion | None:
-        """Run the family's `identify` once; return None unless it suspects another family."""
+    def _suspicion(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
+        """Run the family's `identify` once; return None unless it, or evidence, suggests another family.
+
+        Evidence of `rivals` is read only if the family's identity is weak.
+        """
         port, refused = self._exchanges.line.queue, None
         silences = self._exchanges.peer(drive).silences
 
@@ -216,23 +254,52 @@ class IdentityCheck:
 
         try:
             carry_out(drive.identify.script(), do)
+            if shown := self._rival(drive, rivals):
+                return shown
             if not self._exchanges.has_answered(drive):
                 self._echo.read_any(drive, 1, insists=True)
         except (WriteForbidden, DriveException) as refusal:
             if refused and drive.is_passing(refused.code):
                 return None
-            return str(refusal), isinstance(refusal, WriteForbidden) and refusal.rule == ANOTHER_FAMILY
+            is_certain = isinstance(refusal, WriteForbidden) and refusal.rule == ANOTHER_FAMILY
+            return Suspicion(str(refusal), is_certain)
         except Exception:  # no reply, or an error in the family's own code: the stop is sent
-            return None
+            return self._rival(drive, rivals)
         if self._is_in_step(drive):
             self._know(drive, port, silences, was_heard=False)  # else it is already known
         return None
 
-    def _lookalike(self, drive: Drive) -> Drive | None:
-        """Return a drive of the built-in family that recognises this drive SURE times."""
+    def _rival(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
+        """Return the suspicion of a rival that a drive of weak identity shows."""
+        make = self._shown(drive, rivals) if drive.identity_is_weak else None
+        return None if make is None else Suspicion(_declare(make), make=make)
+
+    def _shown(self, drive: Drive, makes: Iterable[Make]) -> Make | None:
+        """Return the first of these makes that the drive shows SURE times."""
+        try:
+            probe = Evidence(
+                drive.address,
+                framing=drive.framing,
+                baudrate=drive.settings.baudrate,
+                format=drive.settings.format,
+            )
+        except ValueError:  # not Modbus
+            return None
+        for make in makes:
+            if all(self._reads_as(probe, drive, make.shows(drive)) for _ in range(SURE)):
+                return make
+            if not self._is_in_step(drive):
+                return None
+        return None
+
+    def _lookalike(self, drive: Drive, register: Register[Any], count: float) -> Drive | None:
+        """Return a drive of the built-in family that recognises this drive SURE times.
+
+        A family in which the count at this register is a stop, too, is skipped.
+        """
         settings = drive.settings
         for family in MODELS.values():
-            if isinstance(drive, family) or not family.identify_recognises:
+            if isinstance(drive, family) or not family.identify_recognises or _stops(family, register, count):
                 continue
             with suppress(ValueError):  # a drive of that family cannot be on this line
                 other = family(
@@ -245,16 +312,40 @@ class IdentityCheck:
         return None
 
     def _answers_as(self, drive: Drive, other: Drive) -> bool:
+        return self._reads_as(other, drive, other.identify.script()) is not False
+
+    def _reads_as(self, other: Drive, drive: Drive, script: Script[Any]) -> Any:
+        """Return the result of a script that reads registers of `other` from this drive; False: it failed."""
+
         def do(step: Step) -> object:
             if not isinstance(step, Read):
                 return None
             return self._exchanges.value_as(other, drive, step.register)
 
         try:
-            carry_out(other.identify.script(), do)
+            return carry_out(script, do)
         except (BusError, ValueError):
             return False
-        return True
+
+
+def _of_same_register(drive: Drive) -> list[Make]:
+    """Return the makes whose control register is at the address of this drive's."""
+    control = drive.registers.get("control")
+    return [make for make in MAKES if control is not None and make.control == control.address]
+
+
+def _stops(family: type[Drive], register: Register[Any], count: float) -> bool:
+    """Return True if a count at this register is harmless in the family, such as its own stop."""
+    control = family.registers.get("control")
+    return (
+        control is not None
+        and (control.table, control.address) == (register.table, register.address)
+        and count in (control.harmless or ())
+    )
+
+
+def _declare(make: Make) -> str:
+    return f"it answers as an {make.title} does; if it is one, declare model {make.model}"
 
 
 def _forget_setpoint(drive: Drive) -> None:
@@ -268,13 +359,14 @@ def _slept_ns() -> int:
     return int(clock.boottime_ns() - clock.now_ns())
 
 
-def _withheld(drive: Drive, why: str, other: Drive | None) -> WriteForbidden:
+def _withheld(drive: Drive, why: str, other: Drive | Make | None) -> WriteForbidden:
     way = "Use the hard-wired stop, and find out which drive has this address"
     if other is not None:
+        attach = f"{type(other).__name__}({drive.address})" if isinstance(other, Drive) else other.model
         way = (
             f"It answers as a {other.title} does. Use the hard-wired stop, or stop it as that: "
             f"`multidrop stop PORT {other.model} {drive.address}`; in a program detach {drive.name} "
-            f"first, and attach {type(other).__name__}({drive.address})"
+            f"first, and attach {attach}"
         )
     return WriteForbidden(
         f"no stop was sent to {drive.name}: at its address is another drive, as it said twice ({why}), "

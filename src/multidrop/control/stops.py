@@ -92,6 +92,8 @@ class StopAttempt:
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
+        self.doubt = ""  # why the drive may be of another family
+        self._shows_more_than_zeros = True  # of the reads since the last write
         self._begin()
 
     def _begin(self) -> None:
@@ -127,12 +129,22 @@ class StopAttempt:
                 if not is_answered:
                     self._share_line(begun, now())
         except StopIteration:
-            self.failure = None
+            self.failure = self._unproven()
             return True
         except Exception as failure:  # a user's own script may raise anything
             self.failure = failure
             return not self._goes_on(failure, now())
         return False
+
+    def _unproven(self) -> Unconfirmed | None:
+        """Return a failure if all that shows a standstill are zeros of a drive that may be another make."""
+        if not self.doubt or self._shows_more_than_zeros:
+            return None
+        reason = (
+            f"it was sent, but {self.doubt}; the registers that would show the motor at rest all read 0, "
+            "as unused registers of another make do: look at the motor"
+        )
+        return Unconfirmed(self.drive.name, "the stop", reason)
 
     def _next_step(self) -> Step:
         """Resume the script; return its next step.
@@ -187,12 +199,15 @@ class StopAttempt:
             raise
         else:
             self._note(step, None)
+            if isinstance(step, Read) and result != 0:
+                self._shows_more_than_zeros = True
             self._resume = lambda: script.send(result)
         return True
 
     def _note(self, step: Step, failure: Exception | None) -> None:
         if not isinstance(step, Write):
             return
+        self._shows_more_than_zeros = False
         if not isinstance(failure, UNSENT):
             self.times_sent += 1
             if isinstance(step, Pulse):
@@ -454,7 +469,10 @@ class Stopper:
             return self._exchanges.value(stop.drive, step.register, 1)
         assert isinstance(step, Write)
         timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
-        return self._writer.insist(stop.drive, step, timeout, stop.note_frame).value
+        try:
+            return self._writer.insist(stop.drive, step, timeout, stop.note_frame).value
+        finally:
+            stop.doubt = self._writer.identity_check.doubt(stop.drive)
 
     def insist(self, drive: Drive, step: Write) -> Outcome:
         """Write a count that stops the motor, after reopening a lost port; return the outcome."""

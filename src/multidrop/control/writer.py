@@ -87,7 +87,7 @@ class Writer:
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
-        self.identity_check.check_before_stop(drive)
+        self.identity_check.check_before_stop(drive, register, raw)
         kept = wears(drive, register)
         try:
             return self._send(drive, register, raw, None, timeout, log or self.records.log_later)

@@ -316,6 +316,11 @@ class Drive(RegisterAccess):
         return self.model or type(self).__name__
 
     @property
+    def identity_is_weak(self) -> bool:
+        """True if `identify` may pass on another make, so that `families.makes` is checked too."""
+        return False
+
+    @property
     def echo_probe(self) -> Register[Any] | None:
         """Register whose reply is never a copy of its request; None if the family has none.
 

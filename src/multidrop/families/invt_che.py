@@ -65,6 +65,7 @@ class Device(IntEnum):
 
 
 OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # what their manuals have at 3016H
+CHF = 0x02  # the high byte of 3016H in the CHF series (CHE100 manual v1.4, p. 119), whose words are the same
 
 
 class CHEFault(Worded):
@@ -283,6 +284,8 @@ class InvtCHE(Drive):
             return
         series = OTHER_SERIES.get(int(device))
         known = f", a {series}" if series else ""
+        if int(device) >> 8 == CHF:
+            known = ", a CHF100A: declare model invt-chf100a"
         raise WriteForbidden(
             f"{self.name} says that it is device {int(device):04X}H{known}; a CHE is 0101H or 0102H",
             rule=ANOTHER_FAMILY if series else "",

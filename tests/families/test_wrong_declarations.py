@@ -1,0 +1,193 @@
+"""The matrix: every family that commands a motor, declared at the address of every simulated drive."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from profile_families import COMMANDED, READ_ONLY, shipped
+from simulated_bus import SimulatedBus
+from tables import table
+
+from multidrop.drive import ANOTHER_FAMILY, Drive
+from multidrop.errors import BusError, Unconfirmed, WriteForbidden
+from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.registry import shipped_family
+from multidrop.sim import MotorDrive, simulated
+
+BUILT_IN: dict[str, Callable[[int], Drive]] = {
+    "erman-er-g-220": ErmanERG220,
+    "invt-che": lambda address: InvtCHE(address, maximum_frequency=50),
+    "innovert-ibd": InnovertIBD,
+    "delixi-modbus": DelixiModbus,
+    "yd1000": YD1000,
+}
+DECLARED = {**BUILT_IN, **{name: partial(shipped, name) for name in COMMANDED}}
+THERE: dict[str, Callable[[int], Any]] = {
+    **DECLARED,
+    **{name: shipped_family(name) for name in READ_ONLY},
+}
+# Families with the same registers and words, so that each commands the other's drives.
+SAME_WORDS = (
+    {"delta-vfd-el", "delta-ms300", "delta-cp2000"},
+    {"erman-er-g-220", "erman-er-g-220-02"},
+    {"innovert-ibd", "innovert-idd-mini-plus"},
+    {"yaskawa-a1000", "yaskawa-v1000"},
+)
+# Families with INVT's words at the same addresses: a stop is sent, and a start is refused.
+SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
+
+AT_2000 = ("invt-goodrive", "powtran-pi130")
+# Stops that would run the motor, so that they are withheld on proof. docs/reference/profiles.md lists them.
+RUNS_AT_A_STOP = {
+    **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
+    **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),
+    "powtran-pi130": (
+        *("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"),
+        *("delta-vfd-el", "delta-ms300", "delta-cp2000"),
+    ),
+}
+RECOGNISED = {"invt-che", "yd1000"}  # built-in makes: no frame of another family is sent to them
+
+
+def same_words(declared: str, there: str) -> bool:
+    return any({declared, there} <= each for each in SAME_WORDS)
+
+
+class Pair:
+    """A drive as it is declared, and the simulated drive of another make, whose motor may turn."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, declared: str, there: str, turns: bool) -> None:
+        self.sim: Any = simulated(THERE[there](1))
+        self.bus = SimulatedBus(monkeypatch, self.sim)
+        self.drive = self.bus.attach(DECLARED[declared](1))
+        if turns and isinstance(self.sim, MotorDrive):
+            self.sim.motor.target = 20.0
+            self.sim.motor.run(1)
+            self.bus.sleep(5)
+            self.sim.motor.run_to(self.bus.seconds)
+
+    @property
+    def turns(self) -> bool:
+        motor = getattr(self.sim, "motor", None)
+        return bool(motor and (motor.energised or motor.frequency))
+
+
+@pytest.mark.parametrize("declared", DECLARED)
+@table("there", THERE)
+def test_no_command_is_sent_to_another_make(
+    monkeypatch: pytest.MonkeyPatch, declared: str, there: str
+) -> None:
+    if declared == there or same_words(declared, there):
+        return
+    pair = Pair(monkeypatch, declared, there, turns=False)
+    for call in (lambda: pair.drive.set_frequency(20), pair.drive.start, pair.drive.reset_fault):
+        with pytest.raises(BusError):
+            call()
+    assert pair.bus.written == []
+    assert not pair.turns
+
+
+@pytest.mark.parametrize("turns", [False, True], ids=["at rest", "turning"])
+@pytest.mark.parametrize("declared", DECLARED)
+@table("there", THERE)
+def test_stop_never_runs_another_make_and_is_never_reported_done_while_it_turns(
+    monkeypatch: pytest.MonkeyPatch, declared: str, turns: bool, there: str
+) -> None:
+    if declared == there or same_words(declared, there):
+        return
+    pair = Pair(monkeypatch, declared, there, turns)
+    failure: BusError | None = None
+    try:
+        pair.drive.stop(seconds=1)
+    except BusError as raised:
+        failure = raised
+    is_withheld = isinstance(failure, WriteForbidden) and failure.rule == ANOTHER_FAMILY
+    assert is_withheld == (pair.bus.written == [])
+    if is_withheld:
+        assert there in RECOGNISED or there in RUNS_AT_A_STOP.get(declared, ())
+        assert (
+            f"multidrop stop PORT {there}" in str(failure)
+            or same_words(there, "delta-vfd-el")
+            or (same_words(there, "innovert-ibd"))
+        )
+    if there in RUNS_AT_A_STOP.get(declared, ()):
+        assert is_withheld or not pair.turns or turns
+    if not turns:
+        assert not pair.turns
+    if {declared, there} <= SAME_STOP:
+        assert pair.bus.written != []
+        return
+    assert failure is not None  # no standstill is reported from registers that only read 0
+
+
+@table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
+def test_documents_list_the_stops_that_are_withheld(declared: str, there: str) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "profiles.md").read_text("utf-8")
+    rows = [row.split("|") for row in page.splitlines() if re.search(r"\| 000[16]H \|", row)]
+    assert any(f"`{declared}`" in row[1] and f"`{there}`" in row[3] for row in rows)
+
+
+@pytest.mark.parametrize("declared", ["delta-vfd-el", "delta-cp2000"])
+def test_parameter_that_looks_like_the_address_does_not_hide_a_goodrive(
+    monkeypatch: pytest.MonkeyPatch, declared: str
+) -> None:
+    """0900H of a Goodrive is P09.00, the source of the PID reference, which may be 1."""
+    pair = Pair(monkeypatch, declared, "invt-goodrive", turns=False)
+    show = pair.sim.answer
+    pair.sim.answer = lambda request, now: (
+        replace_data(request, 1) if request.start == 0x0900 else show(request, now)
+    )
+    with pytest.raises(WriteForbidden, match="model invt-goodrive"):
+        pair.drive.set_frequency(20)
+    with pytest.raises(WriteForbidden, match="multidrop stop PORT invt-goodrive 1"):
+        pair.drive.stop(seconds=1)
+    assert pair.bus.written == []
+
+
+def replace_data(request: Any, value: int) -> Any:
+    return type(request)(request.address, request.function, data=value.to_bytes(2))
+
+
+def test_a_confirmed_ibd_does_not_run_a_goodrive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after a drive was replaced: its owner has confirmed the former one."""
+    sim: Any = simulated(shipped("invt-goodrive", 1))
+    bus = SimulatedBus(monkeypatch, sim)
+    drive = bus.attach(InnovertIBD(1, confirmed=1))
+    with pytest.raises(WriteForbidden, match="model invt-goodrive"):
+        drive.start()
+    with pytest.raises(WriteForbidden, match="multidrop stop PORT invt-goodrive 1"):
+        drive.stop(seconds=1)
+    assert bus.written == []
+    assert not sim.motor.energised
+
+
+def test_a_goodrive_stops_a_delta_but_does_not_coast_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """0005H stops both; 0006H, which coasts a Goodrive, would run a Delta."""
+    pair = Pair(monkeypatch, "invt-goodrive", "delta-vfd-el", turns=True)
+    with pytest.raises(WriteForbidden, match="multidrop stop PORT delta-vfd-el 1"):
+        pair.drive.coast(seconds=1)
+    assert pair.bus.written == []
+    with pytest.raises(BusError):
+        pair.drive.stop(seconds=1)
+    assert pair.bus.written != []
+
+
+def test_a_chf100a_declared_as_a_che_is_told_its_model_and_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = Pair(monkeypatch, "invt-che", "invt-chf100a", turns=True)
+    with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
+        pair.drive.start()
+    assert pair.bus.written == []
+    pair.drive.stop()
+    assert not pair.turns
+
+
+def test_an_optidrive_on_an_erman_reports_that_it_cannot_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = Pair(monkeypatch, "optidrive-e3", "erman-er-g-220", turns=True)
+    with pytest.raises(Unconfirmed, match=r"all read 0, as unused registers .*: look at the motor"):
+        pair.drive.stop()
+    assert pair.turns
