@@ -592,7 +592,7 @@ def test_a_log_of_a_chf100a_decodes_to_the_keypads_values() -> None:
         name: value for name, (_, value) in CHF100A_LOG.items()
     }
     assert [registers[name].address for name in CHF100A_LOG] == [0x3000, *range(0x3002, 0x3008)]
-    assert 60 * 31.37 == pytest.approx(1882, abs=0.5)
+    assert pytest.approx(1882, abs=0.5) == 60 * 31.37
 
 
 @pytest.mark.parametrize("name", ["delixi-e", "powtran-pi130"])
