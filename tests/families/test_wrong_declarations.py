@@ -13,10 +13,13 @@ from profile_families import COMMANDED, READ_ONLY, shipped
 from simulated_bus import SimulatedBus
 from tables import table
 
+from multidrop.core import Message
 from multidrop.drive import ANOTHER_FAMILY, Drive
-from multidrop.errors import BusError, Unconfirmed, WriteForbidden
-from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.families.registry import shipped_family
+from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, WriteForbidden
+from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.registry import RECOGNISABLE, shipped_family
+from multidrop.scan.identify import identify
+from multidrop.scan.sweep import ScanRequest, Sweep
 from multidrop.sim import MotorDrive, simulated
 
 BUILT_IN: dict[str, Callable[[int], Drive]] = {
@@ -191,3 +194,26 @@ def test_an_optidrive_on_an_erman_reports_that_it_cannot_know(monkeypatch: pytes
     with pytest.raises(Unconfirmed, match=r"all read 0, as unused registers .*: look at the motor"):
         pair.drive.stop()
     assert pair.turns
+
+
+# ---- a scan ----
+
+SCANNED = [*MODELS.values(), *map(shipped_family, RECOGNISABLE)]
+
+
+def ask(sim: Any, drive: Drive, request: Message) -> Message:
+    reply = sim.answer(request, 1000.0)
+    if reply is None:
+        raise NoReply(drive.name)
+    if reply.exception:
+        raise DriveException(drive.name, reply.exception, "")
+    return Message(reply.address, reply.function, data=reply.data)
+
+
+@table("there", [*RECOGNISABLE, "invt-che", "yd1000", "delixi-modbus"])
+def test_scan_recognises_the_drives_that_identify_themselves(there: str) -> None:
+    drive = THERE[there](1)
+    sweep = Sweep(drive.settings, drive.framing, (), ScanRequest(3, 0, 1), (1,), 0.0, 0.0)
+    found, doubt = identify(sweep, 1, SCANNED, partial(ask, simulated(drive)))
+    assert [one.model for one in found] == [there]
+    assert doubt == ""

@@ -27,7 +27,7 @@ from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import SERIAL_ADDRESSES, speaks_tcp
 from multidrop.families import MODELS
-from multidrop.families.registry import find_model
+from multidrop.families.registry import RECOGNISABLE, find_model
 from multidrop.printable import plain_whole
 from multidrop.scan import (
     ADDRESSES,
@@ -79,7 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.port = declared.port if declared else arguments.port
     rs485, settle = opening_of(arguments, declared)
     families = _families(arguments.model)
-    planned = _planned(arguments, list(families.values()))
+    # A scan for all families has the settings of the built-in ones; more would take much longer.
+    planned = _planned(arguments, list(families.values() if arguments.model else MODELS.values()))
     begun = time.monotonic()
     found, finished = _scan(arguments, rs485, settle, planned, list(families.values()))
     seconds = round(time.monotonic() - begun, 3)
@@ -122,7 +123,7 @@ def _scan(
 def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
     """Return families by their names in a plant file, with absolute paths of model files."""
     named = {}
-    for text in models or MODELS:
+    for text in models or (*MODELS, *RECOGNISABLE):
         path, colon, name = text.rpartition(":")
         whole = f"{Path(path).resolve()}:{name}" if colon and path.endswith(".py") else text
         if text.endswith(".toml"):

@@ -32,6 +32,9 @@ GROUP = "multidrop.families"  # of entry points of other packages; a built-in na
 _SHIPPED = Path(__file__).parent / "shipped"
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read on demand
 
+# Shipped families that a drive proves by more than its status, so that a scan may look for them.
+RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
+
 
 def shipped_family(name: str) -> type[Drive]:
     """Return the shipped family of this name; its `model` is the name, not the file."""
