@@ -10,18 +10,16 @@ from typing import Any
 
 import pytest
 from motors import MAKE, STARTS
-from profile_families import ALL, KIND
-from profile_families import MAKE as PROFILES
+from profile_families import ALL
 from profile_families import STARTS as PROFILE_STARTS
-from simulated_bus import SimulatedBus, is_write, one
+from simulated_bus import is_write, one
 from tables import table
 
 from multidrop.control import records
 from multidrop.control.outcome import Seen
 from multidrop.core import Message, build_reply, build_request
-from multidrop.drive import ANOTHER_FAMILY, Drive
+from multidrop.drive import Drive
 from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, Unsupported, WriteForbidden
-from multidrop.sim import simulated
 
 FAMILIES: dict[str, Callable[[int], Drive]] = {**MAKE, **ALL}
 STARTED_BY = {**STARTS, **PROFILE_STARTS}
@@ -75,7 +73,7 @@ class Cell:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, family: str, situation: str) -> None:
         self.line, self.drive, self.sim = one(monkeypatch, FAMILIES[family](1))
         self.sim.motor.acceleration_time = self.sim.motor.deceleration_time = 1.0
-        self._is_start = STARTED_BY[KIND.get(family, family)]
+        self._is_start = STARTED_BY[family]
         if situation != "fresh":
             self.drive.set_frequency(20)
         if situation == "running":
@@ -187,52 +185,3 @@ def test_outcome_of_a_verb_during_a_fault(family: str, cell: tuple[str, str, str
         assert outcome in (*expected.split("/"), "n")
         assert outcome != "n" or verb in ("jog", "coast", "reset_fault"), "only these may be missing"
         check(tried, situation, verb, fault, outcome)
-
-
-# ---- another make at the drive's address ----
-
-
-BUILT_IN = {name: make for name, make in MAKE.items() if name != NO_EXCEPTIONS}
-PAIRS = [
-    (declared, there)
-    for declared in {**BUILT_IN, **ALL}
-    for there in {**BUILT_IN, **PROFILES}
-    if KIND.get(declared, declared) != there
-]
-# Makes that are recognised by their registers, so that no frame of another family is sent to them.
-RECOGNISED = {"invt-che", "yd1000"}
-# The other make's status is invalid in the profile, and its `signature` is another one.
-RECOGNISED_BY_STATUS = {("invt-goodrive", "delta-vfd-el")}
-# Families whose stop, 0001H at 2000H, runs an INVT Goodrive, which shows no proof of its make.
-STOP_RUNS_A_GOODRIVE = {"innovert-ibd", "delixi-modbus", "delta-vfd-el"}
-
-
-@table("declared, there", PAIRS)
-def test_commands_never_reach_another_make(declared: str, there: str) -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        sim: Any = simulated(FAMILIES[there](1))
-        bus = SimulatedBus(monkeypatch, sim)
-        drive = bus.attach(FAMILIES[declared](1))
-        for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):
-            with pytest.raises(BusError):
-                call()
-        assert bus.written == []
-        assert not sim.motor.energised
-
-
-@table("declared, there", PAIRS)
-def test_stop_is_withheld_only_from_a_recognised_make(declared: str, there: str) -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        sim: Any = simulated(FAMILIES[there](1))
-        bus = SimulatedBus(monkeypatch, sim)
-        drive = bus.attach(FAMILIES[declared](1))
-        failure: BusError | None = None
-        try:
-            drive.stop(seconds=1)
-        except BusError as raised:
-            failure = raised
-        is_withheld = isinstance(failure, WriteForbidden) and failure.rule == ANOTHER_FAMILY
-        assert is_withheld == (bus.written == [])
-        kind = KIND.get(declared, declared)
-        assert not is_withheld or there in RECOGNISED or (kind, there) in RECOGNISED_BY_STATUS
-        assert sim.motor.energised == (kind in STOP_RUNS_A_GOODRIVE and there == "invt-goodrive")

@@ -380,7 +380,7 @@ def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, 
     assert ledger.wear(line.seconds) == []
     drive.write(drive.jump, 0x1388)
     assert line.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
-    with pytest.raises(WriteForbidden, match="less often"):
+    with pytest.raises(WriteForbidden, match="once in 60 s"):
         drive.write(drive.jump, 0x1389)
     assert sim.counters.eeprom_writes == {"jump": 1}
 

@@ -275,7 +275,10 @@ class IdentityCheck:
         return None if make is None else Suspicion(_declare(make), make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make]) -> Make | None:
-        """Return the first of these makes that the drive shows SURE times."""
+        """Return the first of these makes that the drive shows SURE times.
+
+        After a request without a reply, only makes that do not answer every request are still looked for.
+        """
         try:
             probe = Evidence(
                 drive.address,
@@ -285,9 +288,15 @@ class IdentityCheck:
             )
         except ValueError:  # not Modbus
             return None
+        is_silent = False
         for make in makes:
-            if all(self._reads_as(probe, drive, make.shows(drive)) for _ in range(SURE)):
-                return make
+            if is_silent and not make.may_be_silent:
+                continue
+            try:
+                if all(self._reads_as(probe, drive, make.shows(drive)) for _ in range(SURE)):
+                    return make
+            except NoReply:
+                is_silent = True
             if not self._is_in_step(drive):
                 return None
         return None
@@ -312,10 +321,16 @@ class IdentityCheck:
         return None
 
     def _answers_as(self, drive: Drive, other: Drive) -> bool:
-        return self._reads_as(other, drive, other.identify.script()) is not False
+        try:
+            return self._reads_as(other, drive, other.identify.script()) is not False
+        except NoReply:
+            return False
 
     def _reads_as(self, other: Drive, drive: Drive, script: Script[Any]) -> Any:
-        """Return the result of a script that reads registers of `other` from this drive; False: it failed."""
+        """Return the result of a script that reads registers of `other` from this drive; False: it failed.
+
+        Raises NoReply.
+        """
 
         def do(step: Step) -> object:
             if not isinstance(step, Read):
@@ -324,6 +339,8 @@ class IdentityCheck:
 
         try:
             return carry_out(script, do)
+        except NoReply:
+            raise
         except (BusError, ValueError):
             return False
 

@@ -48,6 +48,7 @@ class Make:
     control: int  # address of the holding register
     runs: Callable[[float], bool]  # whether a word there runs the motor
     evidence: tuple[tuple[Register[Any], Test], ...]
+    may_be_silent: bool = False  # whether it may not reply to requests for registers that it does not have
     copies: tuple[str, ...] = ()  # models whose registers do not distinguish them from this make
 
     def shows(self, drive: Drive) -> Script[bool]:
@@ -115,6 +116,7 @@ MAKES = (
         0x2000,
         _bit_1,
         ((Evidence.ibd_address, _own_address), (Evidence.ibd_baudrate, _ibd_baudrate)),
+        may_be_silent=True,
     ),
     Make(
         "delixi-modbus",

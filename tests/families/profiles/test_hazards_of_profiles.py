@@ -5,18 +5,14 @@ from __future__ import annotations
 from contextlib import suppress
 
 import pytest
-from examples import usually
 from profile_families import ALL, MAKE, STARTS
-from simulated_bus import SimulatedBus, is_write, one
-from tables import table
+from simulated_bus import is_write, one
 
 from multidrop.control.ramp import ramp
 from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive
-from multidrop.errors import DriveException, NoReply, NotVerified, Unconfirmed, WriteForbidden
-from multidrop.families import YD1000, InnovertIBD, InvtCHE
-from multidrop.families.profiles.invt import Invt, InvtControl
-from multidrop.sim import simulated
+from multidrop.errors import NotVerified, Unconfirmed, WriteForbidden
+from multidrop.families.profiles.invt import InvtControl
 
 FAULT = 4
 
@@ -73,49 +69,6 @@ def test_a_start_and_a_stop(line: Line) -> None:
     line.drive.start()  # the setpoint is still in force
     assert len(line.starts) == 2
     assert line.sim.motor.energised
-
-
-def test_a_start_whose_reply_is_lost_is_sent_once(line: Line) -> None:
-    line.drive.set_frequency(20)
-    line.bus.loses = line.starts_it
-    with pytest.raises(Unconfirmed, match="no reply"):
-        line.drive.start()
-    assert len(line.starts) == 1
-    assert line.sim.motor.energised  # it took effect, and the caller knows that it may have
-
-
-def test_a_start_that_never_arrives_is_sent_once(line: Line) -> None:
-    line.drive.set_frequency(20)
-    line.bus.deafens = line.starts_it
-    with pytest.raises(Unconfirmed):
-        line.drive.start()
-    assert len(line.starts) == 1
-    assert not line.sim.motor.energised
-
-
-@pytest.mark.parametrize("lost", usually(7, 1, 2, 3))
-@pytest.mark.parametrize("how", ["loses", "deafens"])
-def test_stop_is_repeated_if_its_replies_are_lost(line: Line, lost: int, how: str) -> None:
-    """It is sent until it is confirmed and the motor stands."""
-    line.runs()
-    begun = len(line.writes)
-    setattr(line.bus, how, lambda request: is_write(request) and len(line.writes) <= begun + lost)
-    line.drive.stop()
-    stops = line.writes[begun:]
-    assert len(stops) > lost
-    of_a_jog = {InvtControl.STOP_JOG} if isinstance(line.drive, Invt) else set()
-    assert stops[0].data[-1] not in of_a_jog
-    assert all(stop == stops[0] or stop.data[-1] in of_a_jog for stop in stops[: lost + 1])
-    assert not any(line.starts_it(stop) for stop in stops)
-    assert not line.sim.motor.energised
-
-
-def test_a_stop_is_sent_to_a_drive_that_never_answers(line: Line) -> None:
-    line.bus.deafens = lambda request: True
-    with pytest.raises((NoReply, Unconfirmed)):
-        line.drive.stop(seconds=3)
-    assert len(line.writes) > 3
-    assert not line.starts
 
 
 def test_a_stop_is_watched(line: Line) -> None:
@@ -238,30 +191,6 @@ def test_a_drive_in_local_control_is_not_started(model: str, monkeypatch: pytest
     with pytest.raises(WriteForbidden, match=LOCAL[model]):
         line.drive.start()
     assert line.writes[begun:] == []
-
-
-OTHERS: dict[str, Callable[[int], Drive]] = {
-    "invt-che": lambda address: InvtCHE(address, maximum_frequency=50),
-    "innovert-ibd": InnovertIBD,
-    "yd1000": YD1000,
-    **MAKE,
-}
-
-
-@table("other", OTHERS)
-def test_a_drive_of_another_make_is_not_written_to(
-    model: str, other: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if other == model:
-        return  # its own make
-    there = simulated(OTHERS[other](1))
-    bus = SimulatedBus(monkeypatch, there)
-    drive: Any = bus.attach(ALL[model](1))
-    for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
-        with pytest.raises((WriteForbidden, NoReply, DriveException)):
-            call()
-    assert bus.frames
-    assert bus.written == []
 
 
 NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
