@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from motors import MAKE, STARTS
-from profile_families import ALL
+from profile_families import MAKE as PROFILES
 from profile_families import STARTS as PROFILE_STARTS
 from simulated_bus import is_write, one
 from tables import table
@@ -21,7 +21,7 @@ from multidrop.core import Message, build_reply, build_request
 from multidrop.drive import Drive
 from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, Unsupported, WriteForbidden
 
-FAMILIES: dict[str, Callable[[int], Drive]] = {**MAKE, **ALL}
+FAMILIES: dict[str, Callable[[int], Drive]] = {**MAKE, **PROFILES}
 STARTED_BY = {**STARTS, **PROFILE_STARTS}
 NO_EXCEPTIONS = "delixi-native"  # its error replies have codes of their own: tests/families
 
