@@ -45,8 +45,8 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     - The address of a setpoint that is not stored is printed "xxH". The only one known is 0002H
       (P00.02), which wears the EEPROM: it is written on change only, so do not ramp with it.
     - Whether a run command without a direction keeps the old one is not stated: both are always
-      sent together. `start` without a direction goes forward from rest; while the motor turns it is
-      refused, because the direction cannot be read. The toggle of the direction is never sent.
+      sent together. `start` without a direction goes forward from rest. It is refused while the motor turns,
+      because the direction cannot be read. The word that toggles the direction is never sent.
     - Whether a start ends a jog, and a jog a run, is not stated: after a jog a stop is required before a
       start, and a turning motor must be stopped before a jog.
     - No fault reset is documented, and reserved bits are not tried.

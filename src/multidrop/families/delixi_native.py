@@ -58,10 +58,10 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
       other code that is not 0 is a fault.
     - "K = FOH" is F0H, "3800" bit/s is 4800, and "<80m" is 80 ms.
     - What P00.01 must be for K = 04 to be used is not stated.
-    - K = 03 may say fault or undervoltage while P05.31 is 0, and what becomes of a run command then is not
-      stated (it may wait for the mains): `start` is refused, as in any state that is not explained.
-    - The sum cannot see swapped bytes: a reply is compared field by field.
-    - A drive does not take another master's K = F0 to FF, and none is sent.
+    - K = 03 may report a fault or undervoltage while P05.31 is 0. What a run command does then is not stated
+      (it may wait for the mains): `start` is refused, as in any state that is not explained.
+    - The checksum does not detect swapped bytes: a reply is compared field by field.
+    - A drive rejects K = F0 to FF from another master, so none is sent.
 
     Less than 10 ms may pass between two characters. Only run commands (K = 02) may be broadcast.
     """

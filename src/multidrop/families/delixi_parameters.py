@@ -15,7 +15,7 @@ STOP_TIME = 60.0  # s; the parameter number of the deceleration time is not know
 
 KEYPAD = "it belongs to the line or to the command over the motor; set it on the keypad"
 
-UNIT_INFERRED = "Its unit is inferred: the manual has the name alone."
+UNIT_INFERRED = "Its unit is inferred: the manual has only the name."
 
 
 def parameter(group: int, index: int) -> int:

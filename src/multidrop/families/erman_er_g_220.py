@@ -114,7 +114,7 @@ class ErmanERG220(Drive):
     - Of the diagnostics, function 08, only the example is described, subfunction 0, and its error reply
       has the code 89H instead of 88H. `drive.send_raw(0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
       a copy of the request, as an adapter's echo is: it does not prove that a drive is there.
-    - The order of the two words at 0400H and 0402H is not stated; one of them is always 0.
+    - The order of the two words at 0400H and 0402H is not stated, but one word is always 0.
     - 0402H is the last fault. The document does not say whether a reset clears it, or whether it is still in
       force. `start` is refused until that fault has been reset by this object's `reset_fault`, or
       declared as dealt with by the option `acknowledged_fault`.
@@ -182,7 +182,7 @@ class ErmanERG220(Drive):
         ErmanStatus,
         number_format=NumberFormat.U32_EITHER,
         place="1024-1025",
-        note="The word order is not stated; all that is defined fits one word.",
+        note="The word order is not stated; all defined values fit into one word.",
     )
     last_fault = _state(
         0x0402,

@@ -99,25 +99,25 @@ class InnovertIBD(Drive):
 
     - The meaning of Prb.01 is contradictory (5 is the line in the text, the potentiometer in an
       example): it is never written. Set it to 5, and Prb.02 to 2, on the keypad.
-    - The bits for the direction are ambiguous (their order is printed the other way round than that
-      of the bits before): a direction is refused, unless the option `forward_bit` says which bit was
-      seen on site to be forward. Without a direction both bits are 0, and `start` turns the motor in
-      whatever direction is in force. The toggle of the direction is never sent.
-    - A jog is left by a stop and a new start (table 3), and whether a motor that turns does so in a jog
-      cannot be read: `start` and `jog` are refused while it turns, and want a stop first.
-    - A reset has "no action" in bits 1 and 0, which may leave a run of before the fault in force: a stop is
-      sent before it, and without that no reset.
+    - The two direction bits are ambiguous: they are printed in the opposite order to all other bits. A
+      direction is refused, unless the option `forward_bit` says which bit was seen on site to turn the motor
+      forward. Without a direction both bits are 0, and `start` turns the motor in the last direction. The
+      word that toggles the direction is never sent.
+    - A jog ends with a stop and a new start (table 3). No register shows whether a turning motor jogs:
+      `start` and `jog` are refused while it turns, and need a stop first.
+    - A reset has "no action" in bits 1 and 0, so a run from before the fault may stay in force. A reset is
+      sent only after a confirmed stop.
     - A family file that extends this one may declare `run_state` (0 at rest), `output_frequency` and `fault`,
       as siblings have them. `state`, `stop` and `start` then read these, and not the outputs.
-    - No state word is documented. The state is unknown unless the outputs are programmed as in the
-      example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
-      Otherwise `stop` goes by current and speed.
+    - No state word is documented. `state` and `stop` use the outputs if these are programmed as in the
+      example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3). Otherwise the state is unknown, and `stop`
+      uses current and speed.
     - 2000H and 2001H are marked "write": they are not read.
     - A value above a parameter's maximum is silently stored as the maximum: settings are read back.
       The setpoint's range, 0 to 400 Hz, ignores the drive's maximum frequency: declare it
       as the option `maximum_frequency`.
-    - The table of letters is lost: of A and b the digit is known from examples, of C to H it is
-      inferred, and these are read but never written.
+    - The table of letters is lost. The digits of A and b are known from examples. Those of C to H are
+      inferred: these parameters are read, but never written.
     - No register identifies an IBD: see `identify`, and the option `confirmed`.
     - The "ordinal of the register" in a reply is the byte count. At most 4 registers are read.
 
@@ -237,7 +237,7 @@ class InnovertIBD(Drive):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if the owner has confirmed what it is, which no register then shows."""
+        """True if the owner has confirmed the family, which no register shows."""
         return bool(self.option.get("confirmed")) and not self.declared_in
 
     def _shows_its_state(self) -> Script[bool]:

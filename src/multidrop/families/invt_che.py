@@ -157,10 +157,10 @@ class InvtCHE(Drive):
     - 2000H is a percentage of the maximum frequency (P0.04), so `set_frequency` needs that as the
       option `maximum_frequency`. It may be negative, which likely reverses: 0 to 100 % is written.
     - Newer INVT families have the control word at 2000H: see `identify`.
-    - Two scales are left open, because sources differ: GD200L and GD300L print the DC bus voltage (3002H)
+    - Two scales are not stated, because sources differ: GD200L and GD300L print the DC bus voltage (3002H)
       with and without a decimal; the output power (3006H) is 0.1 % in the Goodrive300L manual, and 0.01 kW
       on a CHF100A, as its owner compared it with the keypad.
-    - The example that writes 5000 to 0008H does not say what that is, and must not be repeated.
+    - The example that writes 5000 to 0008H does not say what that register is: do not repeat it.
     - STOP may not end a jog: if the motor still turns after it, or its state is unknown, STOP_JOG follows at
       once. A start may not end a jog either: after a jog a stop is required before a start. Whether a jog
       ends a run is not stated: `jog` is refused while the motor turns.

@@ -146,24 +146,24 @@ class YD1000(Drive):
 
     Where the document errs or is silent, the safest reading is taken:
 
-    - Register numbers are hex digits that are sent as they are: dEC, number 0010, is 0010H. That
-      and the units of ACC, FH and their like are from outside the document (Toshiba's relatives):
-      see `identify`, which holds 0802H against the drive's own address.
-    - The table heads have the checksum's high byte first. It is the low one, as everywhere.
-    - Other functions than 03 (one register) and 06 are spoken of, but not in the function table.
-    - 0000H in the control word does not stop: without bit 15 the panel or the terminals are in command,
-      and may say run. A stop keeps bit 15, and so does everything else.
+    - Register numbers are hex digits that are sent as they are: dEC, number 0010, is 0010H. The source of
+      this rule, and of the units of ACC, FH and similar, is not the document but Toshiba's relatives.
+      `identify` checks it: 0802H must be the drive's own address.
+    - The table heads have the checksum's high byte first. The low byte comes first, as everywhere.
+    - The text mentions other functions than 03 (one register) and 06, but the function table has only these.
+    - 0000H in the control word does not stop: without bit 15 the panel or the terminals command the drive,
+      and may run it. A stop keeps bit 15, as does every other command.
     - Bits 15 and 14 latch until they are written 0 or the power fails: until then panel and terminals have
-      no effect. `release_control` writes 0000H, only at rest, and only if no terminal says run. The panel's
-      command cannot be read: if the motor then turns, the stop is written again.
-    - Bit 14 should stay as it was, but it cannot be read reliably: every command has it set.
-      So the setpoint is 1001H from the first verb on, which is 0 Hz until set_frequency is called.
-      With the option `setpoint_by_fnod` a start has it off, as the document's 8400H and 8600H.
-    - Bits 3 to 0 are called preset speed 1 to 4, and there are seven, Sr1 to Sr7: the bits are taken for
-      the number's, 1, 2, 4 and 8, as relatives have it. With the option `preset_speed` they are
+      no effect. `release_control` writes 0000H, only at rest, and only if no terminal commands a run. The
+      panel's command cannot be read: if the motor then turns, the stop is written again.
+    - Bit 14 should keep its value, but it cannot be read reliably: every command has it set. So the setpoint
+      is 1001H after the first verb, which is 0 Hz until set_frequency is called. With the option
+      `setpoint_by_fnod` a start has it off, as the document's 8400H and 8600H.
+    - Bits 3 to 0 are called preset speed 1 to 4, but there are seven preset speeds, Sr1 to Sr7. The bits are
+      read as a number, 1, 2, 4 and 8, as in relatives. With the option `preset_speed` they are
       written without the run bit first, from rest, and the motor is started only if 1202H changes to
       that speed.
-    - How bit 7, the direct-current brake, goes with run and stop is not stated: it is never set.
+    - The effect of bit 7, the direct-current brake, during run and stop is not stated: it is never set.
     - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: relatives restart again and
       again while they are set. A reset has bit 15 and not the run bit; its reply may be cut off, and 3 s
       later the stop is written again. A restart may take bit 15 back, as power-on does (section 8.1), so

@@ -53,9 +53,9 @@ class DanfossFC(Profile):
 
     - Bit 6 acts by its level: a drive that is reset while it holds the bit starts at once. So a stop is
       confirmed before a reset, and no word has both.
-    - A locked trip is left only by taking the mains away (VT2800 guide, p. 115): the reset is refused.
+    - A locked trip ends only when the mains are switched off (VT2800 guide, p. 115): the reset is refused.
     - The status shows no direction. A start without one goes forward from rest, and is refused while the
-      motor turns. Bit 15 counts only where 8-54 lets the line reverse.
+      motor turns. Bit 15 counts only if 8-54 lets the line reverse.
     - Jog (bit 8), the preset references, the relays and the set-ups are not sent.
     """
 

@@ -62,7 +62,7 @@ class Delta(Profile):
 
     - `fault` is needed: the status shows no fault. Its low byte counts; the high byte of newer drives is a
       warning.
-    - The direction is sent with every run, and the toggle of both bits never.
+    - The direction is sent with every run. The word that toggles it is never sent.
     - 2002H holds its bits. It is written 2 once and 0 again, or a later fault would reset itself. Bit 2, the
       base block, lets the motor continue when it is cleared: a stop comes before.
     - Bit 10 of the status says that the drive takes its commands from the line; a start needs it.

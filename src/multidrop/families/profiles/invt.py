@@ -137,7 +137,7 @@ class Invt(Profile):
         yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
-        """Do nothing: the drive acts on a word once, so the reset need not be cleared."""
+        """Leave the reset in the control register: the drive acts on a word once."""
         yield from ()
 
 
@@ -155,7 +155,7 @@ class InovanceControl(IntEnum):
 
 
 class InovanceStatus(IntEnum):
-    """3000H: Powtran PI130 manual p. 122. A Delixi E's 0, "none" (B000H), is not used: it proves nothing."""
+    """3000H: Powtran PI130 manual p. 122. A Delixi E also has 0, "none" (B000H), which is not accepted."""
 
     FORWARD = 1
     REVERSE = 2
@@ -165,9 +165,8 @@ class InovanceStatus(IntEnum):
 class Inovance(Invt):
     """The words of Inovance MD, Powtran PI and their copies: 5 coasts, 6 stops along the ramp.
 
-    - `fault` is needed: the status does not show a fault. A fault is any value but 0.
-    - The status has three numbers, 1 forward, 2 reverse and 3 stopped; a drive that shows another one is not
-      known, and is never taken for stopped.
+    - `fault` is needed: the status does not show a fault. Any value except 0 is a fault.
+    - The status is 1 forward, 2 reverse or 3 stopped. With any other number the state is unknown.
     - A family may give its own numbers in `control`, as in the profile `invt`. A word that it leaves out is
       never sent.
     """

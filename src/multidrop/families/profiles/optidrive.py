@@ -13,7 +13,7 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class OptidriveControl(IntFlag):
-    """Register 1: ODE-3 user guide 1.00, p. 33. The Optidrive Plus has bits 1 and 2 the other way round."""
+    """Register 1: ODE-3 user guide 1.00, p. 33. The Optidrive Plus has bits 1 and 2 exchanged."""
 
     RUN = 1 << 0
     RESET = 1 << 2
@@ -48,13 +48,12 @@ STOP, COAST, RESET, START = 0x0000, 0x0008, 0x0004, 0x0001
 class Optidrive(Profile):
     """Invertek's control word of the Optidrive E3: bit 0 runs while it is 1, bit 2 resets, bit 3 coasts.
 
-    - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp: the same word means another
-      thing on another drive of this maker. Bit 1 is never sent.
-    - The first guide (1.00) prints register 6 with the code in its low and the state in its high byte, the
-      later ones as it is used here. A start needs bit 6, ready, which the first reading never shows, and no
-      drive counts as stopped while its output frequency is not 0: a drive of the first reading is refused.
-    - No guide says whether the reset acts by its edge: the bit is taken back, and a stop comes before.
-    - No bit is a direction: the setpoint's sign would be one, and is not written below 0.
+    - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp. Bit 1 is never sent.
+    - The first guide (1.00) prints the two bytes of register 6 in the opposite order to later guides. A start
+      needs bit 6, ready, which such a drive never shows. A drive counts as stopped only if its output
+      frequency is 0.
+    - No guide says whether the reset acts by its edge. So a stop is sent before it, and the bit is cleared.
+    - The direction is the sign of the setpoint. No negative setpoint is written.
     """
 
     stop_word: ClassVar[int] = STOP

@@ -57,16 +57,15 @@ SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # neither enables operation: no motor tu
 class Profidrive(Profile):
     """PROFIdrive's state machine: OFF1 is the stop, OFF2 coasts, bit 7 resets on its rising edge.
 
-    A start goes the way of the ACS550's manual (p. 246): 0476H until the drive is ready to be switched on,
-    100 ms, 0477H until it is ready to operate, 047FH. The last two are sent once each. While OFF2 or OFF3 is
-    active from elsewhere, while a trip or the power-up inhibits switching on, and in local control a start is
-    refused.
+    A start follows the ACS550's manual (p. 246): 0476H until the drive is ready to be switched on, 100 ms,
+    0477H until it is ready to operate, 047FH. The last two are sent once each. A start is refused in local
+    control, and while OFF2 or OFF3 is active from elsewhere, or a trip or the power-up inhibits switching on.
 
     - The stop is 047EH, OFF1 alone: bit 3, which the manual's first word lacks too, would let the motor
       coast if it carries the run enable (ACS550, 1601 = COMM).
     - The direction is the sign of the reference, or a bit that each make has elsewhere (SINAMICS has bit 11;
       on an ABB this bit selects EXT2). References are written from 0 up, and a start names no direction.
-    - A jog is each make's own, and is not sent.
+    - Each make has its own jog, so none is sent.
     """
 
     stop_word: ClassVar[int] = STOP
