@@ -88,7 +88,7 @@ LISTENED = (
 class Attempt(NamedTuple):
     user: str
     deed: str  # "publish" or "subscribe"
-    subject: str  # {name} stands for the inbox of that user
+    subject: str  # {name}: the inbox of that user
 
 
 def attempts() -> Iterator[Attempt]:

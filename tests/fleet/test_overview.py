@@ -43,7 +43,7 @@ def lease(session: int, *, ended: bool = False) -> dict[str, Any]:
 
 
 def view(answers: dict[str, Any] | None = None) -> FleetView:
-    """Return a view of five lines and three gateways, one of which, gw-3, has ended."""
+    """Return a view of five lines and three gateways; gw-3 has ended."""
     made = FleetView(Answering(answers or {}))  # type: ignore[arg-type]
     records, leases = made._records, [MemoryBucket(name) for name in names.LEASES]
     for follower, bucket in zip(records.observer.paths, leases, strict=True):

@@ -115,7 +115,7 @@ def test_an_invalid_answer_of_the_stream_is_a_stream_error(name: str) -> None:
 def test_invalid_cluster_states_are_reported_and_move_no_leader(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A gateway reads them in its tasks, none of which may end."""
+    """A gateway's tasks read them and must not end."""
     monkeypatch.setattr(setup, "WAIT_S", 0.0)  # for the end of an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(FleetError, match="the answer of NATS about a bucket's servers is invalid"):

@@ -50,7 +50,7 @@ def setpoints(desk: Desks) -> list[int]:
 
 def test_a_command_is_offered_then_done_and_logged_before_and_after(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
-    assert desk.writes == []  # an offer sends nothing
+    assert desk.writes == []
     answer = asyncio.run(desk.do(token))
     assert answer.outcome is DONE
     assert answer.held == "20.00 Hz"
@@ -211,7 +211,7 @@ def test_only_the_master_answers(desk: Desks) -> None:
 
 
 def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
-    """In its first second a new master lets nothing else pass, and the motor must stop in it too."""
+    """A new master accepts only stops in its first second."""
     desk.is_guarded = True
     assert desk.ask(register=SETPOINT, value=20.0) is None
     stopped = asyncio.run(desk.stop())
@@ -551,7 +551,7 @@ def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     with desks(tmp_path) as desk:
         answers = asyncio.run(stopped(desk))
     assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
-    assert repeated == [None, 0.0, 0.0]  # the second of these for seven that waited for the first one's reply
+    assert repeated == [None, 0.0, 0.0]  # the last stop serves seven callers
 
 
 def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:

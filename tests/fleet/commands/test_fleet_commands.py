@@ -106,12 +106,12 @@ def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
 
 NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
 NO_RIGHT = MayNotSend("no right")
-ANY = FleetError("no right")  # which does not say that nobody was asked
+ANY = FleetError("no right")  # the request may have been delivered
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
 
 WRITES: dict[
     str, tuple[ScriptedPath, CommandOutcome, int]
-] = {  # what is answered, what is told, how often it is sent
+] = {  # path, expected outcome, number of confirmations
     "done": (ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE]), DONE, 1),
     "no master": (ScriptedPath(cmd=[NOBODY]), NOT_SENT, 0),
     "no connection": (ScriptedPath(cmd=[CUT]), NOT_SENT, 0),

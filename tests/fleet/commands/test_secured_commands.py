@@ -38,7 +38,7 @@ def servers(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SecuredC
 
 @asynccontextmanager
 async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[CommandSubjects]:
-    """Take commands as a gateway of these rights."""
+    """Accept commands with the rights of a gateway."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
     await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
@@ -90,7 +90,7 @@ async def nobody_is_asked(asker: Client) -> bool:
 
 
 def test_servers_report_a_line_without_gateway(servers: SecuredCluster, tmp_path: Path) -> None:
-    """That nobody was asked is certain, though asker and gateway have accounts of their own."""
+    """Servers report it across the accounts of commander and gateway."""
 
     async def main(made: Desks) -> None:
         async with commanded(servers, made) as subjects:

@@ -192,7 +192,7 @@ async def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
 
 
 async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> None:
-    """Else the next gateway would wait until the lease has run out, though this one left in order."""
+    """Otherwise the next gateway would wait for the lease to expire."""
     trial, lease = await begun()
     for bucket, value in zip(trial.buckets, trial.values(), strict=True):
         bucket.store("a", value)
@@ -211,7 +211,7 @@ async def test_an_end_replaces_only_renewals_of_its_own_session(later: dict[str,
 
 
 async def test_unanswered_renewals_at_the_end_start_no_session() -> None:
-    """Else the engine might send again, and the kernel's timer would run for a gateway without a session."""
+    """Otherwise the engine might send again, and the kernel's timer would run without a session."""
     trial = Trial()
     gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
     trial.buckets = [*gates]
@@ -324,7 +324,7 @@ async def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
 
 
 async def test_a_single_free_path_is_not_taken() -> None:
-    """Else a gateway that waits would take the paths of another one of its name one after the other."""
+    """Otherwise a waiting namesake would take the paths one after the other."""
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     assert await first.try_to_begin()
@@ -501,7 +501,7 @@ async def test_only_the_stale_revision_is_ended() -> None:
 
 
 async def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
-    """Some records are read while others are asked for; a gateway may be judged in between."""
+    """A gateway may be judged between the reads of two paths."""
     trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
@@ -514,7 +514,7 @@ async def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
 
 
 async def test_no_gateway_ends_itself() -> None:
-    """Such an end would count for all others at once."""
+    """Its own end would count at once for all others."""
     trial = Trial()
     lease, observer = trial.lease("b"), trial.observer("b")
     assert await lease.try_to_begin()
@@ -526,7 +526,7 @@ async def test_no_gateway_ends_itself() -> None:
 
 
 async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
-    """Else all gateways would end each other when servers that were away come back."""
+    """Otherwise all gateways would end each other after an outage of the servers."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
     observer.restart_waits()
@@ -540,7 +540,7 @@ async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
 
 
 async def test_an_ended_session_stays_ended_after_a_cut() -> None:
-    """Else it counts a dead gateway among the living for a while, and gives lines away to it."""
+    """Otherwise lines would be assigned to a dead gateway for a while."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
@@ -627,7 +627,7 @@ async def test_without_answers_no_gateway_counts_as_dead() -> None:
 
 
 async def test_an_end_by_another_counts_once_the_lease_has_expired() -> None:
-    """Its writer may be hasty, wrong, or worse: until then the ended one may still send."""
+    """Its writer may be wrong: until then the ended gateway may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
     assert await lease.try_to_begin()

@@ -92,7 +92,7 @@ class Gateways:
         return member
 
     async def die(self, name: str) -> None:
-        """End the gateway as SIGKILL does: it sends no more bytes, and its sockets are closed."""
+        """End the gateway as SIGKILL does: its sockets are closed without further bytes."""
         member, task = self.members.pop(name), self.tasks.pop(name)
         member._leave = _do_nothing  # type: ignore[method-assign]
         task.cancel()
@@ -148,7 +148,7 @@ async def gateways(cluster: Cluster, *members: str, terms: Terms = USUAL) -> Asy
 
 @asynccontextmanager
 async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Lease]:
-    """Yield the lease of a gateway that says by other rules whose a line is."""
+    """Yield the lease of a gateway with an incompatible protocol."""
     paths = paths_of(cluster.urls)
     await open_all(paths)
     buckets = [
@@ -350,7 +350,7 @@ async def test_a_dead_node_moves_no_line(fleet: Cluster) -> None:
 async def test_weak_sessions_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else it would fall silent with the next server that dies."""
+    """Otherwise the next dead server would end them."""
     monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:

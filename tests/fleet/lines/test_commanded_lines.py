@@ -116,7 +116,7 @@ async def test_a_stop_is_answered_only_to_an_inbox(desk: Desks) -> None:
 async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, may_wait: bool
 ) -> None:
-    """The requester gets the result, before the end of the line can cut the answer off."""
+    """The sender gets the result before the line is closed."""
     begun, go_on = threading.Event(), threading.Event()
 
     monkeypatch.setattr(command_desk, "AWAITED_S", PATIENCE_S)
@@ -143,7 +143,7 @@ async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
     for _ in range(10):
         await asyncio.sleep(0.002)
     assert lines.is_going is not may_wait
-    assert (await desk.do(second)).outcome is CommandOutcome.NOT_SENT  # nothing starts now
+    assert (await desk.do(second)).outcome is CommandOutcome.NOT_SENT
     go_on.set()
     assert (await doing).outcome is CommandOutcome.DONE
     await going

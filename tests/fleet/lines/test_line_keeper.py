@@ -358,7 +358,7 @@ async def test_a_lost_race_ends_the_claim() -> None:
 
 
 async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would be opened between the two records that give it away, and be another's in the next moment."""
+    """Otherwise it would be opened between the writes of its release."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -461,7 +461,7 @@ async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCa
 
 
 class BrokenLines(RecordingLines):
-    """Lines whose port cannot be opened, for this reason; "" opens them."""
+    """Lines whose ports cannot be opened; `why` is the reason, "" opens them."""
 
     why = "nothing listens there"
 

@@ -6,7 +6,7 @@ from multidrop.fleet.lines.moves import Move, Moves, move_of
 
 
 def told(*moves: Move) -> list[tuple[str | None, str]]:
-    """Return the shown moves of these, in any order."""
+    """Return the moves that are shown after these reports."""
     found = Moves()
     found.add(moves)
     return [(move.before, move.after) for move in found.newest(100)]

@@ -313,7 +313,7 @@ def commit_of(
 
 
 def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The order of system calls decides what a power cut leaves."""
+    """Otherwise a power cut could leave an incomplete file."""
     calls: list[str] = []
     really_synced, really_renamed = os.fsync, Path.rename
 
@@ -439,7 +439,7 @@ def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Post
 
 @pytest.mark.slow
 def test_rows_after_a_moved_position_are_refused(empty: Postgres) -> None:
-    """Behind a pooler several may have the same lock."""
+    """Several hubs may share one lock behind a connection pooler."""
     sink = PostgresSink(empty.where)
     sink.begin("then")
     empty.ask("update multidrop.hub set place = 7 returning place")

@@ -155,8 +155,7 @@ async def test_after_any_doubt_each_message_is_there_once(
 
 
 async def test_server_answers_within_a_log_are_skipped(running: Cluster, tmp_path: Path) -> None:
-    """Whoever asks a server anything may have its answer sent there: nothing is sent again, and nothing kept
-    back."""
+    """Any client may direct a server's answer to this subject; messages are sent once as usual."""
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]

@@ -180,7 +180,7 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
     ],
 )
 def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, said: str) -> None:
-    """A hub that could not keep one message would never come to those behind it, of all gateways."""
+    """Such a message would block all later messages of all gateways."""
     with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
 
@@ -275,7 +275,7 @@ def test_rows_without_bytes_are_limited_too(most_allocated: Callable[[], int]) -
 
 
 def test_an_older_format_version_is_rejected() -> None:
-    """It has another way to say that buffers are compressed."""
+    """It marks compressed buffers differently."""
     options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
     with pytest.raises(MessageError, match="another version of the format"):
         unpack(written(options))
@@ -303,7 +303,7 @@ def test_the_size_equals_the_buffers_that_pyarrow_unpacks(options: pa.ipc.IpcWri
 
 
 def test_a_message_is_split_before_it_is_too_large_to_be_unpacked() -> None:
-    """Long names of many drives take much more room than they are sent with."""
+    """Long names of many drives compress well."""
     drives = Names([f"{number:0900d}" for number in range(6000)])
     columns = Columns(6000)
     for number in range(6000):

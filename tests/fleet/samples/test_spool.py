@@ -165,7 +165,7 @@ def _is_whole(data: bytes) -> bool:
 
 
 def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The order of system calls decides what a power cut leaves."""
+    """Otherwise a power cut could leave an incomplete file."""
     calls: list[str] = []
     names: dict[int, str] = {}
     really: dict[str, Any] = {name: getattr(os, name) for name in ("open", "write", "fsync", "rename")}

@@ -32,7 +32,7 @@ STREAMS = ("KV_plant", "KV_lease_0", "KV_own_0", STREAM)
 
 
 def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
-    """Return a user's reply subjects, each of which contains the user's name."""
+    """Return reply subjects, all with the user's name."""
     return [
         *(f"$KV.plant.{user}", f"$KV.lease_0.{user}.gw-b", f"$KV.own_0.{user}", f"{STREAM}.gw-b.{user}"),
         *(f"stop.{user}", f"cmd.{user}", f"do.gw-b.{user}", f"gateway.gw-b.{user}"),
@@ -80,7 +80,7 @@ def all_inboxes(servers: SecuredCluster) -> dict[str, str]:
 
 
 def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
-    """Return the reply subjects of each user, none of which it may publish to."""
+    """Return each user's forbidden reply subjects."""
     rights, inboxes = rights_of(GATEWAYS), all_inboxes(servers)
     return {
         user: [

@@ -1,4 +1,4 @@
-"""Direct gets: which servers are asked when, and which answer counts, in simulated time."""
+"""Direct gets in simulated time: the order of requests, and the answer that counts."""
 
 from __future__ import annotations
 

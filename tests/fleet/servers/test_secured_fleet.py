@@ -137,7 +137,7 @@ def test_a_missing_right_is_one_sentence(
 def test_a_stored_message_directed_into_anothers_samples_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Servers with an account for all send what is asked for wherever its asker says, with its headers."""
+    """Servers with one account for all users send stored messages to any subject that a client names."""
 
     async def main(servers: SecuredCluster) -> None:
         made = multidrop(servers, "operator", "fleet", "init")
@@ -234,7 +234,7 @@ def test_mistaken_credentials_are_one_sentence(
 @pytest.mark.long
 @pytest.mark.slow
 def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredCluster, tmp_path: Path) -> None:
-    """Else whoever is between could read on, and pass our answer to the server's question on as his own."""
+    """Otherwise a man in the middle could read and relay the login."""
     with cluster(tmp_path / "plain", 1) as plain:
         url = plain.urls[0].replace("nats://", "tls://")
         key, ca = str(servers.key("viewer")), str(servers.tls.ca)

@@ -1,4 +1,4 @@
-"""`fleet init` on real servers: what it creates and refuses."""
+"""`fleet init` on real servers: created buckets, and refusals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
     made = asyncio.run(_init(nats.urls))
     assert made["replicas"] == 3
     assert set(made["servers"]) == {"n1", "n2", "n3"}
-    assert asyncio.run(_init(nats.urls)) == made  # a second run changes nothing
+    assert asyncio.run(_init(nats.urls)) == made  # a second run keeps all
 
 
 @pytest.mark.slow
