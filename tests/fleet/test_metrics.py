@@ -14,14 +14,7 @@ from peers import require_module, require_program
 from tables import table
 
 from multidrop.exposition import expose_metrics
-from multidrop.fleet.metrics import (
-    MOST_CLIENTS,
-    MOST_HEAD,
-    answer,
-    families_of,
-    listen,
-    serving,
-)
+from multidrop.fleet.metrics import MOST_CLIENTS, MOST_HEAD, answer, families_of, listen, serving
 
 OPEN = "application/openmetrics-text"
 STATE: dict[str, Any] = {
@@ -167,7 +160,7 @@ def test_a_port_in_use_is_one_sentence() -> None:
             listen(f"127.0.0.1:{port}")
 
 
-async def test_a_silent_namesake_does_not_block_forever() -> None:
+async def test_silent_clients_are_limited_and_do_not_delay_the_end() -> None:
     """Clients above the limit, or with too much data, are dropped at once; none delays the end."""
 
     async def ask(port: int, data: bytes) -> bytes:

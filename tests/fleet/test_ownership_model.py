@@ -10,14 +10,7 @@ from typing import NamedTuple
 import pytest
 from tables import table
 
-from multidrop.fleet.lines.ownership import (
-    NEEDED,
-    NOBODY,
-    LineRecords,
-    Owner,
-    claim_of,
-    owner_value,
-)
+from multidrop.fleet.lines.ownership import NEEDED, NOBODY, LineRecords, Owner, claim_of, owner_value
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 BUCKETS = 3

@@ -14,10 +14,7 @@ from lines import until
 from nats_clusters import Cluster, free_ports
 
 from multidrop import PlantError
-from multidrop.fleet.overview import (
-    FleetView,
-    FleetWatch,
-)
+from multidrop.fleet.overview import FleetView, FleetWatch
 from multidrop.fleet.page_part import FleetPart
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.gateway.settings import read_settings

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -11,11 +10,8 @@ import pytest
 
 from multidrop.fleet.errors import FleetError, Unsure
 from multidrop.fleet.samples import samples_stream
-from multidrop.fleet.servers import (
-    names,
-    setup,
-)
-from multidrop.fleet.servers.buckets import Bucket, Record, ask
+from multidrop.fleet.servers import names, setup
+from multidrop.fleet.servers.buckets import Bucket, Record
 from multidrop.fleet.servers.leaders import Cluster, known_cluster, led_clusters
 from multidrop.fleet.servers.setup import check_buckets
 
@@ -75,58 +71,40 @@ class Liar:
         return [self.answer for _ in requests]
 
 
-def bucket_of(answer: bytes) -> Bucket:
-    return Bucket("own_0", lambda: Liar(answer))  # type: ignore[arg-type,return-value]
-
-
 @pytest.mark.parametrize("name", [*STRANGE, *PARTS])
-def test_an_invalid_answer_to_a_write_leaves_its_outcome_unknown(name: str) -> None:
-    bucket = bucket_of({**STRANGE, **PARTS}[name])
-    with pytest.raises(Unsure, match="the answer of NATS "):
-        asyncio.run(bucket.put("a", {}, 1))
-    assert asyncio.run(bucket.put_all([Record("a", 1, {})])) == ([], set())
-
-
-@pytest.mark.parametrize("name", [*STRANGE, *PARTS])
-def test_an_invalid_record_is_not_read(name: str) -> None:
-    with pytest.raises(Unsure, match="the answer of NATS "):
-        asyncio.run(bucket_of({**STRANGE, **PARTS}[name]).get("a"))
-
-
-@pytest.mark.parametrize("name", STRANGE)
-def test_an_invalid_answer_about_a_stream_is_reported(name: str) -> None:
-    with pytest.raises(FleetError, match="the answer of NATS is not one of JetStream"):
-        asyncio.run(ask(Liar(STRANGE[name]), "STREAM.INFO.KV_own_0"))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("name", [*STRANGE, *PARTS])
-def test_an_invalid_answer_of_the_stream_is_a_stream_error(name: str) -> None:
-    """Forwarder and hub try again after a FleetError, and end by any other."""
-    client: Any = Liar({**STRANGE, **PARTS}[name])
-    with pytest.raises(FleetError, match="the answer of NATS "):
-        asyncio.run(samples_stream.about(client))
-    with pytest.raises(FleetError, match="the answer of NATS "):
-        asyncio.run(samples_stream.last_of(client, "samples.gw.log"))
-    with pytest.raises(FleetError, match="the answer of NATS "):
-        asyncio.run(samples_stream.publish(client, "samples.gw.log", b"", {}))
+async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: str) -> None:
+    """Gateway, forwarder and hub retry after a FleetError, and end by any other."""
+    path: Any = Liar({**STRANGE, **PARTS}[name])
+    bucket = Bucket("own_0", lambda: path)
+    for request in (bucket.put("a", {}, 1), bucket.get("a")):
+        with pytest.raises(Unsure, match="the answer of NATS "):
+            await request
+    assert await bucket.put_all([Record("a", 1, {})]) == ([], set())
+    for request in (
+        samples_stream.about(path),
+        samples_stream.last_of(path, "samples.gw.log"),
+        samples_stream.publish(path, "samples.gw.log", b"", {}),
+    ):
+        with pytest.raises(FleetError, match="the answer of NATS "):
+            await request
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-def test_invalid_cluster_states_are_reported_and_move_no_leader(
+async def test_invalid_cluster_states_are_reported_and_move_no_leader(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gateway's tasks read them and must not end."""
     monkeypatch.setattr(setup, "WAIT_S", 0.0)  # for the end of an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(FleetError, match="the answer of NATS about a bucket's servers is invalid"):
-        asyncio.run(check_buckets(path))
-    assert asyncio.run(known_cluster(path, names.OWNERS[0])) == Cluster()
-    assert asyncio.run(led_clusters(path)) == {}
+        await check_buckets(path)
+    assert await known_cluster(path, names.OWNERS[0]) == Cluster()
+    assert await led_clusters(path) == {}
     assert {subject.split(".KV_")[0] for subject in path.asked} == {"$JS.API.STREAM.INFO"}
 
 
 @pytest.mark.parametrize("name", TIMES)
-def test_an_invalid_server_time_is_reported(name: str) -> None:
+async def test_an_invalid_server_time_is_reported(name: str) -> None:
     path: Any = Liar(TIMES[name])
     with pytest.raises(Unsure, match="the answer of nats://liar about a bucket has no time"):
-        asyncio.run(check_buckets(path))
+        await check_buckets(path)

@@ -35,7 +35,7 @@ async def test_a_task_is_cancelled_until_it_is_over() -> None:
     assert await end_tasks() == []
 
 
-async def test_an_ended_session_stays_ended() -> None:
+async def test_the_error_of_an_ended_task_is_returned() -> None:
     async def failing() -> None:
         raise OSError("the disk is full")
 

@@ -19,17 +19,10 @@ from multidrop.fleet.leases import member as member_module
 from multidrop.fleet.leases.lease import Lease, boottime_ns
 from multidrop.fleet.leases.member import Member, MemberState
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
-from multidrop.fleet.lines import (
-    line_keeper,
-    releases,
-    unopened_lines,
-)
+from multidrop.fleet.lines import line_keeper, releases, unopened_lines
 from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.buckets import (
-    Bucket,
-    LeaseBucket,
-)
+from multidrop.fleet.servers.buckets import Bucket, LeaseBucket
 from multidrop.fleet.servers.connections import paths_of
 from multidrop.fleet.servers.leaders import Cluster as Servers
 from multidrop.fleet.servers.leaders import Replica

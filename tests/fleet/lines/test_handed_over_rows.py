@@ -10,15 +10,7 @@ from pathlib import Path
 
 import pytest
 from lines import until
-from numbered_answers import (
-    PORT,
-    Answers,
-    KeptRow,
-    NumberedDrive,
-    drive_name,
-    judge_drive,
-    plant_file,
-)
+from numbered_answers import PORT, Answers, KeptRow, NumberedDrive, drive_name, judge_drive, plant_file
 from tables import table
 
 from multidrop.core import UNASKED, Mastership

@@ -13,10 +13,7 @@ from fleets import GatedBucket, Hall, HandClock, MemoryBucket, RecordingLines, R
 
 from multidrop.fleet.leases.lease import Lease
 from multidrop.fleet.leases.rules import SECOND, USUAL
-from multidrop.fleet.lines import (
-    line_keeper,
-    owner_records,
-)
+from multidrop.fleet.lines import line_keeper, owner_records
 from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss
 from multidrop.fleet.lines.ownership import owner_of, owner_value
 from multidrop.fleet.lines.records import ShareRecords

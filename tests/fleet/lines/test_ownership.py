@@ -9,15 +9,7 @@ from collections import Counter
 import pytest
 from tables import table
 
-from multidrop.fleet.lines.ownership import (
-    NEEDED,
-    Claim,
-    Step,
-    claim_of,
-    decide,
-    owner_by,
-    owner_value,
-)
+from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
 from multidrop.fleet.lines.shares import assign
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record

@@ -14,10 +14,7 @@ from multidrop.fleet.leases.rules import USUAL
 from multidrop.fleet.lines import records as line_records
 from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value
 from multidrop.fleet.lines.records import ShareFollower, ShareRecords
-from multidrop.fleet.servers import (
-    buckets,
-    names,
-)
+from multidrop.fleet.servers import buckets, names
 from multidrop.fleet.servers.buckets import Bucket, Record
 
 ME, OTHER, NOBODY = (owner_value(who, 1, 0) for who in (("a", 2), ("b", 1), ("", 0)))

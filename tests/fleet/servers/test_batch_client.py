@@ -12,10 +12,7 @@ from nats_clusters import Cluster, connected_path
 from tables import table
 
 from multidrop.fleet.errors import Unsure
-from multidrop.fleet.servers import (
-    batch_client,
-    direct_gets,
-)
+from multidrop.fleet.servers import batch_client, direct_gets
 from multidrop.fleet.servers.batch_client import (
     BatchClient,
     DirectGet,

@@ -10,10 +10,7 @@ import pytest
 from controlled_loop import run_controlled
 
 from multidrop.fleet.errors import Unsure
-from multidrop.fleet.servers import (
-    leaders,
-    names,
-)
+from multidrop.fleet.servers import leaders, names
 from multidrop.fleet.servers.leaders import (
     HAND_OVER_S,
     SILENT_FOR_S,
