@@ -52,8 +52,7 @@ async def test_a_waiting_namesake_answers_no_requests(tmp_path: Path) -> None:
 
 
 async def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path) -> None:
-    """The servers let it go there: a record of the plant is what its asker may not write. And an answer of a
-    server to somebody's request, sent here, has no inbox."""
+    """Servers would deliver the answer there, even to a record that the requester may not write."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.member.lease.session = 7
     for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):

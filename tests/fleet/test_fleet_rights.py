@@ -1,7 +1,7 @@
 """Rights on a fleet's servers, with the configuration of `fleet rights`: requests that each user is refused.
 
 Each attempt is made twice: at a server with the rights as written, which must refuse it, and at one whose
-users may do everything, which must not. So an attempt that could not be refused is no proof.
+users may do everything, which must not. So each attempt could succeed.
 """
 
 from __future__ import annotations

@@ -112,8 +112,8 @@ class Model:
     def search(self, most: int | None = None) -> tuple[int, tuple[PathState, ...] | None]:
         """Return how many states there are, and one in which two masters could write, if there is one.
 
-        A state is whether the holder has looked at the clock and not written yet, and its paths, sorted, for
-        they are alike. A dead holder's states are left out: it writes no more.
+        A state has a flag, True between the holder's check of the clock and its write, and its sorted paths.
+        States of a dead holder are left out.
         """
         table = _PathTable(self)
         first = (False, *(table.number(PathState()),) * self.paths)

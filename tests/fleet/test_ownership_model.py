@@ -72,8 +72,8 @@ def as_read(records: Records) -> LineRecords:
 class Model:
     """Sessions that claim and release at any time, by records read once, and end at any time.
 
-    Writes are stored late, in any order, or never; an answer is a read like any other. So many records are
-    stored at most. Who does not know yet that another is over claims nothing, as who does not act.
+    Writes are stored late, in any order, or never; an answer is a read like any other. At most `most` records
+    are stored. A session that does not know of another's end claims nothing, like an idle one.
     """
 
     sessions: str = "ab"
@@ -217,7 +217,7 @@ class Model:
 
 
 def read(session: Session, bucket: int, record: Stored) -> Session:
-    """Return the session after it has read this record; an older one changes nothing."""
+    """Return the session after it has read this record; an older record is ignored."""
     if session.known[bucket].revision >= record.revision:
         return session
     known = list(session.known)

@@ -57,7 +57,7 @@ class ScriptedPath:
         return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
 
     async def close(self) -> None:
-        """Do nothing."""
+        """Keep the script."""
 
 
 class Plant:

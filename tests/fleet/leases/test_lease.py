@@ -346,8 +346,7 @@ async def test_two_simultaneous_starts_are_never_both_valid() -> None:
 
 
 async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
-    """The first one's renewal of path 0 comes before the second one's taking of it; path 2 was renewed all
-    the time."""
+    """The first session renews path 0 right before the second one takes it, and path 2 all the time."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
     first, second = trial.lease(), trial.lease()

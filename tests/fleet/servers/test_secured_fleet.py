@@ -331,9 +331,9 @@ def test_a_revoked_key_is_logged_and_its_lines_are_taken_over(tmp_path: Path) ->
 
 @pytest.mark.long
 def test_a_new_gateway_shares_the_lines_and_ends_no_session(tmp_path: Path) -> None:
-    """The servers read its rights while all others go on, and commands find it.
+    """The servers read its rights while all others continue, and commands reach it.
 
-    NATS 2.15 gives an account that it reads while it runs what others offer it when it reads that once more.
+    NATS 2.15 gives a new account its imports only at the second reload.
     """
     with secured_fleet(tmp_path, 3, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
