@@ -17,7 +17,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
 from enum import StrEnum
 from functools import partial
@@ -42,33 +42,6 @@ _log = logging.getLogger("multidrop.fleet")
 
 WEAK_LOOK_S = 1.0
 WEAK_NS = 10 * SECOND  # a weak session is kept at least this long after its gateway has settled
-
-
-class WeakSession:
-    """Decides when to give up this gateway's session after others ended one of its three records.
-
-    `is_too_weak` is True then. If the session were kept, it would end as soon as one more server fails.
-    """
-
-    def __init__(self, lease: Lease, observer: Observer, path: Callable[[], ServerPath]) -> None:
-        self.is_too_weak = False
-        self._lease = lease
-        self._observer = observer
-        self._path = path
-
-    async def watch(self, settled_at: Callable[[], int]) -> None:
-        """Check the session forever.
-
-        Giving up leaves the lines without a master for a moment. So one gateway at a time does so, and only
-        when all paths answer and lines can be claimed.
-        """
-        while True:
-            await asyncio.sleep(WEAK_LOOK_S)
-            lease = self._lease
-            if not (lease.is_weak and lease.is_valid) or lease.clock() < settled_at() + WEAK_NS:
-                continue
-            if self._observer.weak()[:1] == [lease.name]:
-                self.is_too_weak = await have_leaders(self._path()) and await lease.could_be_whole()
 
 
 class IncompatibleGateways:
@@ -152,7 +125,7 @@ class Member:
         self._is_dirty = True
         self._woken = asyncio.Event()
         self._was_valid = False
-        self._weak = WeakSession(self.lease, self.records.observer, self.best)
+        self._is_too_weak = False
         self._incompatible = IncompatibleGateways(name, self.records.observer)
         self._stepped: tuple[Any, ...] = ()
         self._over = asyncio.Event()
@@ -252,7 +225,7 @@ class Member:
             **records,
             "guard": self._guard(),
             "leaders": keep_leaders(self.best, self._keeps_leaders),
-            "weak session": self._weak.watch(lambda: self._settled_at),
+            "weak session": self._watch_weakness(),
             "releases": self._releases.watch(),
             "steps": self._live(),
             "lines": self.keeper.fail(),
@@ -272,11 +245,11 @@ class Member:
                 self._shares.reset()
                 self._is_dirty = True
                 _log.info("%s: the lease began (session %d)", self.name, self.lease.session)
-            elif self.lease.is_over or self._weak.is_too_weak:
+            elif self.lease.is_over or self._is_too_weak:
                 what = "is over" if self.lease.is_over else "lost one of three records; a new one starts"
                 _log.warning("%s: the lease %s (session %d)", self.name, what, self.lease.session)
                 await self._leave()
-                self._is_dirty, self._weak.is_too_weak = True, False
+                self._is_dirty, self._is_too_weak = True, False
             self._woken.clear()
             await self.step()
             await asyncio.sleep(LEAST_STEP_S)
@@ -309,6 +282,21 @@ class Member:
                     self.mastership.end()
                     _log.warning("%s: the lease was not renewed in time; all lines are closed", self.name)
             await asyncio.sleep(GUARD_LOOK_S)
+
+    async def _watch_weakness(self) -> None:
+        """Decide when to give up this session after others ended one of its three records.
+
+        If it were kept, it would end as soon as one more server fails. Giving up leaves the lines without a
+        master for a moment. So one gateway at a time does so, and only when all paths answer and lines can be
+        claimed.
+        """
+        while True:
+            await asyncio.sleep(WEAK_LOOK_S)
+            lease = self.lease
+            if not (lease.is_weak and lease.is_valid) or lease.clock() < self._settled_at + WEAK_NS:
+                continue
+            if self.records.observer.weak()[:1] == [self.name]:
+                self._is_too_weak = await have_leaders(self.best()) and await lease.could_be_whole()
 
     def _keeps_leaders(self) -> bool:
         """Return True if this gateway manages the buckets' leaders: the first gateway by name does."""
