@@ -7,7 +7,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from parameter_drives import factory_reset, raw_of, set_at_random, with_parameters, writable
+from parameter_drives import factory_reset, obey_the_line, raw_of, set_at_random, with_parameters, writable
 from simulated_bus import SimulatedBus
 
 from multidrop import (
@@ -21,17 +21,22 @@ from multidrop import (
     params,
 )
 from multidrop.control import Ledger, read_audit
+from multidrop.families.registry import shipped_family
 from multidrop.families.yd1000 import COMMAND
 from multidrop.sim import MotorDrive
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.protocol import Reason, Refusal
 
-EXTRA = {
+GOODRIVE, DELIXI_E = shipped_family("invt-goodrive"), shipped_family("delixi-e")
+EXTRA: dict[type[Drive], list[str]] = {
     YD1000: ["F170", "F240", "F241", "F305"],
     DelixiModbus: ["P00.03", "P00.04", "P01.00", "P01.01"],
     DelixiNative: ["P00.03", "P00.04", "P01.00", "P01.01"],
     ErmanERG220: [],
+    GOODRIVE: ["P00.03", "P00.11", "P01.20", "P05.12", "P08.28", "P14.03"],
+    DELIXI_E: ["P0.0.08", "P0.1.00", "P3.2.05", "P4.1.04"],
 }
+FAMILIES = [pytest.param(family, id=family.model) for family in EXTRA]
 
 
 @pytest.fixture(autouse=True)
@@ -39,19 +44,25 @@ def _state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
 
 
+def made(family: type[Drive]) -> Drive:
+    """Return a drive whose run source, if it has one, is the line."""
+    return family(1, **({"confirmed": 1} if family.declared_in else {}))
+
+
 def attached(
     monkeypatch: pytest.MonkeyPatch, drive: Drive, extra: list[str]
 ) -> tuple[SimulatedBus, Drive, MotorDrive]:
     sim = with_parameters(drive, extra)
+    obey_the_line(sim)
     line = SimulatedBus(monkeypatch, sim)
     return line, line.attach(drive), sim
 
 
-@pytest.mark.parametrize("family", EXTRA)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_saved_parameters_are_restored_after_a_factory_reset(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, family: type[Drive]
 ) -> None:
-    line, drive, sim = attached(monkeypatch, family(1), EXTRA[family])
+    line, drive, sim = attached(monkeypatch, made(family), EXTRA[family])
     there = writable(drive, EXTRA[family])
     assert there
     set_at_random(sim, there, Random(7))
@@ -75,9 +86,9 @@ def test_saved_parameters_are_restored_after_a_factory_reset(
 # ---- what refuses all ----
 
 
-@pytest.mark.parametrize("family", EXTRA)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_running_motor_refuses_all(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
-    line, drive, sim = attached(monkeypatch, family(1), EXTRA[family])
+    line, drive, sim = attached(monkeypatch, made(family), EXTRA[family])
     first = writable(drive, EXTRA[family])[0]
     sim.motor.target = 50.0
     sim.motor.run()
@@ -151,6 +162,16 @@ def test_parameters_of_the_line_are_written_only_one_by_one(monkeypatch: pytest.
         params.plan(drive, {"F803": 20}, also=["F803"])
     assert list(params.plan(drive, {"F802": 5}).left) == ["F802"]
     assert sim["communication_timeout"] == 30
+
+
+def test_backup_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    _, drive, _ = attached(monkeypatch, made(GOODRIVE), ["P00.03", "P14.01", "P00.18"])
+    rows = ["0;3;6000", "0;18;1", "14;1;3", "7;13;104", "17;0;5000"]
+    text = "\n".join(["GRUPO_PARAMETRO;CODIGO_FUNCAO;VALOR_PARAMETRO", *rows])
+    (tmp_path / "bkp_result.csv").write_text(text)
+    done = params.apply(drive, params.load(tmp_path / "bkp_result.csv"))
+    assert [str(change) for change in done.written] == ["P00.03: 0 -> 6000"]
+    assert [*done.plan.left] == ["P00.18", "P14.01"]
 
 
 def test_missing_parameter_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,6 +174,7 @@ TABLES = {
 03/06 300B outputs             1
 03/06 300C analog_input_1      0.01 V
 03/06 300D analog_input_2      0.01 V
+03/06 0001 run_source          - RunSource
 """,
     "invt-chf100a": """
 03/06 1000 control             - InvtControl
@@ -222,6 +223,7 @@ TABLES = {
 03/06 000B acceleration_time   0.1 s
 03/06 000C deceleration_time   0.1 s
 03/06 4102 station             1
+03/06 0003 run_source          - RunSource
 """,
     "powtran-pi130": """
 03/06 2000 control             - InovanceControl

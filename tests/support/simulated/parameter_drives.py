@@ -46,3 +46,10 @@ def set_at_random(sim: MotorDrive, parameters: list[Parameter], random: Random) 
             low, high = one.coding.raw_span if one.span is None else map(one.coding.count_of, one.span)
             sim.memory.set_raw(one, random.randint(int(low), min(int(high), 0xFFFF)))
     sim.set_up()
+
+
+def obey_the_line(sim: MotorDrive) -> None:
+    """Let the line command the motor, if the drive's run source is a register."""
+    source = sim.drive.registers.get("run_source")
+    if source is not None and source.values is not None:
+        sim["run_source"] = next(one for one in source.values if one.name.lower() == "line")
