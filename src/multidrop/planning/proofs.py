@@ -8,15 +8,31 @@ protocol by parameter, and otherwise by the values that two registers are known 
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from functools import lru_cache
 from typing import Any
 
+from multidrop.core import Framing
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Carrier, Register
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    HOLDING_MULTIPLE,
+    INPUT,
+    Access,
+    Carrier,
+    Register,
+    Table,
+)
+from multidrop.drive.request import read_request
 from multidrop.planning.blocks import Block, all_requests
 
 MOST_PROOFS = 4  # limit per drive, because each proof uses memory
+
+# The proof of a device whose replies all look alike is a read of another table. Even an exception names the
+# function, and a read changes nothing.
+OTHER_TABLE = {HOLDING: INPUT, HOLDING_MULTIPLE: INPUT, INPUT: HOLDING, COIL: DISCRETE, DISCRETE: COIL}
 
 RawRange = tuple[int, int]  # lowest and highest raw count of the only register in a reply
 
@@ -25,7 +41,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return the blocks to read from this drive as proofs.
 
     Each has the range of raw counts that its reply is known to hold, or None. The last block is the least
-    likely to be polled. If all replies of the family look alike, the list is empty.
+    likely to be polled. The list is empty if all replies look alike in a protocol other than Modbus.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -36,6 +52,8 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
         found = [*known, *found[1:]]
     if probe := drive.echo_probe:  # its reply cannot be mistaken for an echo
         found = [(Block.of(drive, [probe]), None), *found]
+    if len(found) < 2:
+        found += [(block, None) for block in _of_other_tables(drive, [block for block, _ in found])]
     if len(found) >= MOST_PROOFS:
         return [*found[: MOST_PROOFS - 1], found[-1]]
     return found if len(found) > 1 else []
@@ -57,6 +75,21 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
                 shapes[shape] = ordered[begin:end]
     found = list(shapes.values())
     return tuple(found if len(found) <= MOST_PROOFS else [*found[:MOST_PROOFS], found[-1]])
+
+
+def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
+    """Return reads whose replies differ by function from the only shape found, or from each other."""
+    if drive.framing is Framing.DELIXI:
+        return []
+    places: list[tuple[Table, int, int]] = [
+        (OTHER_TABLE[block.table], block.start, block.count) for block in found if block.table in OTHER_TABLE
+    ]
+    if not found:  # a device without declared registers
+        places = [(INPUT, 0, 1), (DISCRETE, 0, 1)]
+    return [
+        Block(table, start, count, (), read_request(drive, table, start, count))
+        for table, start, count in places
+    ]
 
 
 def _shape(first: Register[Any], count: int) -> Hashable:
