@@ -9,11 +9,14 @@ from importlib.metadata import PackageNotFoundError, requires
 def install_command(extra: str) -> str:
     """Return the pip command for an extra's libraries.
 
-    It names the libraries, because `multidrop[extra]` is found only beside the sources.
+    It names the libraries, because `multidrop[extra]` is found only beside the sources. The extra follows as
+    the shell's comment.
     """
     try:
         found = [one.partition(";") for one in requires("multidrop") or ()]
     except PackageNotFoundError:
         found = []
     wanted = [name.strip() for name, _, marker in found if f'extra == "{extra}"' in marker.replace("'", '"')]
-    return "pip install " + (shlex.join(wanted) if wanted else f"'multidrop[{extra}]'")
+    if not wanted:
+        return f"pip install 'multidrop[{extra}]'"
+    return f"pip install {shlex.join(wanted)}  # multidrop[{extra}]"

@@ -7,7 +7,8 @@ no proof; a gateway that replies with its own ids is treated like RTU.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
 
 import pytest
 from examples import every_fourth, usually
@@ -34,6 +35,7 @@ from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
 from multidrop.core import Framing, Message, Status, TransactionIds
 from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING, Table, reading
 from multidrop.errors import BusError
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
@@ -117,6 +119,24 @@ def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[fl
 @pytest.mark.parametrize(("name", "longest"), STALLS)
 def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
     Path(of_one_variant(LINES[name])).run_over(stalling(longest))
+
+
+class OneByOne(Drive):
+    """A device that is read one register at a time, so that all its replies look alike."""
+
+    title = "a user's device"
+    framings = (Framing.RTU,)
+    most_registers: ClassVar[Mapping[Table, int]] = {HOLDING: 1}
+    power = reading(0x10)
+    energy = reading(0x40)
+
+
+@pytest.mark.parametrize("delay", [constant(0.6), constant(4.0), stalling(0.9), stalling(15.0)])
+def test_replies_that_all_look_alike_are_never_mixed_up(delay: Delay) -> None:
+    """A read of another table, even a refused one, shows that no earlier reply can still come."""
+    drives = [OneByOne(address, name=f"meter-{address}") for address in (1, 2)]
+    story = Path(drives)
+    assert story.run_over(delay, TAIL + TURNS * 15) == {drive.name for drive in story.drives}
 
 
 @pytest.fixture

@@ -50,13 +50,13 @@ def test_polars_gets_times_with_their_type() -> None:
         (
             "to_pandas",
             "pandas",
-            r"to_pandas\(\) needs pandas, which is not installed: .*'multidrop\[pandas\]'",
+            r"to_pandas\(\) needs pandas, which is not installed: .*multidrop\[pandas\]",
         ),
-        ("to_pandas", "pyarrow", r"to_pandas\(\) needs pyarrow, which is not .*'multidrop\[pandas\]'"),
+        ("to_pandas", "pyarrow", r"to_pandas\(\) needs pyarrow, which is not .*multidrop\[pandas\]"),
         (
             "to_polars",
             "polars",
-            r"to_polars\(\) needs polars, which is not installed: .*'multidrop\[polars\]'",
+            r"to_polars\(\) needs polars, which is not installed: .*multidrop\[polars\]",
         ),
     ],
 )

@@ -14,25 +14,15 @@ from typing import Any
 
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
-from multidrop.drive.register import (
-    COIL,
-    DISCRETE,
-    HOLDING,
-    HOLDING_MULTIPLE,
-    INPUT,
-    Access,
-    Carrier,
-    Register,
-    Table,
-)
+from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Access, Carrier, Register
 from multidrop.drive.request import read_request
 from multidrop.planning.blocks import Block, all_requests
 
 MOST_PROOFS = 4  # limit per drive, because each proof uses memory
 
-# The proof of a device whose replies all look alike is a read of another table. Even an exception names the
-# function, and a read changes nothing.
-OTHER_TABLE = {HOLDING: INPUT, HOLDING_MULTIPLE: INPUT, INPUT: HOLDING, COIL: DISCRETE, DISCRETE: COIL}
+# For devices whose replies look alike: even an exception names the function, and a read changes nothing.
+OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
+ENOUGH = 3  # one may be outstanding itself, and the last is reserved for a drive that answers again
 
 RawRange = tuple[int, int]  # lowest and highest raw count of the only register in a reply
 
@@ -41,7 +31,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return the blocks to read from this drive as proofs.
 
     Each has the range of raw counts that its reply is known to hold, or None. The last block is the least
-    likely to be polled. The list is empty if all replies look alike in a protocol other than Modbus.
+    likely to be polled. With fewer than ENOUGH of them, a Modbus device's other tables are read too.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -52,7 +42,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
         found = [*known, *found[1:]]
     if probe := drive.echo_probe:  # its reply cannot be mistaken for an echo
         found = [(Block.of(drive, [probe]), None), *found]
-    if len(found) < 2:
+    if len(found) < ENOUGH and drive.framing is not Framing.DELIXI:
         found += [(block, None) for block in _of_other_tables(drive, [block for block, _ in found])]
     if len(found) >= MOST_PROOFS:
         return [*found[: MOST_PROOFS - 1], found[-1]]
@@ -78,17 +68,13 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return reads whose replies differ by function from the only shape found, or from each other."""
-    if drive.framing is Framing.DELIXI:
-        return []
-    places: list[tuple[Table, int, int]] = [
-        (OTHER_TABLE[block.table], block.start, block.count) for block in found if block.table in OTHER_TABLE
-    ]
-    if not found:  # a device without declared registers
-        places = [(INPUT, 0, 1), (DISCRETE, 0, 1)]
+    """Return reads of one register, whose replies differ by function from those of the blocks found."""
+    start = found[0].start if found else 0
+    functions = {block.table.read for block in found}
     return [
-        Block(table, start, count, (), read_request(drive, table, start, count))
-        for table, start, count in places
+        Block(table, start, 1, (), read_request(drive, table, start, 1))
+        for table in OTHER_TABLES
+        if table.read not in functions
     ]
 
 
