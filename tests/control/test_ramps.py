@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +23,7 @@ from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read
 from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import BusError, NoReply, Unconfirmed, WriteForbidden
+from multidrop.errors import NoReply, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 
@@ -200,7 +199,7 @@ def test_a_staggered_start_does_not_stop_drives_it_never_reached(monkeypatch: py
 def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The stop of an IBD, 0001H to 2000H, runs an INVT Goodrive, which is no built-in family."""
+    """The stop of an IBD, 0001H to 2000H, runs an INVT Goodrive."""
     sims: list[Any] = [simulated(InnovertIBD(1)), simulated(PROFILES["invt-goodrive"](2))]
     line = SimulatedBus(monkeypatch, *sims)
     drives: list[Any] = [line.attach(InnovertIBD(address)) for address in (1, 2)]
@@ -209,9 +208,9 @@ def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
         start_staggered(drives, 1.0)
     assert {request.address for request, _ in line.frames if is_write(request)} == {1}
     assert not any(sim.motor.goal for sim in sims)
-    with suppress(BusError):
-        drives[1].stop(seconds=1)  # a stop that the user calls is sent
-    assert {request.address for request, _ in line.frames if is_write(request)} == {1, 2}
+    with pytest.raises(WriteForbidden, match="multidrop stop PORT invt-goodrive 2"):
+        drives[1].stop(seconds=1)  # which would run it
+    assert {request.address for request, _ in line.frames if is_write(request)} == {1}
 
 
 class NotedCalls:
