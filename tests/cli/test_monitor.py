@@ -655,7 +655,7 @@ def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch
 
 def await_both(terminal: Terminal) -> None:
     """Wait until one drive is silent, and a value of the other was read: its age is shown."""
-    terminal.wait_for("pump-9 silent")
+    terminal.wait_for_match(r"pump-9 .*silent")
     terminal.wait_for_match(r"\d\.\d s ")
 
 
