@@ -123,7 +123,7 @@ def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
 
     async def main() -> None:
         server = make()
-        await server.start()
+        server.listen()
         ready.append(server)
         begun.set()
         try:

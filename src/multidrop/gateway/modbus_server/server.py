@@ -94,20 +94,13 @@ class ModbusServer:
                 raise
             self.ports[line] = self._sockets[line].getsockname()[1]
 
-    async def start(self) -> None:
-        """Accept clients."""
-        if not self._sockets:
-            self.listen()
+    async def run(self) -> None:
+        """Accept clients, and close idle ones, until cancelled."""
         clock, share = asyncio.get_running_loop().time, RoundShare()
         for line, listener in self._sockets.items():
             port = ModbusPort(partial(self.serve, line), self.settings.may_connect, clock, share)
             await port.open(listener)
             self._listening.append(port)
-
-    async def run(self) -> None:
-        """Close idle clients until cancelled."""
-        if not self._listening:
-            await self.start()
         while True:
             await asyncio.sleep(SWEEP_S)
             for port in self._listening:
