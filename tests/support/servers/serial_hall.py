@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 REQUEST = 8  # bytes of a Modbus RTU read
+MAKE = {0x02BC: 1, 0x02BE: 1}  # of an INNOVERT IBD: 9600 baud, address 1
 
 
 @dataclass
@@ -43,7 +44,8 @@ class LineSeen:
 class SerialHall:
     """Listens on a port for each line; answers Modbus RTU reads with zeros, and confirms each write.
 
-    So its motors are stopped. A line whose name is in `refusing` rejects writes.
+    So its motors are stopped. Only two registers, which identify the make, are not 0. A line whose name is in
+    `refusing` rejects writes.
     """
 
     def __init__(self, number: int, host: str = "127.0.0.1", names: Sequence[str] = ()) -> None:
@@ -154,9 +156,10 @@ class SerialHall:
 
 
 def _answer(client: socket.socket, request: bytes, *, takes_writes: bool) -> None:
-    address, function, _, count = struct.unpack(">BBHH", request[:6])
+    address, function, first, count = struct.unpack(">BBHH", request[:6])
     if function in (3, 4) and count <= 125:
-        body = bytes([address, function, 2 * count]) + bytes(2 * count)
+        words = (MAKE.get(register, 0) for register in range(first, first + count))
+        body = bytes([address, function, 2 * count]) + struct.pack(f">{count}H", *words)
     elif function == 6 and takes_writes:
         body = request[:-2]
     else:
