@@ -367,8 +367,8 @@ static int is_run_command(int framing, const struct md_message *request)
     return framing == MD_DELIXI && request->function == MD_DELIXI_RUN;
 }
 
-/* Requests with the same key have replies with the same fields. A Delixi run command is where other
- * requests have their address. */
+/* Requests with the same key have replies with the same fields. In a Delixi run request, the command is in
+ * the field that holds the register's address in other requests. */
 static uint64_t key_of(int framing, const struct md_message *request)
 {
     uint64_t start = is_run_command(framing, request) ? 0 : request->start;

@@ -17,7 +17,7 @@ enum md_side {
     MD_SIDES
 };
 
-/* A ring with one writer and one reader. All zero except `ring` and `room`: empty. */
+/* A ring buffer with one writer and one reader. All zero except `ring` and `room`: empty. */
 struct md_tap {
     uint8_t *ring;
     uint32_t room;       /* bytes, a power of two */

@@ -23,7 +23,8 @@ struct md_rs485 {
 
 struct md_port {
     /* fields for every exchange */
-    int fd, must_take;
+    int fd;
+    int must_take;     /* mask of refused settings that are failures; -1: a port without settings */
     unsigned index;    /* among the engine's ports */
     int is_blind;      /* no useful bytes come before the port's wake time */
     int is_watched;    /* the waiter reports when it is readable */

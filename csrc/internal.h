@@ -156,7 +156,7 @@ int md_port_keep_rts(int fd); /* let closing the port leave RTS unchanged; 0, -e
 /* ---- wakeup.c ---- */
 
 struct md_wakeup {
-    int fd, ringer; /* `fd` is readable after a ring until md_wakeup_silence() */
+    int fd, ringer; /* `fd` is readable from md_wakeup_ring() to md_wakeup_silence() */
     atomic_int is_rung;
 };
 

@@ -60,8 +60,8 @@ struct md_line {
     int64_t give_up_ns;  /* deadline of the wait for silence, or for the reply */
     int64_t begun_by_ns; /* deadline of the reply's first byte */
     int64_t looked_ns;   /* time of the last read of the port */
-    int64_t missing_ns;  /* time of the last read with less than a copy of the request; 0: none */
-    int64_t copy_by_ns;  /* an echo would be whole by then; 0: unknown */
+    int64_t missing_ns;  /* time of the last read that found no whole copy of the request; 0: none */
+    int64_t copy_by_ns;  /* time by which an echo would be whole; 0: unknown */
     int64_t ready_ns;    /* no useful bytes come before this time */
     struct md_drive *late; /* the first drive with late replies due */
     struct md_tap *tap;  /* gets all bytes of the line; NULL: none */
@@ -79,7 +79,7 @@ struct md_line {
     uint32_t cut;        /* since the request left: bytes of late replies */
     uint32_t foreign;    /* bytes received while listening */
     uint16_t sight_at, sight; /* where the reply may start; its bytes in the first read */
-    uint16_t burst;      /* most characters that the adapter holds back; 0: possibly whole replies */
+    uint16_t burst;      /* most characters that the adapter gathers; 0: possibly whole replies */
     uint8_t rx[MD_RX_ROOM];
     uint8_t long_tx[MD_MOST_FRAME]; /* a request that its exchange does not store */
     uint16_t transaction;           /* of the last request */
@@ -94,7 +94,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
                    int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
 int64_t md_line_silent_ns(const struct md_line *line);  /* end of the line's silence */
-/* Report that the port took `len` bytes between these two times. */
+/* Record that the port took `len` bytes between these two times. */
 void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
 /* End the exchange in flight: the port failed, or the request must not leave. */
@@ -143,7 +143,7 @@ struct md_turn {
     struct md_urgent *urgent;
     const struct md_exchange *const *round; /* the repeated exchanges */
     uint32_t round_len, round_at;
-    struct md_slot *slots; /* a ring */
+    struct md_slot *slots; /* a ring buffer */
     uint32_t room;         /* a power of two */
     uint32_t is_idle;      /* the next submit must wake the thread */
     int64_t owed_ns;       /* line time that urgent requests still owe to polling */
@@ -217,7 +217,7 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns);
 /* Find late replies among stray bytes, from index `from` on; the reply is searched for after them. */
 void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
 
-/* Decide whether the reply at `at` is this exchange's and end it; 0: it was cut out as a late reply. */
+/* End the exchange if the reply at `at` is its own; 0: the reply was late, and was cut out. */
 int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
                    struct md_ending *ending);
 void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply);

@@ -16,9 +16,9 @@
 
 enum { MOST_LONE_COPIES = 2 }; /* copies accepted as replies before the next echo probe */
 
-/* An adapter may start to echo at any time. The library reads back a write that a copy confirmed. If the
- * reply to a read may equal its request, wait for the reply after the copy, unless the copy is too late
- * for an echo. */
+/* An adapter may start to echo at any time. If a copy confirms a write, the library reads the register back.
+ * If the reply to a read may equal its request, wait for the reply after the copy, unless the copy is too
+ * late for an echo. */
 int md_echo_is_due(const struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;

@@ -15,7 +15,7 @@ struct md_row_queue {
     pthread_mutex_t mutex; /* guards all below */
     pthread_cond_t is_called;
     size_t chunk_rows, most_chunks;
-    struct md_columns **chunks; /* a ring */
+    struct md_columns **chunks; /* a ring buffer */
     size_t first, count;        /* of the chunks that hold rows */
     struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
     size_t spares;

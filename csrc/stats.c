@@ -43,7 +43,7 @@ static void learn(int64_t *ns, int64_t value)
     __atomic_store_n(ns, value, __ATOMIC_RELAXED);
 }
 
-/* As TCP's retransmission timeout (RFC 6298). */
+/* Smoothed delay plus four deviations, as in TCP's retransmission timeout (RFC 6298). */
 static int64_t usual_timeout_ns(const struct md_drive *drive)
 {
     int64_t usual_ns = 3 * drive->least_timeout_ns, delay_ns = learnt(&drive->delay_ns);

@@ -1,4 +1,4 @@
-/* A ring of all bytes on a line, read as packets of a pcapng file.
+/* A ring buffer of all bytes on a line, read as packets of a pcapng file.
  *
  * The line's thread writes, one other thread reads, and neither waits for the other. Bytes that do not fit
  * are dropped and counted. */
@@ -6,7 +6,7 @@
 
 #include <string.h>
 
-/* The header of bytes in the ring. */
+/* The header of bytes in the ring buffer. */
 struct mark {
     int64_t time_ns; /* of CLOCK_MONOTONIC, or UTC with IS_UTC in `side` */
     uint32_t len, side;
@@ -24,7 +24,8 @@ static void set(uint32_t *counter, uint32_t value)
     __atomic_store_n(counter, value, __ATOMIC_RELEASE);
 }
 
-/* Return the address of a ring position; set `first` to how many of `len` bytes fit before the ring's end. */
+/* Return the address of a position in the ring buffer; set `first` to how many of `len` bytes fit before its
+ * end. */
 static uint8_t *place(const struct md_tap *tap, uint32_t at, size_t len, size_t *first)
 {
     uint32_t offset = at & (tap->room - 1);

@@ -33,7 +33,7 @@ void md_wakeup_ring(struct md_wakeup *wakeup)
         (void)!write(wakeup->ringer, "", 1);
 }
 
-/* A ring during this call leaves a byte in the pipe, so it is not lost. */
+/* A call of md_wakeup_ring() meanwhile leaves a byte in the pipe, so it is not lost. */
 void md_wakeup_silence(struct md_wakeup *wakeup)
 {
     char byte;

@@ -211,7 +211,7 @@ class Wrappings:
 
 
 class Tap:
-    """A ring of all bytes on one line (struct md_tap), to be read as packets of a pcapng file."""
+    """A ring buffer of all bytes on one line (struct md_tap), to be read as packets of a pcapng file."""
 
     def __init__(self) -> None:
         self._ring = ffi.new("uint8_t[]", _RING)
@@ -220,7 +220,7 @@ class Tap:
 
     @property
     def lost(self) -> int:
-        """Bytes that were lost because the ring was full."""
+        """Bytes that were lost because the ring buffer was full."""
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:
