@@ -18,7 +18,7 @@ from multidrop.control.outcome import Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
 from multidrop.control.stops import Stopper, StopRun
-from multidrop.control.time_limit import checked_expiry
+from multidrop.control.time_limit import check_expiry
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
@@ -93,7 +93,7 @@ class Bus:
         stop_on_exit: bool = False,
         mastership: Mastership | None = None,
     ) -> None:
-        checked_expiry(expiry, "a write")
+        check_expiry(expiry)
         self.baudrate = baudrate
         self.format = format
         self.silence = silence

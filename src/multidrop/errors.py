@@ -137,9 +137,9 @@ class NotMaster(BusError):
     def __init__(self, drive: str, port: str, *, heard: bytes = b"", is_sent: bool = False) -> None:
         if heard:
             came = heard[:16].hex(" ").upper()
-            why = f"bytes came on {port} before anything was asked, which another master causes ({came})"
+            why = f"unexpected bytes came on {port}, as from another master ({came})"
         else:
-            why = f"this process may not send on {port} any more, and another one may be its master now"
+            why = f"this process is not the master of {port}, and another one may be"
         super().__init__(f"{drive}: not sent: not master: {why}")
         self.drive = drive
         self.reason = why
@@ -149,8 +149,8 @@ class NotMaster(BusError):
     def of_a_stop(self) -> NotMaster:
         """Return the same error with the advice that a failed stop needs."""
         self.args = (
-            f"{self.drive}: the stop was NOT sent, and its motor goes on as it is: {self.reason}. Stop it "
-            "through the process that is master of its line now, or at the drive itself",
+            f"{self.drive}: the stop was NOT sent, and the motor continues as it is: {self.reason}. "
+            "Stop it through the line's present master, or at the drive itself",
         )
         return self
 

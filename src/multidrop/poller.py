@@ -315,7 +315,7 @@ class Poller(RowSource):
 
     def _check_polling(self) -> None:
         if self._closing:
-            raise ValueError("polling has ended: no line comes or goes any more")
+            raise ValueError("polling has ended: no line can be added or removed")
         if self.failure:
             raise self.failure
 
@@ -353,7 +353,7 @@ class Poller(RowSource):
         with self._changing:
             names = {drive.name for bus in self.buses.values() for drive in bus.drives}
             if polled.drive.name in names:
-                raise ValueError(f"another drive is called {polled.drive.name}; give every one its own name")
+                raise ValueError(f"another drive is called {polled.drive.name}; give each its own name")
             self._lines.find(line).add(polled)
 
     @undisturbed

@@ -262,7 +262,7 @@ def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> N
     """A command does not know what another one wrote."""
     with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
         words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
-        sentence = "multidrop: innovert-ibd@1 cannot say its setpoint: add --frequency HZ\n"
+        sentence = "multidrop: innovert-ibd@1 cannot report its setpoint: add --frequency HZ\n"
         assert run("start", *words) == (1, "", sentence)
         assert run("start", *words, "--frequency", 20)[0] == 0
 

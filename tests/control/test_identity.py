@@ -179,7 +179,9 @@ def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_los
         drive.set_frequency(10)
         received.requests.clear()
         lose(bus, drive, monkeypatch)
-        with pytest.raises(WriteForbidden, match="cannot say its setpoint: call set_frequency before start"):
+        with pytest.raises(
+            WriteForbidden, match="cannot report its setpoint: call set_frequency before start"
+        ):
             drive.start()
         assert received.writes == []
         drive.set_frequency(10)
@@ -193,7 +195,9 @@ def test_a_setpoint_is_forgotten_if_the_check_before_start_ends_a_long_silence(m
         drive.set_frequency(10)
         be_silent(bus, drive, received)
         bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
-        with pytest.raises(WriteForbidden, match="cannot say its setpoint: call set_frequency before start"):
+        with pytest.raises(
+            WriteForbidden, match="cannot report its setpoint: call set_frequency before start"
+        ):
             drive.start()
         assert received.writes == []
 
@@ -206,7 +210,7 @@ def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str
         bus.detach(drive)
         bus.attach(drive)
         received.requests.clear()
-        with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
+        with pytest.raises(WriteForbidden, match="cannot report its setpoint"):
             drive.start()
         assert received.writes == []
 

@@ -86,7 +86,7 @@ def test_after_a_lost_reply_nothing_is_known_and_no_motor_starts(
     bus.loses = bus.deafens = lambda request: False
     bus.frames.clear()
     assert drive.commanded is None
-    with pytest.raises(WriteForbidden, match="cannot say its setpoint: call set_frequency before start"):
+    with pytest.raises(WriteForbidden, match="cannot report its setpoint: call set_frequency before start"):
         drive.start()
     assert bus.written == []
 

@@ -184,9 +184,8 @@ def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
 def test_a_stop_says_that_it_was_not_sent(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
     port = scene.bus.line.port
     sentence = (
-        "pump: the stop was NOT sent, and its motor goes on as it is: this process may not send on "
-        f"{port} any more, and another one may be its master now. Stop it through the process that is master "
-        "of its line now, or at the drive itself"
+        "pump: the stop was NOT sent, and the motor continues as it is: this process is not the master of "
+        f"{port}, and another one may be. Stop it through the line's present master, or at the drive itself"
     )
     with caplog.at_level(logging.INFO, "multidrop.control"):
         with pytest.raises(NotMaster) as failure:
@@ -205,7 +204,7 @@ def test_a_stop_of_all_says_it_of_each(scene: Scene) -> None:
         "pump": Seen.FAILED,
         "fan": Seen.FAILED,
     }
-    assert all("the stop was NOT sent, and its motor goes on" in stopped.why for stopped in found.values())
+    assert all("the stop was NOT sent, and the motor continues" in stopped.why for stopped in found.values())
     assert scene.requests == 0
     assert other.bus is scene.bus
 
@@ -215,7 +214,7 @@ def test_a_failed_read_after_a_start_raises_the_lost_mastership(scene: Scene) ->
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()
-    with pytest.raises(NotMaster, match=r"^pump: not sent: not master: this process may not send on "):
+    with pytest.raises(NotMaster, match=r"^pump: not sent: not master: this process is not the master of "):
         scene.drive.state()
 
 
@@ -255,7 +254,7 @@ def test_a_write_of_which_a_part_has_left_is_unconfirmed(
     with pytest.raises(Unconfirmed, match="it is not known whether acceleration_time = 20"):
         scene.drive.write(Toy.acceleration_time, 20.0)
     (entry,) = read_audit(scene.audit)
-    assert "this process may not send on " in str(entry)
+    assert "this process is not the master of " in str(entry)
 
 
 @pytest.mark.slow
@@ -386,7 +385,7 @@ def test_another_master_is_reported_before_anything_is_sent(
             with pytest.raises(NotMaster) as failure:
                 call()
             assert failure.value.heard
-            assert "before anything was asked, which another master causes (" in str(failure.value)
+            assert "as from another master (" in str(failure.value)
             assert b"\x07\x03\x00\x01\x00\x01\xd5\xac" in failure.value.heard
         assert sent_on(far) == b""
         until(lambda: "another master: " in caplog.text)

@@ -397,7 +397,7 @@ def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.Mo
     with pytest.raises(Unconfirmed):
         drive.write(drive.frequency, 10.0)
     for act in (lambda: ramp(drive, 14, rate=4.0), drive.start):
-        with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
+        with pytest.raises(WriteForbidden, match="cannot report its setpoint"):
             act()
 
 
@@ -405,7 +405,7 @@ def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     line.bus.broadcast(drive.frequency, 0)
-    with pytest.raises(WriteForbidden, match="cannot say its setpoint"):
+    with pytest.raises(WriteForbidden, match="cannot report its setpoint"):
         ramp(drive, 14, rate=4.0)
 
 
@@ -455,7 +455,7 @@ def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPa
     line = SimulatedBus(monkeypatch)
     toy = line.attach(Toy(1, name="toy"))
     with pytest.raises(
-        WriteForbidden, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"
+        WriteForbidden, match=r"^toy cannot report its setpoint: call set_frequency before a ramp$"
     ):
         ramp(toy, 20.0, rate=5.0)
     assert line.frames == []

@@ -550,7 +550,7 @@ def test_registers_that_change_at_rest_need_a_readable_state(
     with pytest.raises(WriteForbidden) as refusal:
         drive.write(Mute.ratio, 3)
     assert str(refusal.value) == (
-        "ratio of mute is not written: it changes only while the motor stands, which the family cannot say"
+        "ratio of mute is not written: it changes only while the motor stands, which the family cannot report"
     )
     assert line.written == []
 

@@ -152,8 +152,8 @@ def test_moving_an_unidentified_drive_needs_confirmation(monkeypatch: pytest.Mon
     with pytest.raises(WriteForbidden) as refusal:
         command_it(line, pump)
     assert str(refusal.value) == (
-        f"{name} is not sent to pump: its class has no `identify` that could tell a Pump from another drive, "
-        "to which the same may mean a start; look at its name plate, and declare confirmed = 1"
+        f"{name} is not sent to pump: its class cannot identify a Pump, and the same write may start "
+        "another make: read the drive's name plate, and declare confirmed = 1"
     )
     assert line.frames == []
     line.bus.detach(pump)

@@ -254,7 +254,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         'line "hall-1", drive "pump-1", poll number 1: '
         "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
         'line "hall-1", drive "fan-1": '
-        'address 1 is that of line "hall-1", drive "pump-1" already; give every drive its own',
+        'address 1 is already used by line "hall-1", drive "pump-1"; give each drive its own',
         'line "hall-2", drive "pump-2": rated_frequency = 600 is outside 10 to 400 Hz',
     ]
 
@@ -406,15 +406,15 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + TOY + HEAD.replace("/dev/a", "/dev/b") + FIXED,
-            'line "L": another line has this name too; every line needs its own',
+            'line "L": another line already has this name; each line needs its own',
         ),
         (
             HEAD + TOY + HEAD.replace('"L"', '"M"') + FIXED,
-            'line "M": port /dev/a is that of line "L" already; make them one line',
+            'line "M": port /dev/a is already used by line "L"; make them one line',
         ),
         (
             HEAD + TOY + '[[line]]\nname = "M"\nport = "/dev/b"\n' + TOY,
-            'line "M", drive "D": line "L", drive "D" has this name too; every drive needs its own',
+            'line "M", drive "D": line "L", drive "D" already has this name; each drive needs its own',
         ),
         (
             '[[line]]\nname = "L"\n' + TOY,

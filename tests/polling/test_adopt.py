@@ -394,19 +394,19 @@ def broken() -> dict[str, tuple[Plant, str]]:
     return {
         "line twice": (
             plant(hall(pump), replace(yard(), name="hall")),
-            'line "hall": another line has this name too; every line needs its own',
+            'line "hall": another line already has this name; each line needs its own',
         ),
         "port twice": (
             plant(hall(pump), replace(yard(other), port="port of hall")),
-            'line "yard": port port of hall is that of line "hall" too; make them one line',
+            'line "yard": port port of hall is already used by line "hall"; make them one line',
         ),
         "drive twice": (
             plant(hall(pump), yard(toy("pump-1", 2))),
-            'line "yard", drive "pump-1": line "hall", drive "pump-1" has this name too',
+            'line "yard", drive "pump-1": line "hall", drive "pump-1" already has this name',
         ),
         "address twice": (
             plant(hall(pump, toy("pump-3", 1))),
-            'line "hall", drive "pump-3": address 1 is that of line "hall", drive "pump-1" already',
+            'line "hall", drive "pump-3": address 1 is already used by line "hall", drive "pump-1"',
         ),
         "another's register": (
             plant(hall(alien)),
@@ -474,7 +474,7 @@ def test_more_names_than_a_batch_can_number() -> None:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
         assert made.poller.adopt(plant(hall(*pumps()))) == {}
-        with pytest.raises(ValueError, match="65537 names of drives since polling began are too many"):
+        with pytest.raises(ValueError, match="65537 names of drives since polling started are too many"):
             made.poller.adopt(plant(hall(toy("pump-1", 1), toy("one-more", 3))))
         made.run(1)
         assert_rate(made.run(5), "pump-2", 5, 0.1)

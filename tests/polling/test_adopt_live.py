@@ -398,7 +398,7 @@ def test_calls_on_removed_lines_and_drives_raise(both: TwoLines) -> None:
         pump_1, pump_2 = poller.bus("hall").drives
         fan, _ = poller.bus("yard").drives
         poller.adopt(plant(both.hall(1)))
-        with pytest.raises(LineError, match="its line is polled no more"):
+        with pytest.raises(LineError, match="its line is no longer polled"):
             fan.read(CURRENT)
         with pytest.raises(CancelledByStop):
             fan.start()
@@ -425,7 +425,7 @@ def test_a_read_that_waits_for_a_line_that_goes_fails(both: TwoLines) -> None:
         until(lambda: poller.statistics()["yard"].counters.sent or _is_asking(poller, slow))
         poller.remove_line("yard")
         reading.join(PATIENCE)
-    assert ["its line is polled no more" in str(failure) for failure in found] == [True]
+    assert ["its line is no longer polled" in str(failure) for failure in found] == [True]
 
 
 class SlowToy(Toy):

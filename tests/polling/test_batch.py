@@ -107,7 +107,7 @@ def test_a_consumer_without_time_types_gets_advice(library: str) -> None:
     """pandas' constructor does not know Arrow's interface, and goes through rows one by one."""
     taker = pytest.importorskip(library, reason=f"needs {library}")
     take = taker.DataFrame if library == "pandas" else taker.asarray
-    with pytest.raises(TypeError, match=r"take them with batch\.to_pandas\(\)"):
+    with pytest.raises(TypeError, match=r"use batch\.to_pandas\(\)"):
         take(example())
     assert list(example()) == EXAMPLE
 

@@ -128,7 +128,7 @@ def test_a_failure_on_one_line_is_that_lines_alone(
         assert two.poller.line_failures["ill"].startswith(type(failure).__name__)
         assert "failing (" in repr(two.poller)
     two.until(("ill", "ok"), ("well", "ok"))
-    until(lambda: "line ill: polling failed, and is tried again in " in caplog.text)
+    until(lambda: "line ill: polling failed, and is retried in " in caplog.text)
     assert "Traceback" in caplog.text
     assert "line well" not in caplog.text
     assert two.poller.failure is None
@@ -356,7 +356,7 @@ class Waiting:
     "function", [wait, give, give_later, Waiting(), partial(wait), partial(partial(give))]
 )
 def test_a_function_that_a_call_does_not_carry_out_is_refused(two: Two, function: Any) -> None:
-    with pytest.raises(TypeError, match="is async or a generator: it would be called and never carried out"):
+    with pytest.raises(TypeError, match="is async or a generator: a call would not run it"):
         two.poller.on_batch(function)
 
 

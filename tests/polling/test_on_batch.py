@@ -89,7 +89,7 @@ def test_a_function_that_fails_is_logged_at_once_and_raised_by_closing(
         poller.__exit__(None, None, None)
     assert len(calls) == 1
     (record,) = caplog.records
-    assert record.getMessage() == "on_batch: the function failed, and is called no more"
+    assert record.getMessage() == "on_batch: the function failed and is no longer called"
     summary = poller.summary()
     left = rows_of(poller)
     assert calls[0] + len(left) == summary["samples"] + summary["misses"]  # they can still be taken
@@ -153,9 +153,9 @@ def test_on_batch_rejects_invalid_callbacks(poller: Poller) -> None:
         poller.on_batch(3)  # type: ignore[arg-type]
     with poller:
         poller.on_batch(len)
-        with pytest.raises(ValueError, match="has a function already"):
+        with pytest.raises(ValueError, match="already has a function"):
             poller.on_batch(len)
-    with pytest.raises(ValueError, match="has a function already"):
+    with pytest.raises(ValueError, match="already has a function"):
         poller.on_batch(len)
     other = Poller(plant())
     other.close()

@@ -121,7 +121,7 @@ def test_a_count_that_is_not_a_number_is_an_error(
     with pytest.raises(TypeError, match="is not a whole number"):
         toy.read_raw(*asked)
     for expiry in (0, -1, float("nan"), float("inf"), True):
-        with pytest.raises(ValueError, match="is not a number of seconds above 0"):
+        with pytest.raises(ValueError, match="is not a number of s above 0"):
             toy.read_raw(3, 1, 1, expiry=expiry)
     assert simulated.frames == []
 

@@ -132,7 +132,7 @@ def test_an_owed_reply_is_forgotten_when_the_core_forgets_it(
     now_ns = peers.clock.now_ns
     later: Callable[[], int] = lambda: now_ns() + peers.KEPT_NS  # noqa: E731
     monkeypatch.setattr(peers.clock, "now_ns", later)
-    peers.remember_owing(["elsewhere"], [])
+    peers.remember_former_peers(["elsewhere"], [])
     assert not names & peers._former.keys()
 
 

@@ -29,7 +29,7 @@ from toy import Status, Toy
 from multidrop.bus import Bus
 from multidrop.errors import Unconfirmed
 from multidrop.transport import bridge as bridge_module
-from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, hand_on_nothing_late
+from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, discard_late_bytes
 from multidrop.transport.exchange import WRITE_TIMEOUT
 from multidrop.transport.network_port import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, SocketPort, Telnet
 
@@ -428,7 +428,7 @@ def test_every_connection_limits_unacknowledged_data() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         near = socket.create_connection(listener.getsockname())
         far, _ = listener.accept()
-        hand_on_nothing_late(near)
+        discard_late_bytes(near)
         assert near.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8) == bytes([1, 0, 0, 0, 0, 0, 0, 0])
         near.close()
         with pytest.raises(ConnectionResetError):

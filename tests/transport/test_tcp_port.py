@@ -237,7 +237,7 @@ def test_two_lines_of_one_gateway_have_a_request_under_way_each(tmp_path: Path) 
 
 
 def test_one_unit_is_on_one_line_of_its_gateway(tmp_path: Path) -> None:
-    sentence = r'line "net-2", drive "pump-2": address 1 is that of line "net-1", drive "pump-1" already'
+    sentence = r'line "net-2", drive "pump-2": address 1 is already used by line "net-1", drive "pump-1"'
     with pytest.raises(PlantError, match=sentence):
         load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
 
@@ -251,7 +251,7 @@ def test_rtu_frames_behind_a_tcp_url_are_reported_and_end_the_connection() -> No
     answer = build_reply(Framing.RTU, Message(1, 3, data=b"\0\7"))
     with responder(answer) as (place, came), Bus(f"tcp://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
-        with pytest.raises(PortLost, match=f"has the shape of RTU over TCP: name the port socket://{place}"):
+        with pytest.raises(PortLost, match=f"looks like RTU over TCP: name the port socket://{place}"):
             drive.read(drive.output_current)
         assert parse_request(Framing.TCP, came[0])[0] == len(came[0])
         bus.line.regain()

@@ -10,7 +10,7 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome
 from multidrop.control.performer import Performer
 from multidrop.control.stops import Stopper
-from multidrop.control.time_limit import MOST_EXPIRY_S, checked_expiry
+from multidrop.control.time_limit import MOST_EXPIRY_S, check_expiry
 from multidrop.core import Latch, Message
 from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
@@ -70,7 +70,7 @@ class BusLink:
         expiry: float = MOST_EXPIRY_S,
         attempts: int = 1,
     ) -> bytes:
-        checked_expiry(expiry, "a read")
+        check_expiry(expiry)
         return self._exchanges.ask(drive, function, start, count, expiry, attempts)
 
     def send_raw(self, drive: Drive, function: int, start: int, data: bytes, count: int) -> bytes:

@@ -32,7 +32,7 @@ class AuditLog:
         line = json.dumps({"time": format_time(utc_ns), **record}, ensure_ascii=False)
         whole = (b"\n" if self._is_truncated() else b"") + line.encode(errors="backslashreplace") + b"\n"
         if self._file.write(whole) < len(whole):
-            raise OSError(f"{self.path}: there was room for a part of a record only")
+            raise OSError(f"{self.path}: only a part of a record was written")
 
     def sync(self) -> None:
         """Flush all records to the disk. Raises OSError."""

@@ -165,7 +165,7 @@ class IdentityCheck:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
                 f"nothing is written to {drive.name}: it refuses what every {kind} answers ({refusal})",
-                rule="it does not last like its family",
+                rule="it does not answer like its family",
             ) from refusal
         if drive.identity_is_weak and (rivals := easily_mistaken_for(drive)):
             with timed():
@@ -259,7 +259,7 @@ class IdentityCheck:
             if not self._exchanges.has_answered(drive):
                 self._echo.read_any(drive, 1, insists=True)
         except (WriteForbidden, DriveException) as refusal:
-            if refused and drive.is_passing(refused.code):
+            if refused and drive.is_temporary(refused.code):
                 return None
             is_certain = isinstance(refusal, WriteForbidden) and refusal.rule == ANOTHER_FAMILY
             return Suspicion(str(refusal), is_certain)

@@ -156,7 +156,7 @@ def _present(drive: Drive, register: Register[float]) -> Script[float]:
     """Return the setpoint in force, in Hz."""
     held = (yield from read(register)) if register.readable else drive.commanded
     if held is None:
-        raise WriteForbidden(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
+        raise WriteForbidden(f"{drive.name} cannot report its setpoint: call set_frequency before a ramp")
     if register.unit != "%":
         return held
     most = drive.option.get("maximum_frequency")

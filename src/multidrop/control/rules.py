@@ -131,7 +131,7 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
         state = yield from drive.state.script()
     except Unsupported:
         raise _not_now(
-            drive, register, "it changes only while the motor stands, which the family cannot say"
+            drive, register, "it changes only while the motor stands, which the family cannot report"
         ) from None
     if state.condition not in (Condition.STOPPED, Condition.FAULT):
         raise _not_now(drive, register, f"it changes only while the motor stands; state: {state}")

@@ -26,15 +26,11 @@ def present_limit_ns() -> float:
     return _limit.get()()
 
 
-def checked_expiry(expiry: float, what: str) -> float:
-    """Return `expiry`; raise ValueError unless it is a positive number of seconds."""
+def check_expiry(expiry: float) -> None:
+    """Raise ValueError unless `expiry` is a positive number of seconds."""
     is_number = isinstance(expiry, (int, float)) and not isinstance(expiry, bool)
     if not is_number or not 0 < expiry <= MOST_EXPIRY_S:
-        raise ValueError(
-            f"expiry = {expiry!r} is not a number of seconds above 0 for {what}'s turn to come, "
-            f"{MOST_EXPIRY_S:.0f} at most"
-        )
-    return expiry
+        raise ValueError(f"expiry = {expiry!r} is not a number of s above 0, at most {MOST_EXPIRY_S:.0f}")
 
 
 def _called(limit: Limit) -> float:

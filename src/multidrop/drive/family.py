@@ -340,7 +340,7 @@ class Drive(RegisterAccess):
         """Return the meaning of an exception code in this family."""
         return self.exceptions.get(code, "a code that the document does not explain")
 
-    def is_passing(self, code: int) -> bool:
+    def is_temporary(self, code: int) -> bool:
         """Return True for a temporary exception: the request arrived damaged, or the drive was busy."""
         return code in self.exceptions and code in self.damaged | self.later
 
@@ -355,7 +355,7 @@ class Drive(RegisterAccess):
         if why := doubt(self._kind(), self.declared_in, identifies=self._identifies()):
             raise WriteForbidden(
                 f"{what} is not sent to {self.name}: {why}, and declare confirmed = 1",
-                rule="nobody has confirmed what it is",
+                rule="the drive is not confirmed",
                 advice=Advice.declare("confirmed", 1),
             )
 
@@ -400,7 +400,7 @@ class Drive(RegisterAccess):
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
-            why = f"{self.name} cannot say its setpoint:"
+            why = f"{self.name} cannot report its setpoint:"
         elif held == 0:
             why = f"the setpoint of {self.name} is 0:"
         elif self.commanded is not None and held != self.commanded:

@@ -51,12 +51,12 @@ def doubt(family: str, declared_in: str, *, identifies: bool) -> str:
     """Return why a drive of this class must be confirmed; "" if it need not be."""
     if declared_in:
         return (
-            f"{declared_in} declares it, which nobody has tested: read `multidrop check "
-            f"{declared_in}` against the manual and look at its name plate"
+            f"its class is the untested file {declared_in}: compare `multidrop check {declared_in}` with the "
+            "manual, and read the drive's name plate"
         )
     if not identifies:
         return (
-            f"its class has no `identify` that could tell a {family} from another drive, to which the same "
-            "may mean a start; look at its name plate"
+            f"its class cannot identify a {family}, and the same write may start another make: read the "
+            "drive's name plate"
         )
     return ""

@@ -136,7 +136,7 @@ class _Reader:
         try:
             raws = self._ask(block)
         except DriveException as refusal:
-            if refusal.code == ILLEGAL_FUNCTION or self.drive.is_passing(refusal.code):
+            if refusal.code == ILLEGAL_FUNCTION or self.drive.is_temporary(refusal.code):
                 raise
         except NoReply:
             self._check_answers()  # some drives do not answer a read of a missing parameter

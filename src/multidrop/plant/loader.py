@@ -108,9 +108,9 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     name, port = given.get("name", ""), given.get("port", "")
     if name:
         place.attempt(check_drive_name, name)
-        place.once("line", name, sentence="another line has this name too; every line needs its own")
+        place.once("line", name, sentence="another line already has this name; each line needs its own")
     if port and not speaks_tcp(port):  # several lines may have one tcp:// port, each its own connection
-        place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
+        place.once("port", port, sentence=f"port {port} is already used by {{first}}; make them one line")
     if port:
         place.attempt(check_port, port)
     settings: dict[str, Any] = {
@@ -149,9 +149,9 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     given = place.check(table, _DRIVE | _option_keys(model))
     if "name" in given:
         place.attempt(check_drive_name, given["name"])
-        place.once("drive", given["name"], sentence="{first} has this name too; every drive needs its own")
+        place.once("drive", given["name"], sentence="{first} already has this name; each drive needs its own")
     if "address" in given:
-        sentence = f"address {given['address']} is that of {{first}} already; give every drive its own"
+        sentence = f"address {given['address']} is already used by {{first}}; give each drive its own"
         wire = line["port"] if speaks_tcp(line["port"]) else place.labels[0]
         place.once("address", wire, given["address"], sentence=sentence)
     every = duration_of(given, "every", place)

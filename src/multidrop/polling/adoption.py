@@ -47,14 +47,16 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
 
     for line in plant.lines:
         where = f'line "{line.name}"'
-        once(where, "line", line.name, "another line has this name too; every line needs its own")
+        once(where, "line", line.name, "another line already has this name; each line needs its own")
         wire = line.port if speaks_tcp(line.port) else where
         if wire is where:
-            once(where, "port", line.port, f"port {line.port} is that of {{first}} too; make them one line")
+            once(
+                where, "port", line.port, f"port {line.port} is already used by {{first}}; make them one line"
+            )
         for polled in line.drives:
             drive, at = polled.drive, f'{where}, drive "{polled.drive.name}"'
-            once(at, "drive", drive.name, "{first} has this name too; every drive needs its own")
-            address = f"address {drive.address} is that of {{first}} already; give every drive its own"
+            once(at, "drive", drive.name, "{first} already has this name; each drive needs its own")
+            address = f"address {drive.address} is already used by {{first}}; give each drive its own"
             once(at, "address", (wire, drive.address), address)
             if not is_free(drive):
                 found.append(f"{at}: it is on another bus: detach it there first, or make another")
@@ -80,18 +82,8 @@ def _mistakes(place: str, check: Callable[[], object]) -> list[str]:
     return []
 
 
-def has_same_port(line: PlantLine, other: PlantLine) -> bool:
-    """Return True if both lines can use the same open port."""
-    facts, others = ((each.port, each.echo, each.ids, each.rs485, each.settle) for each in (line, other))
-    return facts == others
-
-
-def is_same_drive(drive: Drive, other: Drive) -> bool:
-    """Return True if both objects describe the same drive with the same options."""
-    return drive is other or _description(drive) == _description(other)
-
-
 def _description(drive: Drive) -> tuple[object, ...]:
+    """Return the facts that are equal for two objects of the same drive with the same options."""
     return (
         type(drive),
         drive.address,
@@ -111,7 +103,8 @@ def drive_changes(present: Iterable[PolledDrive], wanted: Iterable[PolledDrive])
     left = list(present)
     changes = DriveChanges(left, [], [])
     for polled in wanted:
-        same = next((each for each in left if is_same_drive(each.drive, polled.drive)), None)
+        description = _description(polled.drive)
+        same = next((each for each in left if _description(each.drive) == description), None)
         if same is None:
             changes.joining.append(polled)
             continue
@@ -121,7 +114,7 @@ def drive_changes(present: Iterable[PolledDrive], wanted: Iterable[PolledDrive])
     return changes
 
 
-GONE = "its line is polled no more"
+GONE = "its line is no longer polled"
 
 
 @dataclass(frozen=True)
@@ -333,9 +326,12 @@ def _is_free(drive: Drive, buses: set[Bus]) -> bool:
 
 def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
     """Return True if a line can change without reopening its port."""
+    facts, others = (
+        (each.port, each.echo, each.ids, each.rs485, each.settle) for each in (line.declared, wanted)
+    )
     settings = line.bus.line.only_settings
     wanted_settings = {(at.baudrate, at.format) for at in (polled.drive.settings for polled in wanted.drives)}
-    return has_same_port(line.declared, wanted) and (settings is None or wanted_settings <= {settings})
+    return facts == others and (settings is None or wanted_settings <= {settings})
 
 
 def _is_another(drive: Drive, wanted: PlantLine) -> bool:

@@ -108,8 +108,8 @@ class Rows(ArrowTable):
     def __array__(self, *how: object, **details: object) -> NoReturn:
         """Raise TypeError, because `pandas.DataFrame(batch)` would convert the rows to one array."""
         raise TypeError(
-            "rows are columns of several types, not one array: take them with batch.to_pandas(), "
-            "batch.to_polars(), or what speaks Arrow, such as pyarrow.record_batch(batch)"
+            "a batch has columns of several types and is not one array: use batch.to_pandas(), "
+            "batch.to_polars(), or an Arrow library: pyarrow.record_batch(batch)"
         )
 
     def __arrow_c_schema__(self) -> Any:

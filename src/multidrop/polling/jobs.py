@@ -33,8 +33,8 @@ class RowNames:
         for names, of in ((of_drives, "drives"), (of_registers, "registers")):
             if len(names) > MOST_NAMES:
                 raise ValueError(
-                    f"{len(names)} names of {of} since polling began are too many for one poller, which "
-                    f"has numbers for {MOST_NAMES}: begin another"
+                    f"{len(names)} names of {of} since polling started are too many for one poller: at most "
+                    f"{MOST_NAMES}; start another one"
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:

@@ -24,7 +24,7 @@ from multidrop.transport.open_port import check_port
 
 OPENING = 32  # number of ports opened concurrently, so that a slow one delays no other
 ENDING_NS = 1_000_000_000  # how long to wait for in-flight exchanges
-NOBODY = 0  # reserved: never a line's number
+NO_LINE = 0  # reserved: never a line's number
 MOST_LINES = (1 << 16) - 1  # limit of a row queue's line numbers
 
 

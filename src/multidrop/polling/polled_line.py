@@ -327,7 +327,7 @@ class PolledLine:
     def tend(self, now_ns: int) -> None:
         """Process the results of queued exchanges, and queue the next ones.
 
-        Never raises. A failure, such as one in a user's own class, is logged; polling is tried again later,
+        Never raises. A failure, such as one in a user's own class, is logged; polling is retried later,
         and until then the line's rows are misses with the status POLLING_FAILED.
         """
         if self._is_left:  # the lock may be held until the port is closed
@@ -343,7 +343,7 @@ class PolledLine:
         self._failures += 1
         self._retry_ns = now_ns + delay_ns
         self.failure = words_of(failure)
-        said = "line %s: polling failed, and is tried again in %g s: %s\n%s"
+        said = "line %s: polling failed, and is retried in %g s: %s\n%s"
         log_aside(_log, logging.ERROR, said, self.name, delay_ns / 1e9, self.failure, traceback_of(failure))
 
     def _is_sound(self, now_ns: int) -> bool:
@@ -396,7 +396,7 @@ class PolledLine:
             if now_ns - self._learnt_ns >= LEARN_NS:
                 self._learn(now_ns)
             self._observe(now_ns)
-            self._refusals.heed(now_ns)
+            self._refusals.update(now_ns)
             self._queue.keep_busy(port, now_ns)
             self._miss_unasked(now_ns)
 

@@ -44,7 +44,7 @@ class Refusals:
             f"{job.owner.name}.{register.name}" for job in self._set_aside for register in job.block.registers
         ]
 
-    def heed(self, now_ns: int) -> None:
+    def update(self, now_ns: int) -> None:
         """Split or set aside refused blocks, and restore those that are answered again."""
         for trial in [trial for trial in self._trials if trial.rows.is_answered]:
             self._make_whole(trial, now_ns)
@@ -59,7 +59,7 @@ class Refusals:
             elif job not in self._set_aside:
                 self._put_aside(job, now_ns)
         for job in [job for job in self._schedule.jobs if job.may_be_too_long and job.rows.failures]:
-            self._heed_silence(job, now_ns)
+            self._split_unanswered(job, now_ns)
         if self._probes:
             self._end_probes()
 
@@ -69,7 +69,7 @@ class Refusals:
         if not count or job in self._trials or job is self._probes.get(job.drive):
             return False
         is_part = len(job.block.registers) > 1 and job in self._wholes
-        return count >= (1 if is_part else REFUSALS) and not job.owner.is_passing(job.rows.refusal)
+        return count >= (1 if is_part else REFUSALS) and not job.owner.is_temporary(job.rows.refusal)
 
     def _put_aside(self, job: PolledJob, now_ns: int) -> None:
         if job not in self._rare:
@@ -78,7 +78,7 @@ class Refusals:
         rare.rows.refusals = job.rows.refusals
         self._set_aside[rare] = job
         self._schedule.replace([job], [rare], now_ns)
-        said = "%s is refused (code %02XH), and asked rarely from now on"
+        said = "%s is refused (code %02XH), and polled rarely from now on"
         log_aside(_log, logging.INFO, said, job.name, job.rows.refusal)
 
     # ---- blocks ----
@@ -90,7 +90,7 @@ class Refusals:
             self._wholes[part] = self._wholes.get(job, job)
         self._schedule.replace([job], parts, now_ns)
         why = f"is refused (code {job.rows.refusal:02X}H)" if job.rows.refusals else "is not answered"
-        said = "%s with %d more %s, and asked for in two parts"
+        said = "%s with %d more %s, and polled in two parts"
         log_aside(_log, logging.INFO, said, job.name, len(job.block.registers) - 1, why)
 
     def _try_rarely(self, whole: PolledJob, now_ns: int) -> None:
@@ -113,7 +113,7 @@ class Refusals:
 
     # ---- silence ----
 
-    def _heed_silence(self, job: PolledJob, now_ns: int) -> None:
+    def _split_unanswered(self, job: PolledJob, now_ns: int) -> None:
         """Split a block that may be too long, once the drive is seen to answer shorter requests."""
         peer, drive = job.exchange.peer, job.owner
         if job.rows.is_answered or job in self._trials:

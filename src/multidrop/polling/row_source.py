@@ -16,7 +16,7 @@ from multidrop.core.undisturbed import undisturbed
 from multidrop.errors import PollingFailed
 from multidrop.polling.batch import Batch
 from multidrop.polling.jobs import RowNames
-from multidrop.polling.line_set import NOBODY
+from multidrop.polling.line_set import NO_LINE
 from multidrop.transport import clock
 from multidrop.transport.wakeup import WakeUp
 
@@ -38,8 +38,8 @@ def check_function(function: object) -> None:
 
 
 _DEFERS = (
-    "on_batch takes a plain function, and {!r} is async or a generator: it would be called and never carried "
-    "out. In asyncio, wait for poller.fileno() to be readable and call poller.take(): docs/howto/asyncio.md"
+    "on_batch takes a plain function, and {!r} is async or a generator: a call would not run it. In asyncio, "
+    "iterate over the poller with `async for`: docs/howto/asyncio.md"
 )
 
 
@@ -72,7 +72,7 @@ class BatchCaller:
             pass  # the poller has logged it, and raises it itself
         except BaseException as failure:  # of any kind: the caller of close() must see it
             self._failure = failure
-            _log.error("on_batch: the function failed, and is called no more", exc_info=failure)
+            _log.error("on_batch: the function failed and is no longer called", exc_info=failure)
 
     def join(self) -> None:
         """Wait until the function has had the last batch. Does nothing if called by the function itself."""
@@ -177,10 +177,10 @@ class RowSource:
         check_function(function)
         with self._changing:
             if self._caller:
-                raise ValueError("on_batch has a function already, which gets every batch")
+                raise ValueError("on_batch already has a function")
             if self._closing:
-                raise ValueError("polling has ended: no batches come any more")
+                raise ValueError("polling has ended: there are no more batches")
             self._caller = BatchCaller(self.batches(every=every), function)
 
     def _call_thread(self) -> None:
-        self._row_queue.call(NOBODY)
+        self._row_queue.call(NO_LINE)

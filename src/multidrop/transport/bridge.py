@@ -53,7 +53,7 @@ def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
     port.stopbits = int(format[2])
 
 
-def hand_on_nothing_late(connection: socket.socket) -> None:
+def discard_late_bytes(connection: socket.socket) -> None:
     """Make the kernel cut a connection that stalls, and discard unsent bytes when it is closed.
 
     Such bytes could start a motor, even after this process has died. Windows before 11 may not support the

@@ -253,7 +253,7 @@ class Exchanges:
         """Return smaller blocks to read instead of a failed block; raise the failure if they cannot help."""
         block = read.block
         if isinstance(failure, DriveException):
-            helps = failure.code != ILLEGAL_FUNCTION and not drive.is_passing(failure.code)
+            helps = failure.code != ILLEGAL_FUNCTION and not drive.is_temporary(failure.code)
         else:
             helps = read.may_be_too_long and block not in prepared.answered and self._is_there(drive, block)
         if helps and (parts := halves(drive, block)):

@@ -32,10 +32,7 @@ from multidrop.transport.open_port import OpenPort, check_port, is_lost_by, reas
 
 _log = logging.getLogger("multidrop.line")
 
-FOREIGN = (
-    "%s: another master: %d bytes came before anything was asked; nothing but stops is sent until the "
-    "line has been silent"
-)
+FOREIGN = "%s: another master: %d unexpected bytes came; only stops are sent until the line has been silent"
 
 
 class LineLog:
@@ -101,7 +98,9 @@ class LineLog:
 
 LOGGING_S = 1.0  # how long closing waits for the log thread
 
-UNOPENED = "it is not opened: this process is not its master, and could end the master's connection"
+UNOPENED = (
+    "it is not opened: this process is not its master, and opening it could end the master's connection"
+)
 
 
 class Line:

@@ -36,7 +36,7 @@ def mixed_up(port: str, received: bytes) -> str:
     is_shaped = other and (_is_tcp(received) if other.startswith("tcp") else _is_rtu(received))
     if not is_shaped:
         return ""
-    return f"; this has the shape of {spoken_on(other)}: name the port {other} in place of {port}"
+    return f"; this looks like {spoken_on(other)}: name the port {other} in place of {port}"
 
 
 def silence_hint(port: str) -> str:

@@ -27,7 +27,7 @@ from multidrop.core import (
 from multidrop.drive.line_settings import MODBUS_PORT, SCHEMES, URLS, speaks_tcp, url_of
 from multidrop.errors import LineError, NoSuchPort
 from multidrop.transport import clock, port_identity
-from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
+from multidrop.transport.bridge import PORT_FAILURES, Bridge, discard_late_bytes, set_up
 from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.network_port import RFC2217Port, SocketPort
 from multidrop.transport.port_identity import USBAdapter, adapter_of
@@ -41,7 +41,7 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 def overruns(fd: int) -> int:
     """Return the number of overruns since the driver was loaded. Raises OSError if they are not counted."""
     if sys.platform != "linux":
-        raise OSError("Linux alone counts them")
+        raise OSError("only Linux counts them")
     import fcntl  # which Windows lacks
 
     counts = bytearray(_ICOUNTER.size)
@@ -93,7 +93,7 @@ def why_lost(port: str, error: int, received: bytes) -> str:
     if error != errno.EPROTO:
         return os.strerror(error) if error else "hung up"
     shown = received[:16].hex(" ").upper() or "a damaged header"
-    return f"what came is no Modbus TCP: {shown}{mixed_up(port, received)}"
+    return f"the received bytes are not Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
 _FOR_PROGRAMS = ("loop", "spy")  # pyserial's; without options, as spy://DEVICE?file=PATH empties that file
@@ -246,7 +246,8 @@ class OpenPort:
             raise LineError(
                 self.name,
                 f"another adapter has this name now ({found or 'none on USB'}, and not {self._adapter}); "
-                "if it is meant, begin anew; a name in /dev/serial/by-id stays with its adapter",
+                "if that is intended, restart the program; a name in /dev/serial/by-id always means the same "
+                "adapter",
             )
 
     def _drive(self, port: serial.SerialBase) -> Port:
@@ -256,7 +257,7 @@ class OpenPort:
             opened = Port(descriptor_of(port), must_take(device), mastership=self._mastership)
             return self._switched(opened, device)
         if connection := connection_of(port):
-            hand_on_nothing_late(connection)
+            discard_late_bytes(connection)
         if connection and not is_bridged(port):
             connection.setblocking(False)
             ids = _TRANSACTIONS[self._ids] if speaks_tcp(self.name) else Transactions.NONE

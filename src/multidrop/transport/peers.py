@@ -44,7 +44,7 @@ def _made_ns(device: str) -> int:
         return clock.now_ns()
 
 
-def remember_owing(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
+def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
     """Remember the peers (with addresses) whose late replies are still due when their port is closed."""
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
@@ -114,7 +114,7 @@ class Peers:
         """Close the line; late replies still due are remembered for the next opening of the port."""
         names = self._names()
         self._line.close()
-        remember_owing(names, [(address, peer) for (address, *_), peer in self._known.items()])
+        remember_former_peers(names, [(address, peer) for (address, *_), peer in self._known.items()])
 
     def _names(self) -> set[str]:
         return identities_of(self._line.identity, self._line.port)

@@ -160,7 +160,7 @@ def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
         drive = bus.attach(pump, address=2)
         with pytest.raises(WriteForbidden, match=r"`multidrop check pump\.toml`") as refused:
             drive.write(drive.register(name), drive.register(name).parse(value))
-        assert refused.value.rule == "nobody has confirmed what it is"
+        assert refused.value.rule == "the drive is not confirmed"
         assert simulated_writes(line) == []
 
 
