@@ -75,7 +75,7 @@ SECOND: dict[tuple[str, str], set[str]] = {
     ("start", "x"): {"yd1000"},
     ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # cannot be seen to stand
     ("reset_fault", "?"): {"invt-che", "delixi-native"},  # by one pulse
-    ("reset_fault", "ok"): {"yd1000"},  # by a pulse and a stop
+    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # by a pulse and further words
 }
 HEAD, *ROWS = [line.split() for line in TABLE.strip().splitlines()]
 REPEATED = (("fresh", "stop"), ("tripped", "stop"), ("running", "coast"), ("running", "set_frequency"))

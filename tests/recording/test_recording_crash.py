@@ -474,6 +474,8 @@ def test_other_columns_are_not_a_recording(tmp_path: Path, suffix: str) -> None:
         open_recording(path)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("uses_dictionary", [True, False])
 def test_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, uses_dictionary: bool) -> None:
     """A few kilobytes of zstd can hold gigabytes of names, by a dictionary or as they are."""

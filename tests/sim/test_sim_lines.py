@@ -14,7 +14,8 @@ from pathlib import Path
 import checksums
 import pytest
 from kills import descriptors, threads
-from ptys import PATIENCE, opened, receive
+from lines import until
+from ptys import opened, receive
 from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
@@ -117,7 +118,7 @@ class Broken(Wire):
 def ask_in_vain(broken: Wire) -> None:
     with Simulator([broken]) as sim, opened(broken.path) as fd:
         os.write(fd, build_request(Framing.RTU, READ))
-        sim._thread.join(PATIENCE)
+        until(lambda: sim.failure)
 
 
 def test_a_failure_in_the_simulator_s_thread_is_raised_on_exit() -> None:
