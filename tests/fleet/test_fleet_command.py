@@ -199,7 +199,7 @@ def test_a_missing_extra_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPat
     said = one_sentence(run("fleet", "status"))
     assert said.endswith(
         f"`multidrop fleet` needs {library}, which is not installed: "
-        "pip install 'nats-py[nkeys]>=2.10' 'pyarrow>=16'"
+        "pip install 'nats-py[nkeys]>=2.10' 'pyarrow>=16'  # multidrop[fleet]"
     )
 
 

@@ -31,7 +31,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return the blocks to read from this drive as proofs.
 
     Each has the range of raw counts that its reply is known to hold, or None. The last block is the least
-    likely to be polled. With fewer than ENOUGH of them, a Modbus device's other tables are read too.
+    likely to be polled. If a Modbus device has fewer than ENOUGH of them, its other tables are read too.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -42,7 +42,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
         found = [*known, *found[1:]]
     if probe := drive.echo_probe:  # its reply cannot be mistaken for an echo
         found = [(Block.of(drive, [probe]), None), *found]
-    if len(found) < ENOUGH and drive.framing is not Framing.DELIXI:
+    if len(found) < ENOUGH and not known and drive.framing is not Framing.DELIXI:
         found += [(block, None) for block in _of_other_tables(drive, [block for block, _ in found])]
     if len(found) >= MOST_PROOFS:
         return [*found[: MOST_PROOFS - 1], found[-1]]
