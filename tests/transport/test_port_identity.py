@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -115,6 +118,35 @@ def test_a_port_is_opened_again_with_the_same_adapter_alone(
                     found.reopen()
             assert found.is_lost != is_same
         found.close()
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path, is_replaced: bool) -> None:
+    """It belongs to anyone. A link that was replaced leads to the right one."""
+    link = tmp_path / "port"
+    ends = pty.openpty()
+    device = Path(os.ttyname(ends[1]))
+    link.symlink_to(device)
+    found = Line(str(link))
+    found.open()
+    for end in ends:
+        os.close(end)
+    with pytest.raises(LineError, match="no such port"):
+        found.reopen()
+    with ExitStack() as stack:
+        time.sleep(0.05)  # steps of the files' clock have some milliseconds
+        while not device.exists():  # other processes make terminals too
+            for end in pty.openpty():
+                stack.callback(os.close, end)
+        if is_replaced:
+            link.unlink()
+            link.symlink_to(device)
+            found.reopen()
+            found.close()
+        else:
+            with pytest.raises(LineError, match=r"its pseudo-terminal is gone, and .* is another one"):
+                found.reopen()
+            assert found.is_lost
 
 
 def test_a_plant_file_gets_the_name_that_lasts(

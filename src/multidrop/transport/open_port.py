@@ -30,7 +30,7 @@ from multidrop.transport import clock, port_identity
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, discard_late_bytes, set_up
 from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.network_port import RFC2217Port, SocketPort
-from multidrop.transport.port_identity import USBAdapter, adapter_of
+from multidrop.transport.port_identity import PseudoTerminal, USBAdapter, adapter_of, pseudo_terminal_of
 
 # struct serial_icounter_struct of linux/serial.h
 _TIOCGICOUNT = 0x545D
@@ -214,6 +214,7 @@ class OpenPort:
         self._settle = settle
         self._serial: serial.SerialBase | None = None
         self._adapter: USBAdapter | None = None  # the adapter at the first opening
+        self._terminal: PseudoTerminal | None = None  # the pseudo-terminal at the last opening
 
     def open(self) -> Port:
         """Open the port, wait for `settle` s, discard the input, and return the core's port.
@@ -221,6 +222,7 @@ class OpenPort:
         Raises LineError or one of PORT_FAILURES; the caller must then call `close`.
         """
         port = self._serial = unopened(self.name)
+        terminal = self._terminal_now()
         port.timeout = 0
         if isinstance(port, serial.Serial):
             port.exclusive = True
@@ -228,6 +230,7 @@ class OpenPort:
         port.open()
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
             self._require_same_adapter(device_of(port))
+        self._terminal = terminal
         self.identity = identity_of(port, self.name)
         if self._settle:
             clock.sleep(self._settle)
@@ -236,6 +239,16 @@ class OpenPort:
         with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)  # without it, a USB adapter delays bytes by up to 16 ms
         return core
+
+    def _terminal_now(self) -> PseudoTerminal | None:
+        """Return the pseudo-terminal to open. Raises LineError for a later one of the same number.
+
+        It may be anyone's, such as a shell's, and even opening it would change its settings.
+        """
+        found = pseudo_terminal_of(self.name)
+        if self._terminal and found and self._terminal.is_replaced_by(found):
+            raise LineError(self.name, f"its pseudo-terminal is gone, and {found.device} is another one now")
+        return found
 
     def _require_same_adapter(self, device: str) -> None:
         """Raise LineError if another adapter has this name now, because its line has other motors."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from multidrop.core import is_pseudo_terminal
 from multidrop.drive.line_settings import MODBUS_PORT, speaks_tcp
 
 TTYS = Path("/sys/class/tty")
@@ -50,6 +51,36 @@ def _text(file: Path) -> str:
         return ""
 
 
+@dataclass(frozen=True)
+class PseudoTerminal:
+    """A pseudo-terminal, and the links that lead to it. The system gives its number to a later one."""
+
+    device: str
+    changed_ns: int  # later for another terminal of the same number
+    links: tuple[tuple[int, int], ...]  # inode and time of each; different for a replaced link
+
+    def is_replaced_by(self, other: PseudoTerminal) -> bool:
+        """Return True if the same links now lead to another terminal."""
+        return (self.device, self.links) == (other.device, other.links) and self != other
+
+
+def pseudo_terminal_of(name: str) -> PseudoTerminal | None:
+    """Return the pseudo-terminal of this name; None if there is none."""
+    path = Path(name)
+    links: list[tuple[int, int]] = []
+    try:
+        while path.is_symlink() and len(links) < MOST_LINKS:
+            link = path.lstat()
+            links.append((link.st_ino, link.st_mtime_ns))
+            path = path.parent / path.readlink()
+        if is_pseudo_terminal(str(path)):
+            return PseudoTerminal(str(path), path.stat().st_ctime_ns, tuple(links))
+    except OSError:
+        pass
+    return None
+
+
+MOST_LINKS = 40
 BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's serial number
 _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
 
