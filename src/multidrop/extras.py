@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from importlib.metadata import PackageNotFoundError, requires
 
 
 def install_command(extra: str) -> str:
@@ -12,6 +11,8 @@ def install_command(extra: str) -> str:
     It names the libraries, because `multidrop[extra]` is found only beside the sources. The extra follows as
     the shell's comment.
     """
+    from importlib.metadata import PackageNotFoundError, requires  # most programs never need it
+
     try:
         found = [one.partition(";") for one in requires("multidrop") or ()]
     except PackageNotFoundError:

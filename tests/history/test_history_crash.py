@@ -22,13 +22,13 @@ from multidrop.history.folder import listing
 from multidrop.history.history import History
 
 pytest.importorskip("duckdb", reason="needs duckdb")
-SUPPORT = Path(histories.__file__).parent
+SUPPORT = os.pathsep.join(map(str, Path(histories.__file__).parents[1].iterdir()))
 
 
 def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
     """Let it record for a while, and kill it; return how many rows it said that it had written."""
     words = [sys.executable, histories.__file__, str(folder), str(run)]
-    here = {**os.environ, "PYTHONPATH": str(SUPPORT)}
+    here = {**os.environ, "PYTHONPATH": SUPPORT}
     with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True) as child:
         assert child.stdout is not None
         assert child.stdout.readline()  # it is recording
