@@ -41,7 +41,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
     port->must_take = must_take;
     port->turn.line.transactions = (uint8_t)transactions;
     port->is_watched = 1;
-    /* Make the port raw before the first read: with VMIN 0 a read returns 0, as after a hang-up. */
+    /* Make the port raw before the first read: with VMIN 0, an empty read returns 0, as after a hang-up. */
     struct md_settings settings;
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
         md_port_set(fd, &settings);
@@ -185,12 +185,12 @@ static int is_attended(const struct md_port *port)
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion, double *values)
 {
-    struct md_engine *engine = port->engine; /* the port may not exist at the end */
+    struct md_engine *engine = port->engine; /* read now: the port may be freed before the end */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
                                .completion = completion};
     md_engine_enter(engine);
     int64_t late_until_ns = exchange->drive->late_until_ns;
-    if (port->is_closing) { /* the engine has stopped serving it */
+    if (port->is_closing) { /* the engine has stopped serving this port */
         *completion = (struct md_completion){.result = MD_LINE_LOST};
     } else {
         md_turn_add_urgent(&port->turn, &urgent);
@@ -205,8 +205,8 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
     return exchange->values ? md_values(exchange->values, &completion->reply, values) : 0;
 }
 
-/* The engine's thread holds its mutex from the check to the end of write(2). Once this thread has held the
- * mutex after resetting the deadline, no write is in flight. */
+/* The engine's thread holds its mutex from the check of the deadline to the end of write(2). Once this thread
+ * has held the mutex after resetting the deadline, no write is in flight. */
 void md_mastership_end(struct md_mastership *mastership)
 {
     __atomic_store_n(&mastership->until_ns, 0, __ATOMIC_SEQ_CST);

@@ -9,16 +9,16 @@
 
 /* The fields behind address and function code. */
 enum layout {
-    NONE,       /* no such function */
+    NONE,       /* the framing has no such function */
     RANGE,      /* start, count */
     DATA,       /* byte count, data */
     ECHO,       /* start, two bytes */
     RANGE_DATA, /* start, count, byte count, data */
-    LONG        /* start, four bytes: all of Delixi's */
+    LONG        /* start, four bytes: every Delixi body */
 };
 
 static const struct fields {
-    uint8_t start, count, byte_count; /* 1: the layout has this field */
+    uint8_t start, count, byte_count; /* 1: the layout has the field, 0: not */
     uint8_t data_len;                 /* data bytes of a layout without a byte count */
 } fields_of[] = {
     [RANGE] = {.start = 1, .count = 1},
@@ -52,7 +52,7 @@ static const struct function {
 
 enum {
     EXCEPTION_BODY = 3,
-    NO_PATH = 0x0A, /* of a gateway: it cannot reach the unit, or has no reply from it */
+    NO_PATH = 0x0A, /* a gateway's exceptions: no path to the unit, no reply from it */
     NO_TARGET = 0x0B,
     DELIXI_BODY = 8
 };
@@ -107,7 +107,7 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
-/* Write only the bytes that exist: clearing the rest costs more than parsing. */
+/* Write only the data bytes that the body has: clearing the others costs more than parsing. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
     const struct fields *fields = &fields_of[layout];
@@ -164,7 +164,7 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
     const struct function *function = find_function(framing, request->function);
     if (have >= 1 && (body[0] != request->address || !is_answered(framing, request->address)))
         return MD_BAD_ADDRESS;
-    if (request->function & MD_EXCEPTION_BIT) /* invalid: no request sets this bit */
+    if (request->function & MD_EXCEPTION_BIT) /* an invalid request: only exceptions set this bit */
         return MD_BAD_FUNCTION;
     if (have < 2)
         return MD_INCOMPLETE;
@@ -266,7 +266,7 @@ static int confirms(int framing, const uint8_t *body, const struct md_message *r
         return start == request->start && md_get16(body + 4) == request->count;
     case ECHO:
         return start == request->start && memcmp(body + 4, request->data, 2) == 0;
-    case LONG: /* state 0 does not exist: such a reply would equal the query */
+    case LONG: /* value 0 does not exist: that reply would equal the query */
         return (request->function == MD_DELIXI_STATE_QUERY ? start != 0 : start == request->start) &&
                (request->function == MD_DELIXI_PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
     default:
@@ -289,7 +289,7 @@ int md_body_put_reply(int framing, const struct md_message *message, uint8_t *bo
         return MD_BAD_REQUEST;
     if (!message->exception)
         return (int)put_body(find_function(framing, message->function)->reply, message, body);
-    if (framing == MD_DELIXI) { /* the rest is 0: "no meaning" */
+    if (framing == MD_DELIXI) { /* the other bytes are 0: "no meaning" */
         body[1] = message->exception;
         return DELIXI_BODY;
     }

@@ -63,7 +63,7 @@ static size_t skip_header(struct md_channel *channel, const uint8_t *packet, siz
     return len;
 }
 
-/* Append a packet to its channel; 0 without room. */
+/* Append a packet to its channel; return 0 if the channel is full. */
 static int put(struct md_channel *channel, const uint8_t *packet, size_t len, uint64_t ticks)
 {
     struct md_piece piece = {.is_after_pause = 1};
@@ -132,7 +132,7 @@ int md_unpack(struct md_capture *capture)
 
 /* ---- frames of sniffed bytes ---- */
 
-enum { MOST_NOISE = 3 }; /* bytes between a request and its reply; more may hide a lost request */
+enum { MOST_NOISE = 3 }; /* most bytes between a request and its reply; more may be a damaged request */
 
 /* Return the index of the first pause after this piece. */
 static size_t end_of_run(const struct md_stream *stream, size_t piece)
@@ -157,7 +157,7 @@ static int is_echoed(int framing, uint8_t function)
     return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
-/* Return 1 for a Delixi request. It looks like a reply, but the value in a query is 0. */
+/* Return 1 for a Delixi request. A reply looks alike, but the value in a query is 0. */
 static int is_delixi_request(const struct md_message *message)
 {
     static const uint8_t zeros[4];
@@ -180,7 +180,7 @@ static int find_request(int framing, const uint8_t *bytes, size_t len, struct md
 
 enum { HEAD = 6 };
 
-/* Read the first bytes of the body; missing ones are 0. */
+/* Read the first bytes of the body; bytes that have not come yet count as 0. */
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[HEAD])
 {
     memset(head, 0, HEAD);
@@ -217,7 +217,7 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
     }
     int used = md_parse_reply(framing, bytes, len, &guess, message);
     if (used > 0 && guess.function <= 0x04)
-        message->count = 0; /* unknown */
+        message->count = 0; /* a reply does not contain it */
     return used;
 }
 
@@ -275,7 +275,7 @@ static int is_ruled_out(const struct md_piece *piece)
     return piece->side == MD_FAILED || piece->side == MD_NOISE;
 }
 
-/* Parse the frame at `at` in the splitter's piece; `end` is the end of its run. */
+/* Parse the frame at `at` in the splitter's piece; `end` is the index of the next pause. */
 static int look_at(const struct md_splitter *splitter, const struct md_stream *stream, size_t at, size_t end,
                    struct md_span *span)
 {
@@ -311,7 +311,7 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
     span->at = splitter->at;
     span->len = at - splitter->at;
     if (!span->len && is_junk) {
-        span->kind = MD_JUNK; /* does not affect the frames around it */
+        span->kind = MD_JUNK; /* the position between frames, and so their parsing, stays the same */
         size_t next = splitter->piece + 1;
         splitter->at = next < stream->count ? pieces[next].at : stream->len;
         span->len = splitter->at - span->at;
@@ -376,7 +376,7 @@ static uint64_t key_of(int framing, const struct md_message *request)
            start << 24 | (uint64_t)request->count << 40;
 }
 
-/* Find the slot of the key, or the empty one for it. */
+/* Return the slot that holds the key, or else the empty slot for it. */
 static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
 {
     size_t place = (size_t)(key * 0x9E3779B97F4A7C15u >> 32);
@@ -407,7 +407,7 @@ static void put_written(struct md_message *reply, int framing, const struct md_m
         md_copy_message(reply, request);
 }
 
-/* Add the rows of the last request: its reply, or why it has none. Return 0 without room. */
+/* Add the rows of the last request: values, or why there is no reply. Return 0 if the columns are full. */
 static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
 {
     struct md_completion *completion = &decoder->completion;
@@ -442,7 +442,7 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* Set the failure that follows from the bytes received instead of a reply. */
+/* Add these bytes to those received instead of a reply, and set the failure that follows from them all. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -456,7 +456,7 @@ static void explain(struct md_decoder *decoder, const struct md_stream *stream)
     decoder->failure = md_reason(splitter->framing, &splitter->request, completion->raw, completion->raw_len);
 }
 
-/* A gateway's exception means that the drive did not reply. */
+/* Return the reply's length; MD_NO_REPLY if it is a gateway's exception for a silent drive. */
 static int reply_result(const struct md_span *span)
 {
     return md_is_from_gateway(span->framing, &span->message) ? MD_NO_REPLY : (int)span->len;
@@ -469,7 +469,7 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
     case MD_REQUEST:
     case MD_EITHER:
         if (!decoder->is_sure)
-            decoder->block = NULL; /* the frame may be a confirmation, which needs no reply */
+            decoder->block = NULL; /* it may be a reply to a write: then no further reply comes */
         int undone = take_request(decoder, columns);
         if (undone)
             return undone;

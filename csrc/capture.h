@@ -9,11 +9,11 @@
 
 /* The sender of bytes. A capturing master uses the last two values for bytes that are not frames. */
 enum md_side {
-    MD_EITHER_SIDE, /* unknown */
+    MD_EITHER_SIDE, /* unknown sender */
     MD_ASKING,
     MD_ANSWERING,
-    MD_FAILED, /* bytes instead of a reply */
-    MD_NOISE,  /* stray bytes, echo, late replies */
+    MD_FAILED, /* bytes that came instead of a good reply */
+    MD_NOISE,  /* stray bytes, echoes, late replies */
     MD_SIDES
 };
 
@@ -21,12 +21,12 @@ enum md_side {
 struct md_tap {
     uint8_t *ring;
     uint32_t room;       /* bytes, a power of two */
-    uint32_t put, taken; /* bytes written and read so far, modulo 2^32; one writer each */
+    uint32_t put, taken; /* bytes written and read so far, modulo 2^32; one thread changes each */
     uint64_t lost;       /* bytes dropped because the ring was full */
-    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC of the next bytes; 0: use the reader's */
+    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC for the next bytes; 0: the reader's value */
 };
 
-/* Header and trailer of a packet. Each side has two: for bytes that start with ':', and for all others. */
+/* Header and trailer of a packet. Each side has two such pairs: for bytes that start with ':', and others. */
 struct md_wrapping {
     const uint8_t *head, *tail;
     uint32_t head_len, tail_len; /* tail_len is a multiple of 4 */
@@ -42,7 +42,7 @@ void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int 
 
 /* ---- capture.c: return 1; 0 without room (md_stream_put), or without enough bytes (md_split) ---- */
 
-/* Bytes that came together, from `at` to the next piece. */
+/* Bytes that were received together, from index `at` to the start of the next piece. */
 struct md_piece {
     size_t at;
     int64_t time_ns;
@@ -55,22 +55,22 @@ struct md_stream {
     uint8_t *bytes;
     struct md_piece *pieces;
     size_t len, room, count, most; /* bytes, and room for bytes; pieces, and room for pieces */
-    int is_all;                    /* the stream is complete */
-    int is_tcp;                    /* all frames are Modbus TCP; otherwise none is */
+    int is_all;                    /* no more bytes will come */
+    int is_tcp;                    /* 1: all frames are Modbus TCP; 0: no frame is */
 };
 
 enum md_kind {
     MD_JUNK,    /* not a frame */
     MD_REQUEST,
     MD_EITHER,  /* a request, or the reply that repeats it; the bytes before were not a frame */
-    MD_REPLY,   /* to the previous request */
+    MD_REPLY,   /* the reply to the previous request */
     MD_STRAY    /* a reply without its request */
 };
 
 /* A frame, or junk between frames. */
 struct md_span {
     size_t at, len;
-    int64_t time_ns; /* time and side of its first piece */
+    int64_t time_ns; /* of its first piece, as is `side` */
     int side;
     int kind, framing;
     struct md_message message;
@@ -78,14 +78,14 @@ struct md_span {
 
 /* The splitter's position in a stream; all zero: the start. */
 struct md_splitter {
-    size_t at, piece;          /* the next byte, and its piece */
+    size_t at, piece;          /* index of the next byte, and of its piece */
     size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* the last bytes were a frame: a request and its copy are distinguishable */
+    int is_in_step;            /* a frame ended at `at`; else a request looks like its copy */
     int awaited, framing;      /* `awaited`: the reply to `request` is due, in this framing */
-    struct md_message request; /* the last one */
+    struct md_message request; /* the last request */
 };
 
-/* Append a piece. */
+/* Append these bytes as a piece; 0: no room. */
 int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
 /* Discard the bytes before the splitter's position. */
 void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
@@ -95,21 +95,21 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
 
 /* ---- capture.c: return an enum md_decoded ---- */
 
-/* The fields of a request's reply; key 0: an empty slot. */
+/* The fields in the reply to requests with this key; key 0: an empty slot. */
 struct md_known {
     uint64_t key;
     const struct md_block *block;
 };
 
-/* The state of decoding. All zero except `known` and `places`, a power of two: the start. */
+/* The state of decoding. At the start all is zero except `known` and its length `places`, a power of two. */
 struct md_decoder {
     struct md_splitter splitter;
     struct md_span span;
     struct md_known *known;
     size_t places, taken;
-    const struct md_block *block; /* of the last request */
+    const struct md_block *block; /* fields in the reply to the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* the last frame was certainly a request; its result without a reply */
+    int is_sure, failure;         /* 1: the last frame was surely a request; its result if no reply comes */
     int is_due;                   /* `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;
@@ -135,7 +135,7 @@ enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* link types with a header
 struct md_channel {
     uint32_t link;
     int has_sides;        /* the packets state their direction reliably */
-    uint64_t ticks_per_s; /* of the packets' time stamps */
+    uint64_t ticks_per_s; /* unit of the packets' time stamps */
     int64_t offset_ns;
     struct md_stream stream;
 };
@@ -150,13 +150,13 @@ struct md_capture {
 
 enum md_unpacked {
     MD_UNPACKED,      /* the whole file */
-    MD_CHANNEL_FULL,  /* split the channels' bytes and repeat */
+    MD_CHANNEL_FULL,  /* a stream is full: call md_split() for the channels, then repeat */
     MD_OTHER_BLOCK,   /* another pcapng block at `at`, which the caller must read */
     MD_CUT,           /* the file ends within a packet */
     MD_NONSENSE       /* invalid packet at `at` */
 };
 
-/* Append packets to their channels' streams. */
+/* Append packets to their channels' streams until the caller must act: see enum md_unpacked. */
 int md_unpack(struct md_capture *capture);
 /* cdef: end */
 

@@ -101,7 +101,7 @@ static void prefetch(struct md_port *const *ports, int n, int next)
 #include <sys/prctl.h>
 #endif
 
-enum { READY = 256 }; /* ports handled at a time */
+enum { READY = 256 }; /* most ports handled between two waits */
 
 static int64_t earliest(const struct md_engine *engine)
 {
@@ -120,7 +120,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
     if (n > 0)
         return n;
     int64_t late = md_now_ns() - until_ns;
-    if (left > 0 && late >= 0) { /* otherwise the thread did not sleep */
+    if (left > 0 && late >= 0) { /* only if the thread did sleep */
         late = sooner(late, MD_MOST_LATENESS);
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
     }
@@ -129,7 +129,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
 
 /* ---- ports come and go ---- */
 
-/* Make room for one more port; 0 without memory. */
+/* Make room for one more port; return 0 if there is no memory. */
 static int grow(struct md_engine *engine)
 {
     if (engine->count < engine->room)
@@ -147,7 +147,7 @@ static int grow(struct md_engine *engine)
     return 1;
 }
 
-/* Open the arriving ports; their clients wait until then. Only this thread may use the waiter. */
+/* Add the arriving ports, for which their clients wait. Only this thread may use the waiter. */
 static void open_ports(struct md_engine *engine)
 {
     for (struct md_port *port = engine->arriving; port; port = port->next) {
@@ -164,7 +164,7 @@ static void open_ports(struct md_engine *engine)
     engine->arriving = NULL;
 }
 
-/* Close the closing ports; their clients wait until then. */
+/* Remove the closing ports, for which their clients wait. */
 static void close_ports(struct md_engine *engine)
 {
     for (unsigned i = engine->count; i-- > 0;) {
@@ -184,7 +184,7 @@ static void close_ports(struct md_engine *engine)
 
 /* ---- the thread ---- */
 
-/* Serve the readable ports; return the time afterwards, 0 if there were none. */
+/* Serve the readable ports; return the time afterwards, or 0 if no port was readable. */
 static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
 {
     int64_t now_ns = 0;
@@ -208,7 +208,7 @@ static int may_have_news(const struct md_port *port)
     return port->turn.source == MD_NO_SOURCE || port->turn.line.listened_ns;
 }
 
-/* Block SIGPIPE: writing to a port source far end is closed must not end the process. */
+/* Block SIGPIPE: writing to a port whose far end is closed must not end the process. */
 static void ignore_broken_pipes(void)
 {
 #ifndef _WIN32

@@ -14,10 +14,10 @@
 struct md_rs485 {
     int mode;        /* enum md_rs485_mode */
     int reports_end; /* the driver reports when the last bit has left */
-    int is_sending;  /* RTS makes the transceiver send */
-    int64_t sent_ns; /* when the last bit leaves if the UART started immediately */
+    int is_sending;  /* RTS now makes the transceiver send */
+    int64_t sent_ns; /* when the last bit leaves, if the UART sends without delay */
     int64_t look_ns; /* time of the next check whether the last bit has left */
-    int64_t empty_ns; /* when the driver's queue was found empty; 0: not yet */
+    int64_t empty_ns; /* when the driver's queue was found empty; 0: not found yet */
     int64_t character_ns;
 };
 
@@ -25,19 +25,19 @@ struct md_port {
     /* fields for every exchange */
     int fd;
     int must_take;     /* mask of refused settings that are failures; -1: a port without settings */
-    unsigned index;    /* among the engine's ports */
+    unsigned index;    /* index among the engine's ports */
     int is_blind;      /* no useful bytes come before the port's wake time */
-    int is_watched;    /* the waiter reports when it is readable */
+    int is_watched;    /* the waiter reports when the port is readable */
     int is_empty;      /* the last read left no bytes */
     int is_closing;
-    struct md_settings settings; /* in force; baudrate 0: not yet set */
+    struct md_settings settings; /* the port's present settings; baudrate 0: unknown */
     struct md_engine *engine;
     const struct md_mastership *mastership; /* NULL: this process is always the master */
     struct md_rs485 rs485;
     struct md_turn turn;
 
     uint32_t heard_term;  /* term of the mastership that last listened to the line; 0: none */
-    struct md_port *next; /* in the engine's list of arriving ports */
+    struct md_port *next; /* next port in the engine's list of arriving ports */
     int is_opened, open_error, is_closed;
 };
 
@@ -49,7 +49,7 @@ struct md_engine {
     int has_news;           /* `changed` must be signalled */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
-    struct md_port *arriving; /* clients wait until these are open */
+    struct md_port *arriving; /* ports to be added; their clients wait */
     struct md_port **ports;
     int64_t *wakes; /* latest wake time for each port */
     unsigned count, room;
@@ -58,10 +58,10 @@ struct md_engine {
 
 /* This process's right to send on its lines, which ends at a deadline. */
 struct md_mastership {
-    int64_t until_ns;         /* deadline, of CLOCK_BOOTTIME; accessed atomically; 0: no right to send */
-    int64_t guard_ns;         /* least time between two masters */
+    int64_t until_ns;         /* deadline by CLOCK_BOOTTIME; accessed atomically; 0: no right to send */
+    int64_t guard_ns;         /* least time between the requests of two masters */
     uint32_t term;            /* terms so far; another process may be master between two terms */
-    struct md_engine *engine; /* the engine that checks it; NULL: none yet */
+    struct md_engine *engine; /* the engine whose ports check it; NULL: no port yet */
 #ifdef __linux__
     timer_t timer;
 #endif
@@ -79,7 +79,7 @@ enum { MD_MOST_LATENESS = 80000 };
 void md_engine_enter(struct md_engine *engine); /* take the mutex */
 void md_engine_leave(struct md_engine *engine);
 void md_engine_wake(struct md_engine *engine);
-void md_engine_await(struct md_engine *engine, const int *is_done); /* with the mutex */
+void md_engine_await(struct md_engine *engine, const int *is_done); /* the caller holds the mutex */
 
 /* ---- port.c: on the engine's thread ---- */
 
@@ -90,9 +90,9 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 /* ---- rs485.c ---- */
 
 int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
-/* Switch the transceiver to sending, then write; return as write(2). */
+/* Switch the transceiver to sending, then write; return the same as write(2). */
 ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
-/* Switch the transceiver to receiving once the last bit has left; 0, or -errno if the port is lost. */
+/* Switch the transceiver to receiving if the last bit has left; return 0, or -errno if the port is lost. */
 int md_rs485_look(struct md_port *port, int64_t now_ns);
 
 /* ---- system calls on a descriptor; on Windows it is a handle, and windows/ has these functions ---- */
@@ -129,14 +129,14 @@ static inline ssize_t md_descriptor_write(int fd, const void *bytes, size_t len)
     return write(fd, bytes, len);
 }
 
-/* Switch the driver to its RS-485 mode; 0, -errno. */
+/* Switch the driver to its RS-485 mode; return 0 or -errno. */
 static inline int md_descriptor_take_rs485(int fd)
 {
 #ifdef __linux__
     struct serial_rs485 mode;
     if (ioctl(fd, TIOCGRS485, &mode))
         return -errno;
-    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* keep a configured polarity */
+    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* keep a polarity that is set */
         mode.flags |= SER_RS485_RTS_ON_SEND;
     mode.flags |= SER_RS485_ENABLED;
     if (ioctl(fd, TIOCSRS485, &mode) || ioctl(fd, TIOCGRS485, &mode))
@@ -154,7 +154,7 @@ static inline int md_descriptor_set_rts(int fd, int is_up)
     return ioctl(fd, is_up ? TIOCMBIS : TIOCMBIC, &rts) ? -errno : 0;
 }
 
-/* Return 1 if the UART reports that its last bit has left, 0 if not, -errno if it does not report it. */
+/* Return 1 if the UART reports that its last bit has left, 0 if not, -errno if it cannot report that. */
 static inline int md_descriptor_is_shifted_out(int fd)
 {
 #ifdef TIOCSERGETLSR
@@ -166,7 +166,7 @@ static inline int md_descriptor_is_shifted_out(int fd)
 #endif
 }
 
-/* Return 1 if the driver reports unsent bytes. */
+/* Return 1 if the driver reports that its queue has unsent bytes. */
 static inline int md_descriptor_is_queued(int fd)
 {
     int queued = 0;

@@ -114,7 +114,7 @@ static int open_rtu(const uint8_t *bytes, size_t len, const struct md_message *r
 
 int md_tcp_length(const uint8_t *bytes, size_t len)
 {
-    if (len >= 4 && md_get16(bytes + 2) != 0) /* the protocol id is always 0 */
+    if (len >= 4 && md_get16(bytes + 2) != 0) /* in Modbus TCP the protocol id is always 0 */
         return MD_NO_START;
     if (len < MD_TCP_HEAD)
         return MD_INCOMPLETE;
@@ -135,7 +135,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     if (md_tcp_is_exception(bytes, len, request))
         whole = MD_TCP_EXCEPTION;
     else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && (len < 4 || !md_get16(bytes + 2)))
-        return MD_INCOMPLETE; /* may become an exception with a wrong length */
+        return MD_INCOMPLETE; /* it may become an exception with a wrong length in its header */
     if (whole <= 0)
         return whole;
     size_t have = len < (size_t)whole ? len : (size_t)whole;
@@ -150,7 +150,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     return whole;
 }
 
-/* Find the body of the frame that `bytes` start with: in place, or decoded into `text`. */
+/* Find the body of the frame at the start of `bytes`: in place, or (of a text frame) decoded into `text`. */
 static int open_frame(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                       uint8_t text[MD_MOST_BODY + 1], const uint8_t **body)
 {
@@ -254,8 +254,8 @@ int md_reply_length(int framing, const struct md_message *request)
 
 /* ---- why a request has no reply ---- */
 
-/* Rank reasons by how specific they are. The most specific one is reported, of equal ones the first. The
- * search goes on inside a frame from another address, because the expected frame may start there. */
+/* Rank reasons by how specific they are. The most specific reason is reported; among equals, the first. The
+ * search continues inside a frame from another address, because the expected frame may start there. */
 static int weight(int reason)
 {
     static const uint8_t weights[] = {

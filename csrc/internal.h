@@ -17,24 +17,24 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
 /* Count a reply with its delay and the least line time of its exchange. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 uint64_t md_replies(const struct md_drive *drive);
-const uint64_t *md_usual_delays(const struct md_drive *drive); /* the bucket of the smoothed delay */
+const uint64_t *md_usual_delays(const struct md_drive *drive); /* counter of the smoothed delay's bucket */
 
 /* ---- clock.c ---- */
 
-/* Return the same as md_utc_minus_monotonic_ns(), for a caller that has just read CLOCK_MONOTONIC. */
+/* Return the same as md_utc_minus_monotonic_ns(); `now_ns` was just read from CLOCK_MONOTONIC. */
 int64_t md_utc_ahead_ns(int64_t now_ns);
 
 /* ---- columns.c, row_queue.c ---- */
 
-/* Append one row for each of the block's fields; return how many, 0 without room. */
+/* Append one row for each of the block's fields; return the number of rows, 0 if there is no room. */
 int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
-/* Count the block's fields without a value in a good reply. */
+/* Return the number of the block's fields that have no value in a good reply. */
 uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
 /* Keep the queue until it is released, even if its client frees it. */
 void md_row_queue_hold(struct md_row_queue *row_queue);
 void md_row_queue_release(struct md_row_queue *row_queue);
-/* Append the exchange's rows to the newest chunk; `block` NULL: none. */
+/* Append the exchange's rows to the newest chunk; `block` NULL: it has no rows. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);
 /* cdef: end */
@@ -53,7 +53,7 @@ int md_body_reply_length(int framing, const struct md_message *request);
 int md_body_put_request(int framing, const struct md_message *message, uint8_t *body);
 int md_body_put_reply(int framing, const struct md_message *message, uint8_t *body);
 void md_body_get_request(int framing, const uint8_t *body, struct md_message *message);
-/* Read a whole reply; 0 if it does not confirm its request. */
+/* Read a whole reply into `message`; return 0 if the reply does not confirm its request. */
 int md_body_get_reply(int framing, const uint8_t *body, const struct md_message *request,
                       struct md_message *reply);
 
@@ -85,7 +85,7 @@ static inline uint8_t *md_put16(uint8_t *at, unsigned value)
 
 /* Copy only the used part of the data: most messages are short. */
 void md_copy_message(struct md_message *to, const struct md_message *from);
-int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1: not digits */
+int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1: not such digits */
 /* Return the length in a Modbus TCP header, or an enum md_frame_fault. */
 int md_tcp_length(const uint8_t *bytes, size_t len);
 /* Return 1 if the bytes start an exception to this request. An exception's length is fixed, although some
@@ -98,12 +98,12 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 
 /* ---- stats.c: delays and timeouts ---- */
 
-/* Return the delay from the end of a request to the read of the port, without the reply's time on the
+/* Return the delay from the end of a request to the read of the port, not counting the reply's time on the
  * wire. */
 int64_t md_look_ns(const struct md_exchange *exchange);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
-/* Return the time after a request by which its reply starts, with a margin; 0 if the drive is not steady,
- * or not known well enough. */
+/* Return the time after a request by which its reply starts, with a margin; 0 if the drive's delays vary too
+ * much or are not known well enough. */
 int64_t md_reply_due_ns(const struct md_exchange *exchange);
 /* Learn from a reply's delay (an upper bound if the first read found the reply whole); return the best
  * estimate of the delay. */
@@ -113,7 +113,7 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
 /* After a timeout, halve the longer timeout that md_learn_lateness() set. */
 void md_learn_silence(struct md_drive *drive);
-/* Return how long after an exchange's timeout late replies may come in any order. */
+/* Return the time after an exchange's timeout in which late replies may come in any order. */
 int64_t md_window_ns(const struct md_exchange *exchange);
 
 /* Set the drive's count of failures, which clients read at any time. */
@@ -128,8 +128,8 @@ static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
 /* The enhanced packet block of a pcapng file (draft-ietf-opsawg-pcapng, 4.3). */
 enum {
     MD_PACKET_BLOCK = 6,
-    MD_PACKET_HEAD = 28, /* bytes before a packet */
-    MD_PACKET_END = 4    /* bytes after it */
+    MD_PACKET_HEAD = 28, /* bytes before a packet's content */
+    MD_PACKET_END = 4    /* bytes after a packet's content */
 };
 
 void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *bytes, size_t len);
@@ -142,11 +142,11 @@ struct md_waiter *md_waiter_new(void); /* NULL: see errno */
 void md_waiter_free(struct md_waiter *waiter);
 /* Report `owner` whenever the descriptor is readable; -1: see errno. */
 int md_waiter_add(struct md_waiter *waiter, int fd, void *owner);
-/* Set whether a descriptor is watched. */
+/* Set whether the waiter reports this descriptor. */
 void md_waiter_change(struct md_waiter *waiter, int fd, void *owner, int watched);
 void md_waiter_remove(struct md_waiter *waiter, int fd);
-/* Wait at most `timeout_ns`, forever if it is negative; write the owners of readable descriptors, and return
- * how many. */
+/* Wait at most `timeout_ns`, forever if that is negative; write the owners of readable descriptors and return
+ * their number. */
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns);
 
 /* ---- termios.c ---- */
@@ -156,7 +156,7 @@ int md_port_keep_rts(int fd); /* let closing the port leave RTS unchanged; 0, -e
 /* ---- wakeup.c ---- */
 
 struct md_wakeup {
-    int fd, ringer; /* `fd` is readable from md_wakeup_ring() to md_wakeup_silence() */
+    int fd, ringer; /* `fd` is readable from md_wakeup_ring() until md_wakeup_silence() */
     atomic_int is_rung;
 };
 

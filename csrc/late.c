@@ -6,8 +6,8 @@
  * have come, or never will. Therefore outstanding requests are kept beyond the window, and a proof is sent
  * first: a request whose reply differs from all outstanding ones in function, length or value.
  *
- * A reply that fits an outstanding request counts as that one's. It accounts for the earliest request that
- * it fits, and for all requests before that one. */
+* A reply that fits an outstanding request counts as the reply to that request. It settles the earliest
+ * request that it fits, and all requests before that request. */
 #include "line.h"
 
 #include <string.h>
@@ -78,7 +78,7 @@ int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end)
     return end == 0 || reply->exception || reply->data_len < 2 || (value >= least && value < end);
 }
 
-/* Return the length of the reply at `bytes`, MD_INCOMPLETE, or why it does not fit. */
+/* Return the length of the reply at `bytes`, MD_INCOMPLETE, or why the bytes are not a reply to `owed`. */
 static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
 {
     struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
@@ -118,12 +118,12 @@ static void drop_time(struct md_owed *owed)
 /* ---- proofs ---- */
 
 /* Some proofs may not work: a device may be silent to registers that it lacks, and a document may be wrong
- * about a register's range. A proof that was never answered is dropped after MOST_FAILURES failures. A
+* about a register's range. A proof that was never answered is removed after MOST_FAILURES failures. A
  * missing reply counts only if the drive has replied to another request since the last failure. */
 enum { MOST_FAILURES = 2, ANSWERED = 0xFF };
 
-/* Return the index of this exchange in the drive's list of proofs, or proof_count if it is not a proof. Then
- * the list is not read, because it is elsewhere in memory and most exchanges are not proofs. */
+/* Return the index of this exchange in the drive's list of proofs, or proof_count if it is not a proof. In
+ * that usual case do not read the list, because its memory is rarely cached. */
 static uint32_t proof_at(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
@@ -160,7 +160,7 @@ void md_proof_end(const struct md_exchange *exchange, int result)
     int is_silent_to_it = result == MD_NO_REPLY && replies != drive->failed_at;
     if (result > 0)
         drive->proof_failures[at] = ANSWERED;
-    if (!is_silent_to_it && result != MD_BAD_ECHO) /* MD_BAD_ECHO: the value is out of its documented range */
+    if (!is_silent_to_it && result != MD_BAD_ECHO) /* MD_BAD_ECHO: the value is out of its range */
         return;
     drive->failed_at = replies;
     if (++drive->proof_failures[at] == MOST_FAILURES)
@@ -176,9 +176,9 @@ static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
 
 /* ---- outstanding requests of a drive ---- */
 
-static const int64_t FORGET_NS = INT64_C(120000000000); /* no path delays bytes for two minutes */
+static const int64_t FORGET_NS = INT64_C(120000000000); /* no network delays bytes by 2 minutes */
 
-/* Find the same request among the drive's outstanding ones. */
+/* Return the same request among the drive's outstanding requests; NULL: none. */
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)
@@ -192,7 +192,7 @@ int md_late_is_repeated(const struct md_exchange *exchange)
     return find_same(exchange->drive, exchange) != NULL;
 }
 
-/* Return 1 unless a reply to a later request has settled this one. */
+/* Return 1 unless a reply to a later request has settled this request. */
 static int is_open(const struct md_drive *drive, const struct md_owed *owed)
 {
     return last_ns(owed) > drive->answered_ns;
@@ -216,7 +216,7 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
 /* ---- requests that may be sent ---- */
 
 /* Return 1 if an outstanding reply could be mistaken for the exchange's reply. Outstanding replies to the
- * same request count only with `own`. */
+ * same request count only if `own` is 1. */
 static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
@@ -249,7 +249,7 @@ static int is_doubted(const struct md_exchange *exchange)
     return drive->is_doubted && drive->proof_count && !exchange->insists;
 }
 
-/* An exception carries no value, and proves nothing. */
+/* An exception is never in doubt here: it carries no value and settles no request. */
 int md_late_is_in_doubt(const struct md_exchange *exchange, const struct md_message *reply)
 {
     return is_doubted(exchange) && !reply->exception &&
@@ -276,7 +276,7 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
 }
 
 /* The last proof is reserved for a drive that answers again after a silence. During the silence this proof
- * was not sent, so its second reply at the latest settles all outstanding requests. */
+ * was not sent, so the second reply to it, at the latest, settles all outstanding requests. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
@@ -324,7 +324,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
         const struct md_exchange *proof = drive->proofs[n];
         if (is_free(drive, proof))
             return proof;
-        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* the latest settles most */
+        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* the last settles most */
             latest = proof;
     }
     return is_answering ? last_proof(drive) : latest;
@@ -390,8 +390,8 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 
 /* ---- late replies ---- */
 
-/* Account for the drive's earliest request that fits the reply at `at`: return its length, MD_INCOMPLETE or
- * MD_NO_START. A reply that fits a single old request shows how late the drive is. */
+/* Settle the drive's earliest request that the reply at `at` fits; return the reply's length, MD_INCOMPLETE
+ * or MD_NO_START. A reply that fits a single old request shows how late the drive is. */
 static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
 {
     struct md_owed *earliest = NULL;

@@ -1,8 +1,8 @@
 /* One line as a state machine: silence, request, reply or timeout. Bytes and times are arguments; it uses
  * neither a descriptor nor a clock.
  *
- * On real lines junk, an echo, or another station's frame may come before the reply. Neither those nor a
- * damaged frame end the exchange: the timeout keeps running (serial-line guide V1.02, 2.4.1). */
+ * On real lines junk, an echo, or another station's frame may come before the reply. Neither such bytes nor
+ * a damaged frame end the exchange: the timeout keeps running (serial-line guide V1.02, 2.4.1). */
 #include "line.h"
 
 #include <errno.h>
@@ -27,7 +27,7 @@ const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
 
 /* Before its first request a new master listens, because a line has only one master. Unexpected bytes are
  * another master's requests, or replies to them. They restart the wait, so that the first request leaves
- * after a long enough silence. The wait lasts at least for the guard time, in which the kernel's timer ends
+ * after a long enough silence. The wait lasts at least for the guard time, in which the kernel's timer kills
  * a suspended former master. On Modbus TCP, which shows no other master's frames, only the guard time counts.
  *
  * A stop does not wait: the motor must stop, even beside another master. */
@@ -57,7 +57,7 @@ void md_listen_put_back(struct md_line *line)
 
 void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns)
 {
-    if (line->transactions) /* on a network these bytes are a late reply to this process */
+    if (line->transactions) /* on a network, only replies to this process arrive */
         return;
     line->listened_ns = later(line->listened_ns, now_ns + line->listen_ns);
     line->foreign += (uint32_t)len;
@@ -65,7 +65,7 @@ void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns)
 
 static int end_listening(struct md_line *line, int64_t now_ns)
 {
-    if (!md_listen_is_held(line)) /* a stop; later exchanges keep listening */
+    if (!md_listen_is_held(line)) /* a stop ignores it; later exchanges listen */
         return 1;
     if (now_ns < line->listened_ns)
         return 0;
@@ -75,8 +75,8 @@ static int end_listening(struct md_line *line, int64_t now_ns)
 
 /* ---- what an exchange leaves: bytes for the tap, its completion, counts of its drive and block ---- */
 
-/* Return 1 if the result means that the drive is silent or unreachable. A damaged reply shows that it
- * answers. */
+/* Return 1 if the result means that the drive is silent or unreachable; 0 after a damaged reply, because the
+ * drive did answer. */
 static int is_failure(int result)
 {
     switch (result) {
@@ -114,7 +114,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
     md_proof_end(exchange, completion->result);
-    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* value out of range */
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* its value is out of range */
     if (is_failure(completion->result)) {
         md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
@@ -129,11 +129,11 @@ static void count(const struct md_exchange *exchange, const struct md_completion
 
 static void tap_bytes(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
 {
-    if (line->tap && md_line_is_under_way(line)) /* earlier bytes were put there as they came */
+    if (line->tap && md_line_is_under_way(line)) /* bytes before the request went to the tap as they came */
         md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
 }
 
-/* Give the tap the bytes since the request left: the reply, or the bytes instead of one, and the rest. */
+/* Pass the bytes since the request was sent to the tap: the reply or the bytes instead, and all others. */
 static void tap_received(const struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;
@@ -165,8 +165,8 @@ static void complete(struct md_line *line, struct md_ending ending)
 
 static const int64_t WORTH_WAITING = 250000; /* ns; a shorter sleep costs more than reading the port */
 
-/* Return the silence around an exchange. A network needs none, but without ids in replies a silence separates
- * them: a second copy of one could be mistaken for the next reply. */
+/* Return the silence around an exchange, in ns. A network needs no silence. If a gateway's replies have no
+ * matching ids, a silence separates them: a second copy of a reply could be mistaken for the next reply. */
 static int64_t silence_of(const struct md_line *line, const struct md_exchange *exchange)
 {
     enum { CHARACTERS = 4 };
@@ -187,7 +187,7 @@ static void finish(struct md_line *line, struct md_ending ending)
     md_line_go(line, MD_ENDED);
 }
 
-/* End the exchange with all bytes received. */
+/* End the exchange with this failure; the completion gets all bytes received. */
 static void fail(struct md_line *line, int result)
 {
     finish(line, (struct md_ending){result, 0, line->rx_len});
@@ -198,7 +198,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
     if (line->state == MD_IDLE)
         return;
     if (line->state >= MD_AWAITING && line->transactions != MD_MATCHED)
-        md_late_expect(line, md_window_ns(line->exchange)); /* it may come after a reopening of the port */
+        md_late_expect(line, md_window_ns(line->exchange)); /* it may come on the reopened port */
     line->completion->error = error;
     fail(line, result);
 }
@@ -234,7 +234,7 @@ static int load(struct md_line *line, const struct md_exchange *exchange)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns)
 {
-    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the rest has length fields */
+    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the other fields have lengths */
     completion->begun_ns = now_ns;
     completion->stale = line->rx_len;
     line->exchange = exchange;
@@ -257,7 +257,7 @@ int64_t md_line_silent_ns(const struct md_line *line)
     return line->quiet_ns + line->silence_ns;
 }
 
-/* Return the time from which the request may be sent. */
+/* Return the earliest time at which the request may be sent. */
 static int64_t free_ns(const struct md_line *line)
 {
     int64_t silent_ns = md_line_silent_ns(line);
@@ -267,7 +267,7 @@ static int64_t free_ns(const struct md_line *line)
 int md_line_want(struct md_line *line, int64_t now_ns)
 {
     switch (line->state) {
-    case MD_SILENCE: /* wait for a babbling line until give_up_ns only */
+    case MD_SILENCE: /* if bytes keep coming, wait until give_up_ns only */
         line->wake_ns = sooner(free_ns(line), line->give_up_ns);
         if (now_ns < line->wake_ns)
             return md_listen_is_held(line) ? MD_READ : MD_WAIT;
@@ -284,7 +284,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             now_ns + line->exchange->drive->most_timeout_ns + md_wire_ns(line->exchange, line->tx_len);
         return MD_WRITE;
     case MD_READY:
-    case MD_WRITING: /* a port that takes no bytes for so long is broken */
+    case MD_WRITING: /* if the port takes no bytes for so long, it is broken */
         if (now_ns < line->wake_ns)
             return MD_WRITE;
         md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);
@@ -299,7 +299,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         if (line->looks++ && line->rx_len < line->tx_len)
             line->missing_ns = line->looked_ns;
         line->looked_ns = now_ns;
-        if (now_ns >= line->wake_ns) /* this call may itself be late: read once more */
+        if (now_ns >= line->wake_ns) /* maybe only this call is late: read once more */
             md_line_go(line, MD_TIME_OUT);
         else if (now_ns < line->copy_by_ns)
             line->wake_ns = sooner(line->wake_ns, line->copy_by_ns);
@@ -343,7 +343,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
 
 /* ---- received bytes ---- */
 
-/* Make room by discarding the older half of rx. A reply that started there would be complete by now. */
+/* Make room by discarding the older half of rx. A reply that started in it would be complete by now. */
 static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
@@ -367,10 +367,10 @@ static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
     return taken;
 }
 
-/* Stray bytes delay the next request: it needs a silent line. */
+/* Process stray bytes. They delay the next request, which needs a silent line. */
 static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
-    line->quiet_ns = later(line->quiet_ns, now_ns); /* the last request may still be leaving */
+    line->quiet_ns = later(line->quiet_ns, now_ns); /* the port may still be sending the last request */
     if (line->listened_ns)
         md_listen_receive(line, len, now_ns);
     if (line->state != MD_IDLE)
@@ -405,7 +405,7 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
         if (md_tcp_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    if (line->state < MD_AWAITING) /* after bytes that are not Modbus TCP */
+    if (line->state < MD_AWAITING) /* no reply is awaited, and the bytes are not Modbus TCP */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
     for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* keep the bytes for the error message */
         at += keep(line, bytes + at, len - at);
@@ -437,7 +437,7 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
         if (md_reply_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    if (at < len) /* bytes after the reply that did not fit */
+    if (at < len) /* bytes after the reply, for which rx has no room */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes + at, len - at);
     if (line->state != MD_IDLE && now_ns < line->give_up_ns)
         md_line_go(line, MD_BYTES_IN_TIME);

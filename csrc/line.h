@@ -11,8 +11,8 @@ enum md_line_state {
     MD_IDLE,
     MD_SILENCE,   /* wait for the line to be silent for long enough */
     MD_CHECK,     /* read once, in case bytes came during the silence */
-    MD_READY,     /* the request may be written */
-    MD_WRITING,   /* part of the request has left */
+    MD_READY,     /* the request may be written now */
+    MD_WRITING,   /* part of the request has been written */
     MD_AWAITING,  /* wait for the reply, or for its rest */
     MD_LAST_LOOK, /* after the timeout: read once more, because the thread may be late */
     MD_LINE_STATES
@@ -20,13 +20,13 @@ enum md_line_state {
 
 enum md_line_event {
     MD_BEGUN,         /* an exchange starts */
-    MD_FELL_SILENT,   /* the line was silent for long enough, or babbled for too long */
+    MD_FELL_SILENT,   /* the line was silent for long enough, or never silent until the deadline */
     MD_NOTHING_CAME,
-    MD_STRAY_BYTES,   /* bytes before the request, with time left to wait for silence again */
+    MD_STRAY_BYTES,   /* bytes came before the request, and there is time to wait for silence again */
     MD_PART_LEFT,
     MD_ALL_LEFT,
     MD_TIME_OUT,
-    MD_BYTES_IN_TIME, /* bytes, but not the whole reply, and there is time left */
+    MD_BYTES_IN_TIME, /* bytes came, but not the whole reply, and there is time left */
     MD_ENDED,         /* the completion is filled in */
     MD_LINE_EVENTS
 };
@@ -40,9 +40,9 @@ enum { MD_RX_ROOM = 2 * MD_MOST_FRAME };
 
 enum md_want {
     MD_DONE,  /* the completion is filled in */
-    MD_WAIT,  /* wait until wake_ns; no useful bytes come before */
+    MD_WAIT,  /* wait until wake_ns; no useful bytes come before that */
     MD_WRITE, /* write tx[tx_at] to tx[tx_len], as much as the port takes */
-    MD_READ   /* read, or call again at wake_ns */
+    MD_READ   /* read when bytes come; call again at wake_ns at the latest */
 };
 
 struct md_line {
@@ -53,7 +53,7 @@ struct md_line {
     const struct md_exchange *exchange;
     struct md_completion *completion;
     int64_t quiet_ns;    /* time of the line's last activity */
-    int64_t silence_ns;  /* required silence after it */
+    int64_t silence_ns;  /* required silence after quiet_ns */
     int64_t listened_ns; /* end of listening, until which only stops are sent; 0: not listening */
     int64_t listen_ns;   /* required silence while listening */
     int64_t wake_ns;
@@ -64,49 +64,49 @@ struct md_line {
     int64_t copy_by_ns;  /* time by which an echo would be whole; 0: unknown */
     int64_t ready_ns;    /* no useful bytes come before this time */
     struct md_drive *late; /* the first drive with late replies due */
-    struct md_tap *tap;  /* gets all bytes of the line; NULL: none */
-    uint8_t echo;        /* enum md_echo, learnt; failures do not reset it */
-    uint8_t echo_is_configured; /* as echoing: never unlearnt */
+    struct md_tap *tap;  /* gets all bytes of the line; NULL: no tap */
+    uint8_t echo;        /* enum md_echo, learnt; failed exchanges do not reset it */
+    uint8_t echo_is_configured; /* the user states that the adapter echoes: final */
     uint8_t echo_due;    /* the adapter's copy of the request is still to come */
     uint8_t lone_copies; /* copies in a row that were accepted as replies, up to a bound */
     uint8_t transactions; /* enum md_transactions, set before the first exchange */
-    uint8_t is_out_of_step; /* the bytes are not Modbus TCP: give up the port */
+    uint8_t is_out_of_step; /* the received bytes are not Modbus TCP: give up the port */
     uint8_t is_adrift;      /* a frame's length contradicted its header: search for the next header */
     uint8_t is_proven;      /* a good reply came on this port */
     uint8_t is_quicker;     /* a reply came faster than a wire can carry it */
-    uint8_t waited;      /* since the request left: md_line_want() returned MD_WAIT */
-    uint32_t looks;      /* since the request left: reads of the port */
-    uint32_t cut;        /* since the request left: bytes of late replies */
+    uint8_t waited;      /* md_line_want() returned MD_WAIT since the request was sent */
+    uint32_t looks;      /* number of reads of the port since the request was sent */
+    uint32_t cut;        /* bytes of late replies since the request was sent */
     uint32_t foreign;    /* bytes received while listening */
-    uint16_t sight_at, sight; /* where the reply may start; its bytes in the first read */
-    uint16_t burst;      /* most characters that the adapter gathers; 0: possibly whole replies */
+    uint16_t sight_at, sight; /* where the reply may start; how many of its bytes the first read got */
+    uint16_t burst;      /* most characters that the adapter delivers together; 0: maybe whole replies */
     uint8_t rx[MD_RX_ROOM];
-    uint8_t long_tx[MD_MOST_FRAME]; /* a request that its exchange does not store */
-    uint16_t transaction;           /* of the last request */
+    uint8_t long_tx[MD_MOST_FRAME]; /* bytes of a request too long to be stored in its exchange */
+    uint16_t transaction;           /* transaction id of the last request */
     uint16_t frame_len, frame_tapped; /* bytes of an incomplete Modbus TCP frame; how many went to the tap */
     uint8_t frame[MD_MOST_TCP];
 };
 
 void md_line_init(struct md_line *line, int64_t now_ns);
-/* Start an exchange; it ends immediately if a late reply could be mistaken for its own. No byte leaves before
- * the line's silence is over. */
+/* Start an exchange; it ends immediately if a late reply could be mistaken for its own. No byte is sent
+ * before the line's silence is over. */
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
 int64_t md_line_silent_ns(const struct md_line *line);  /* end of the line's silence */
-/* Record that the port took `len` bytes between these two times. */
+/* Record that the port took `len` bytes of the request between these two times. */
 void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
-/* End the exchange in flight: the port failed, or the request must not leave. */
+/* End the exchange in flight, because the port failed or the request must not be sent. */
 void md_line_abandon(struct md_line *line, int result, int error);
 
 /* ---- line.c: listening for another master ---- */
 
-/* Listen before the request that is ready to leave: for the longest frame and the drive's timeout, and for
- * the guard at least; on a network, which shows no foreign frames, for the guard alone. Return 0 if there
- * is no need to wait. */
+/* Listen before the request that is ready to be sent: for the longest frame plus the drive's timeout, and at
+ * least for the guard time. On a network, which shows no other master's frames, only the guard time counts.
+ * Return 0 if no wait is needed. */
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns);
-void md_listen_put_back(struct md_line *line); /* undo the start of a waiting exchange */
+void md_listen_put_back(struct md_line *line); /* undo the start of an exchange that listens */
 
 /* ---- turn.c: the order of exchanges on a line; bytes and times are arguments ---- */
 
@@ -121,31 +121,31 @@ struct md_slot {
 /* An urgent request; it lives on the stack of its waiting caller. */
 struct md_urgent {
     const struct md_exchange *exchange;
-    int64_t not_before_ns; /* 0: immediately */
-    int64_t expires_ns;    /* of CLOCK_BOOTTIME; 0: never */
+    int64_t not_before_ns; /* earliest time to send it; 0: immediately */
+    int64_t expires_ns;    /* latest time to send it, by CLOCK_BOOTTIME; 0: no limit */
     struct md_completion *completion;
     struct md_urgent *next;
     int is_done;
 };
 
-/* The requests sent ahead of an exchange; all zero: none. */
+/* The requests sent ahead of an exchange; all zero if there are none. */
 struct md_before {
-    const struct md_exchange *then; /* the exchange */
+    const struct md_exchange *then; /* the exchange itself */
     uint64_t replies;               /* the drive's reply count before the last proof */
-    uint32_t proofs, is_probed;     /* proofs sent; its echo probe was sent */
+    uint32_t proofs, is_probed;     /* number of proofs sent; whether the echo probe was sent */
     uint32_t failures;              /* the drive's failures before the first of these requests */
 };
 
 struct md_turn {
     int source, last;     /* enum md_source: of the exchange in flight, and of the previous one */
     int is_ending;        /* start no polled exchange */
-    int has_done_urgent;  /* an urgent one ended; the engine resets this */
+    int has_done_urgent;  /* an urgent exchange ended; the engine resets this flag */
     struct md_urgent *urgent;
     const struct md_exchange *const *round; /* the repeated exchanges */
     uint32_t round_len, round_at;
     struct md_slot *slots; /* a ring buffer */
-    uint32_t room;         /* a power of two */
-    uint32_t is_idle;      /* the next submit must wake the thread */
+    uint32_t room;         /* number of slots, a power of two */
+    uint32_t is_idle;      /* md_turn_submit() must wake the thread */
     int64_t owed_ns;       /* line time that urgent requests still owe to polling */
     struct md_before before;
     struct md_row_queue *row_queue;
@@ -168,13 +168,13 @@ int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive);
 int64_t md_turn_counted_ns(const struct md_turn *turn, int64_t now_ns);
 /* Return the line's next action (enum md_want); MD_DONE: no exchange is due before wake_ns. */
 int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns);
-void md_turn_lose(struct md_turn *turn, int error); /* the port failed */
-void md_turn_close(struct md_turn *turn);           /* end everything */
+void md_turn_lose(struct md_turn *turn, int error); /* end all exchanges, because the port failed */
+void md_turn_close(struct md_turn *turn);           /* end all exchanges, because the port closes */
 /* cdef: end */
 
 /* ---- line.c ---- */
 
-/* Follow the table; an event that cannot happen in this state is ignored. */
+/* Change the state by the table; ignore an event that cannot happen in this state. */
 static inline void md_line_go(struct md_line *line, enum md_line_event event)
 {
     int next = md_line_follows[line->state][event];
@@ -182,7 +182,7 @@ static inline void md_line_go(struct md_line *line, enum md_line_event event)
         line->state = next;
 }
 
-void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns); /* bytes came while listening */
+void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns); /* bytes came meanwhile */
 
 /* Return 1 if the exchange in flight waits for the end of listening. Stops do not wait. */
 static inline int md_listen_is_held(const struct md_line *line)
@@ -206,31 +206,31 @@ static inline int md_line_is_under_way(const struct md_line *line)
 
 /* Start the wait for a reply of this length. */
 void md_reply_await(struct md_line *line, int reply_len);
-/* Search the received bytes for the reply; 1: the exchange ends. */
+/* Search the received bytes for the reply; return 1 if the exchange ends. */
 int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending);
-/* Set ready_ns to the time at which the rest of the reply can be there. */
+/* Set ready_ns to the earliest time at which the whole reply can have come. */
 void md_reply_foresee(struct md_line *line, int64_t now_ns);
 /* Return 1 if bytes came other than the request's echo. */
 int md_reply_has_begun(const struct md_line *line);
 /* End the exchange at its timeout. */
 struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns);
-/* Find late replies among stray bytes, from index `from` on; the reply is searched for after them. */
+/* Find late replies among stray bytes, from index `from` on. The search for the reply starts after them. */
 void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
 
-/* End the exchange if the reply at `at` is its own; 0: the reply was late, and was cut out. */
+/* End the exchange if the reply at `at` is its own; return 0 if that reply was late and was cut out. */
 int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
                    struct md_ending *ending);
 void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply);
-/* Extend the timeout after a late reply: this one may be as late. */
+/* Extend the timeout after a late reply, because the present reply may be as late. */
 void md_reply_extend(struct md_line *line);
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply);
-/* Remove bytes that belong to other exchanges. */
+/* Remove received bytes that belong to other exchanges. */
 void md_reply_cut_out(struct md_line *line, size_t at, size_t len);
 
 /* Return the transmission time of a frame on the drive's own wire, which may be behind a gateway. */
 static inline int64_t md_wire_ns(const struct md_exchange *exchange, int64_t len)
 {
-    enum { LONGER_THAN_RTU = 4 }; /* a header of six bytes, and no CRC of two */
+    enum { LONGER_THAN_RTU = 4 }; /* six bytes of header more, two bytes of CRC less */
     return (exchange->framing == MD_TCP ? len - LONGER_THAN_RTU : len) * exchange->character_ns;
 }
 
@@ -238,11 +238,11 @@ static inline int64_t md_wire_ns(const struct md_exchange *exchange, int64_t len
 
 /* Give the next request a new transaction id. */
 void md_tcp_begin(struct md_line *line);
-/* Exclude a partly received frame as the reply to the request that leaves now. */
+/* Exclude a frame that is partly received now as the reply to the request that is sent now. */
 void md_tcp_disown(struct md_line *line);
-/* Take bytes up to the end of a frame; return how many. */
+/* Take bytes up to the end of a frame; return their number. */
 size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
-/* Process the frame if it is whole; 1: the exchange ends. */
+/* Process the frame if it is whole; return 1 if the exchange ends. */
 int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending);
 /* End the exchange at its timeout. */
 struct md_ending md_tcp_missed(struct md_line *line);
@@ -255,40 +255,40 @@ int md_echo_is_due(const struct md_line *line, int reply_len);
 int md_echo_is_copy(const struct md_line *line, size_t at);
 /* Return 1 if an echo probe must be sent before the exchange. */
 int md_echo_is_in_doubt(const struct md_line *line);
-/* Drop bytes that came while the request left, except the start of its echo. */
+/* Drop bytes that came while the request was sent, except the start of its echo. */
 void md_echo_keep(struct md_line *line);
 
-/* Return 1 if the reply is an exception, or its one register is in least .. end - 1; `end` 0: any value. */
+/* Return 1 if the reply is an exception, or if its one register is in least .. end - 1 (`end` 0: any). */
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end);
 int md_is_read(int framing, uint8_t function);
 
 int md_proof_is(const struct md_exchange *exchange);
-/* Count the end of an exchange that may be a proof. */
+/* If the ended exchange is a proof, record whether the drive answered it. */
 void md_proof_end(const struct md_exchange *exchange, int result);
 
 /* ---- late.c: replies after their timeout ---- */
 
-/* Return the proof to send first, so that no late reply can be mistaken for this exchange's; NULL: none is
- * needed, or none helps. */
+/* Return the proof to send first, so that no late reply can be mistaken for this exchange's; NULL: no proof
+ * is needed, or none helps. */
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns);
-/* Return 1 if the reply may answer another process. */
+/* Return 1 if the reply may be to another process's request. */
 int md_late_is_in_doubt(const struct md_exchange *exchange, const struct md_message *reply);
 /* Return 1 if the exchange must not be sent now: a late reply could be mistaken for its own. */
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
-/* Return 1 if the same request is outstanding: then two equal replies do not show an echo. */
+/* Return 1 if the same request is outstanding: then two equal replies are no sign of an echo. */
 int md_late_is_repeated(const struct md_exchange *exchange);
 /* Record that the ended exchange's reply may still come, in any order within the window. */
 void md_late_expect(struct md_line *line, int64_t window_ns);
-/* Record that the drive's first reply may answer another process, and that the real one may still come. */
+/* Record that the drive's first reply may be to another process, so that its own reply may still come. */
 void md_late_doubt(struct md_line *line);
 /* Add a drive with outstanding requests to the line's list. */
 void md_late_link(struct md_line *line, struct md_drive *drive);
-/* Account for the late reply at `at`: return its length, MD_INCOMPLETE, or MD_NO_START. If it may answer the
- * exchange in flight instead, set `since_ns` to the time at which that request was first sent, 0: never.
- * Otherwise pass NULL. */
+/* Settle the earliest request that the reply at `at` fits; return its length, MD_INCOMPLETE, or MD_NO_START.
+ * If the reply also fits the exchange in flight, pass `since_ns`: it is set to the time at which that request
+ * was first sent earlier, 0: never. Otherwise pass NULL. */
 int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns);
 
-/* ---- counters with one writer, and readers on other threads ---- */
+/* ---- counters with one writer thread, and readers on other threads ---- */
 
 static inline uint32_t md_load(const uint32_t *counter)
 {

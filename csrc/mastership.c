@@ -13,7 +13,7 @@
 
 static int set_timer(struct md_mastership *mastership, int64_t at_ns)
 {
-    struct itimerspec once = {.it_value = timespec_of(at_ns)}; /* 0: disarm it */
+    struct itimerspec once = {.it_value = timespec_of(at_ns)}; /* time 0 disarms the timer */
     return timer_settime(mastership->timer, TIMER_ABSTIME, &once, NULL);
 }
 
@@ -75,7 +75,7 @@ int64_t md_mastership_until_ns(const struct md_mastership *mastership)
     return __atomic_load_n(&mastership->until_ns, __ATOMIC_SEQ_CST);
 }
 
-/* Read the deadline before the clock: if the process is suspended between the two, the check only gets
+/* Read the deadline before the clock: if the process is suspended between the two reads, the check only gets
  * stricter. */
 int md_mastership_holds(const struct md_mastership *mastership)
 {

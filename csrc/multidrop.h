@@ -13,14 +13,14 @@
 enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
-    MD_MOST_TCP = 260,        /* a frame of Modbus TCP */
+    MD_MOST_TCP = 260,        /* longest frame of Modbus TCP */
     MD_KEPT_FRAME = 24,       /* longest frame that an exchange stores; every read fits */
     MD_STATUSES = 22,         /* row statuses below MD_EXCEPTION */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
-    MD_MOST_OWED = 12,        /* outstanding requests of a drive */
+    MD_MOST_OWED = 12,        /* most outstanding requests of a drive */
     MD_MOST_PROOFS = 4,
-    MD_PAUSE_S = 10,          /* after such a silence another drive may be at the address */
+    MD_PAUSE_S = 10,          /* after so long a silence another drive may have the address */
     MD_TIMES_KEPT = 6         /* send times stored for one outstanding request */
 };
 
@@ -34,13 +34,13 @@ uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's checksum: the l
 
 enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI, MD_TCP };
 
-/* Why bytes are not a frame. */
+/* The reasons why bytes are not a frame. */
 enum md_frame_fault {
     MD_INCOMPLETE = 0,     /* more bytes are needed */
     MD_NO_START = -1,      /* not the start of a frame */
     MD_BAD_CHARACTER = -2, /* not an upper-case hex digit, or no CR LF at the end */
     MD_BAD_CHECKSUM = -3,
-    MD_BAD_ADDRESS = -4,  /* of another drive */
+    MD_BAD_ADDRESS = -4,  /* the address of another drive */
     MD_BAD_FUNCTION = -5, /* neither the request's function nor its exception */
     MD_BAD_LENGTH = -6,   /* byte count or quantity does not match the request */
     MD_BAD_ECHO = -7,     /* the reply to a write repeats another address or value */
@@ -104,10 +104,10 @@ int64_t md_utc_minus_monotonic_ns(void);
 
 /* ---- stats.c, late.c: a drive's statistics; return a time in ns ---- */
 
-/* Counts of a drive's exchanges; all but longest_ns only grow. `values` counts fields of the blocks. */
+/* Counters of a drive's exchanges; all except longest_ns only grow. `values`: number of values read. */
 struct md_counters {
     uint64_t exchanges, answered, values;
-    uint64_t sent;        /* requests of which at least one byte left */
+    uint64_t sent;        /* requests of which at least one byte was sent */
     uint64_t stray_bytes; /* bytes outside of replies */
     uint64_t ideal_ns;    /* least line time of the answered exchanges */
     int64_t longest_ns;   /* longest response delay */
@@ -117,12 +117,12 @@ struct md_counters {
 struct md_owed {
     int64_t sent_ns[MD_TIMES_KEPT]; /* earliest first; the last element is the latest time */
     uint32_t times;
-    uint32_t end;   /* range of the reply, as in md_exchange */
+    uint32_t end;   /* `least` and `end`: range of the reply, as in md_exchange */
     uint16_t least;
     uint16_t start, count, reply_len;
     uint8_t framing, address, function, data_len;
     uint8_t data[4];
-    uint8_t is_doubtful; /* its reply may have answered another process */
+    uint8_t is_doubtful; /* another process may have got its reply */
 };
 
 /* An outstanding request of Modbus TCP. */
@@ -135,13 +135,13 @@ struct md_unanswered {
 /* More counts of a drive, and its outstanding requests. */
 struct md_history {
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
-    uint64_t missed[MD_STATUSES];      /* values, by status */
+    uint64_t missed[MD_STATUSES];      /* missing values, by status */
     uint64_t late;                     /* replies after their timeout */
     uint64_t exceptions, naks, busies; /* replies with any exception, code 7, code 6 */
-    uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
-    uint64_t pauses;                      /* replies MD_PAUSE_S or more after the previous one */
+    uint32_t refused[MD_EXCEPTION_CODES]; /* missing values, by exception code */
+    uint64_t pauses;                      /* replies MD_PAUSE_S or more after the previous reply */
     struct md_owed owed[MD_MOST_OWED];
-    struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest first */
+    struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest request first */
 };
 
 /* A drive. The caller sets the bounds of its timeout and its interval; the core learns the other fields,
@@ -153,27 +153,27 @@ struct md_drive {
     int64_t patience_ns;               /* a longer timeout, learnt from late replies; 0: none */
     int64_t interval_ns;               /* least time between an exchange and the next request */
     int64_t ready_ns;                  /* earliest time of the next request */
-    uint32_t failures;                 /* in a row */
+    uint32_t failures;                 /* failed exchanges in a row */
     uint8_t owed_count, proof_count;
-    uint8_t is_doubted;                /* its first reply may answer another process */
-    uint8_t sure_looks;                /* replies to expect whole at the first read */
+    uint8_t is_doubted;                /* its first reply may be to another process */
+    uint8_t sure_looks;                /* number of coming replies to read only once whole */
     struct md_counters counters;
-    int64_t answered_ns;               /* no reply to an earlier request can come */
+    int64_t answered_ns;               /* replies to requests sent before this time cannot come */
     int64_t late_until_ns;             /* late replies may come in any order until then */
     uint64_t failed_at;                /* the drive's reply count when a proof last failed */
     uint8_t proof_failures[MD_MOST_PROOFS]; /* 255: the proof was answered once */
-    uint32_t doubtful;                 /* replies that may have answered another process */
+    uint32_t doubtful;                 /* number of replies that may have been to another process */
     uint32_t unanswered_count;
-    const struct md_exchange **proofs; /* reads whose replies differ from all that are missing */
-    struct md_drive *next_late;        /* next drive of the line's list with late replies due */
+    const struct md_exchange **proofs; /* reads whose replies are not mistakable for a missing reply */
+    struct md_drive *next_late;        /* next in the line's list of drives with late replies due */
     struct md_history *history;        /* separate because exchanges seldom need it */
-    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by delay: bucket n from md_delay_edge(n) */
+    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by delay; bucket n starts at md_delay_edge(n) */
 };
 
-int64_t md_present_timeout_ns(const struct md_drive *drive); /* of a read */
+int64_t md_present_timeout_ns(const struct md_drive *drive); /* usual timeout of a read */
 int64_t md_next_timeout_ns(const struct md_drive *drive);    /* of the next read, after failures */
-int64_t md_delay_edge(int bucket); /* least delay of a bucket; its width is an eighth of that */
-/* Copy the outstanding requests of a drive that this one replaces. */
+int64_t md_delay_edge(int bucket); /* least delay of a bucket, whose width is 1/8 of it */
+/* Copy to `drive` the outstanding requests of `before`, the drive that it replaces. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
 /* ---- engine.c, api.c: return NULL and set errno on failure; otherwise counts and flags ---- */
@@ -183,7 +183,7 @@ enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 /* The transaction ids of a port. */
 enum md_transactions {
     MD_NO_TRANSACTIONS, /* every framing except MD_TCP */
-    MD_MATCHED,         /* MD_TCP: a reply repeats its request's id */
+    MD_MATCHED,         /* MD_TCP: a reply has the id of its request */
     MD_IGNORED          /* MD_TCP through a gateway that replies with its own ids */
 };
 
@@ -201,12 +201,12 @@ struct md_exchange {
     struct md_drive *drive;
     struct md_block *block;        /* fields for rows; NULL: no rows */
     const struct md_block *values; /* fields for md_port_carry_out(); NULL: none */
-    int64_t character_ns;          /* one character on the wire */
-    int64_t silence_ns;            /* before the request and after its reply */
+    int64_t character_ns;          /* duration of a character on the wire */
+    int64_t silence_ns;            /* silence kept before the request and after its reply */
     /* The least timeout, for writes; 0: as learnt. With `insists` it is the limit of the wait for late
      * replies instead. */
     int64_t timeout_ns;
-    int64_t period_ns; /* between its slots in a queue; 0: none */
+    int64_t period_ns; /* time between its slots in the queue; 0: it has no slots */
     /* Send this exchange first while it is unknown whether the adapter echoes. Its reply is never a copy of
      * its request. NULL: none. */
     const struct md_exchange *echo_probe;
@@ -215,23 +215,23 @@ struct md_exchange {
     int insists;          /* a stop: sent even if a late reply may be mistaken for its own */
     uint32_t end;         /* upper bound (exclusive) of the reply's only register; 0: no range */
     uint16_t least;       /* lower bound of the same register */
-    uint8_t is_proof;     /* one of its drive's proofs */
-    uint8_t frame_len;    /* 0: build the frame at its turn */
+    uint8_t is_proof;     /* it is a proof of its drive */
+    uint8_t frame_len;    /* 0: the frame is not stored, but built at each turn */
     uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
-    int64_t turnaround_ns; /* after a broadcast */
+    int64_t turnaround_ns; /* silence after a broadcast */
     const uint32_t *stops; /* its drive's stop counter: send only while it equals stops_seen; NULL: always */
     uint32_t stops_seen;
 };
 
-/* Why an exchange has no reply; an enum md_frame_fault if other bytes came. */
+/* The reasons why an exchange has no reply; if other bytes came, it is an enum md_frame_fault. */
 enum md_failure {
     MD_CUT_SHORT = -9,         /* the reply was incomplete at the timeout */
     MD_NO_REPLY = -10,         /* no byte within the timeout except the request's echo */
     MD_LINE_LOST = -11,        /* the port failed; `error`: errno, 0 at end of file, EPROTO: no Modbus TCP */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
     MD_LATE_ANSWER_DUE = -13,  /* not sent: a late reply could be mistaken for its own */
-    MD_EXPIRED = -14,          /* not sent: its time was over, or a stop came first */
+    MD_EXPIRED = -14,          /* not sent: its latest time was over, or a stop came first */
     MD_POLL_ENDED = -16,       /* polling ended before this exchange's turn or reply */
     MD_MAYBE_ECHO = -17,       /* the bytes may be the reply or the adapter's echo */
     MD_NOT_MASTER = -19,       /* this process lost the right to send; part of the request may have left */
@@ -243,13 +243,13 @@ enum md_failure {
 struct md_completion {
     int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
-    int64_t begun_ns;          /* start of its turn; the line's silence may not have been over */
+    int64_t begun_ns;          /* start of its turn, maybe during the silence before it */
     int64_t sent_ns;           /* when the first byte of the request left; 0: never */
     int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC at sent_ns; 0: unknown */
     int64_t first_ns, last_ns; /* arrival of the first and the last byte after the request */
-    int64_t late_until_ns;     /* the drive's late_until_ns at the call; of urgent exchanges only */
-    uint32_t stale;            /* discarded bytes before the request: late replies, noise */
-    uint32_t skipped;          /* bytes after the request outside of the reply */
+    int64_t late_until_ns;     /* of urgent exchanges: the drive's late_until_ns at the call */
+    uint32_t stale;            /* bytes discarded before the request: late replies, noise */
+    uint32_t skipped;          /* bytes after the request that are not part of the reply */
     uint16_t raw_len;
     struct md_message reply;   /* a good reply or an exception */
     uint8_t raw[MD_MOST_FRAME]; /* the reply; after a failure the last bytes received */
@@ -260,11 +260,11 @@ struct md_progress {
     uint32_t submitted, done;
     uint32_t lost;        /* the descriptor failed: all later urgent exchanges end as MD_LINE_LOST */
     uint32_t cut_off;     /* the polled exchange in flight was lost too, on a port that had worked */
-    uint32_t repeating;   /* exchanges are repeated */
-    uint32_t switches;    /* of baud rate and format */
+    uint32_t repeating;   /* 1: the port repeats exchanges */
+    uint32_t switches;    /* number of changes of baud rate or format */
     uint32_t echo;        /* enum md_echo: whether the adapter echoes */
-    uint32_t foreign;     /* bytes received while listening before the first request */
-    int64_t switching_ns; /* time spent on the switches */
+    uint32_t foreign;     /* another master's bytes, received while listening */
+    int64_t switching_ns; /* total time of these changes */
 };
 
 struct md_engine;
@@ -276,8 +276,8 @@ struct md_mastership;
 struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as long as the process */
 
 /* Open a port on a descriptor. `must_take`: mask of the refusals (enum md_refusal) that are failures; -1:
- * a port without settings. `transactions`: enum md_transactions. `room` for queued exchanges: a power of
- * two. */
+ * a port without settings. `transactions`: enum md_transactions. `room`: most queued exchanges, a
+ * power of two. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
 /* Send only while this process is master, which is checked right before each write(2). The mastership must
@@ -288,8 +288,8 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership);
 int md_port_rs485(struct md_port *port, int mode);
 /* Copy all bytes of the line to `tap`, which must outlive the port or be replaced first. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
-/* From now on start urgent exchanges only, no queued or repeated ones. Return 1 while a polled one is in
- * flight. */
+/* Start only urgent exchanges from now on, no queued or repeated ones. Return 1 while a queued or repeated
+ * exchange is in flight. */
 int md_port_end(struct md_port *port);
 /* Return 1 while an exchange with this drive is queued, repeated, urgent or in flight. */
 int md_port_is_asking(struct md_port *port, const struct md_drive *drive);
@@ -297,8 +297,8 @@ int md_port_is_asking(struct md_port *port, const struct md_drive *drive);
 int64_t md_port_counted_ns(struct md_port *port);
 /* Call md_late_inherit() under the engine's lock. */
 void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before);
-/* Stop all exchanges and give the descriptor back. After md_port_end() a polled exchange in flight ends as
- * MD_POLL_ENDED. */
+/* Stop all exchanges and give the descriptor back. After md_port_end() a queued or repeated exchange in
+ * flight ends as MD_POLL_ENDED. */
 void md_port_stop(struct md_port *port);
 /* Stop and free the port. `memory` is unused; the argument keeps the client's memory alive during the
  * call. */
@@ -307,8 +307,8 @@ void md_port_free(struct md_port *port, void *memory);
 void md_port_set_echo(struct md_port *port, int echo);
 /* Deliver rows to `row_queue`, and call its client with `number` when the port needs attention. */
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
-/* Queue exchanges with the earliest time of each; return how many fitted. One client at a time. A slot
- * that is late by a period ends as MD_EXPIRED if the same exchange's next slot is due. */
+/* Queue exchanges, each with its earliest time; return how many fitted. Only one client at a time may call
+ * this. A slot that is late by a period ends as MD_EXPIRED if the same exchange's next slot is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
 /* Repeat these exchanges in turn whenever no queued one is due. Repetition ends when the exchanges are
@@ -318,7 +318,7 @@ unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *e
 const struct md_progress *md_port_progress(struct md_port *port);
 /* Count a stop: urgent exchanges with an older count are not sent. */
 void md_count_stop(uint32_t *stops);
-/* Carry out an urgent exchange ahead of the queue and wait for it; one with `insists` precedes the others.
+/* Carry out an urgent exchange ahead of the queue and wait for it; one with `insists` precedes all others.
  * After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent (MD_EXPIRED). Endless
  * urgent exchanges leave the queue a 20th of the line, except while one with `insists` waits. Write the
  * exchange's values, NaN for a missing one, and return how many exist; -1 without a good reply, or after an
@@ -328,16 +328,16 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
 
 /* ---- columns.c: return a count ---- */
 
-/* Write the values of the block's fields in a good reply, NaN for a missing one; return how many exist. */
+/* Write the values of the block's fields in a good reply, NaN for a missing value; return how many exist. */
 int md_values(const struct md_block *block, const struct md_message *reply, double *values);
 
 /* ---- mastership.c, api.c: return NULL or -1 and set errno on failure; otherwise a time, or a flag ---- */
 
-int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, the clock of the times below */
+int64_t md_boottime_ns(void); /* the time of CLOCK_BOOTTIME, which all times below use */
 /* Return a mastership that has not started yet; ENOSYS if the kernel lacks the timer. Ports listen to their
  * line for at least `guard_ns` before they send. */
 struct md_mastership *md_mastership_new(int64_t guard_ns);
-void md_mastership_free(struct md_mastership *mastership); /* after all ports that use it */
+void md_mastership_free(struct md_mastership *mastership); /* call it after all ports that use it are freed */
 /* Make this process master until `until_ns`. The kernel kills the process at `kill_ns` unless the mastership
  * is extended or ended before. */
 int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns);
@@ -349,29 +349,29 @@ int md_mastership_holds(const struct md_mastership *mastership);
 /* ---- rows ---- */
 
 enum {
-    MD_MOST_NUMBERS = 65536, /* ports of a row queue */
-    MD_MOST_INVALID = 8      /* raw values of a register that mean "no value" */
+    MD_MOST_NUMBERS = 65536, /* most ports of a row queue */
+    MD_MOST_INVALID = 8      /* most raw values of a register that mean "no value" */
 };
 
 /* ---- columns.c: return NULL without memory; md_value returns a number, NaN without one ---- */
 
 enum md_number_format {
     MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
-    MD_I8, /* the low byte of a word */
+    MD_I8, /* the low byte of a 16-bit word */
     MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32, MD_F16,
-    MD_LOW_WORD_FIRST = 0x40, /* flag for formats of several words */
+    MD_LOW_WORD_FIRST = 0x40, /* flag for formats of several 16-bit words */
     MD_LOW_BYTE_FIRST = 0x80  /* flag for all formats except MD_BIT: within each word */
 };
 
-/* Read the number at word (MD_BIT: bit) `at` of a reply's data; NaN if a BCD digit is above 9. */
+/* Read the number at the 16-bit word (MD_BIT: bit) `at` of a reply's data; NaN if a BCD digit is above 9. */
 double md_value(const uint8_t *data, size_t len, size_t at, int format);
 
 /* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
 struct md_field {
     uint16_t at;
     uint8_t format; /* enum md_number_format */
-    uint16_t reg;   /* code of its name */
-    uint16_t extra; /* 0: none; otherwise the block's extra[extra - 1] */
+    uint16_t reg;   /* code of the register's name */
+    uint16_t extra; /* 0: no extra; otherwise the block's extra[extra - 1] */
     double multiplier, divisor;
 };
 
@@ -384,10 +384,10 @@ struct md_invalid {
 struct md_extra {
     double addend;         /* value = (raw * multiplier + addend) / divisor */
     uint8_t low, bits;     /* raw is `bits` bits of the number, from bit `low` on; bits 0: all of them */
-    uint8_t scale_format;  /* format of the decimal exponent at word scale_at; */
+    uint8_t scale_format;  /* format of the decimal exponent at the word scale_at; */
     uint8_t has_scale;     /* outside of 10^-22 to 10^22 the field has no value */
     uint16_t scale_at;
-    uint8_t invalid_count, scale_invalid_count; /* in `invalid`, first those of the number */
+    uint8_t invalid_count, scale_invalid_count; /* elements of `invalid`: number, then exponent */
     struct md_invalid invalid[MD_MOST_INVALID];
 };
 
@@ -400,11 +400,11 @@ struct md_block {
     uint32_t failures; /* exchanges in a row without a good reply */
     uint8_t refusal;   /* code of the last exception */
     uint8_t may_lack;  /* a field may have no value in a good reply */
-    uint8_t is_answered; /* a good reply without exception came once */
-    uint16_t drive;    /* code of its name */
+    uint8_t is_answered; /* a good reply has come, not only exceptions */
+    uint16_t drive;    /* code of the drive's name */
 };
 
-/* A row's status: why it has no value. Other values are -enum md_failure or -enum md_frame_fault. */
+/* A row's status. Other values are reasons: -enum md_failure or -enum md_frame_fault. */
 enum md_status {
     MD_OK = 0,
     MD_NOT_ASKED = 15, /* the poller temporarily skips a silent drive */
@@ -414,8 +414,8 @@ enum md_status {
 
 /* Rows. All arrays have `room` elements. */
 struct md_columns {
-    int64_t *time, *sent;           /* of the request, UTC and monotonic; if it was not sent, of its turn */
-    int64_t *uncertainty;           /* ns between the request and the reply's first byte */
+    int64_t *time, *sent;           /* when the request was sent, else its turn came; UTC and monotonic */
+    int64_t *uncertainty;           /* time between the request and the reply's first byte */
     uint16_t *drive, *reg, *status; /* enum md_status */
     double *value;
     uint8_t *valid;                 /* bitmap, least significant bit first: value and uncertainty exist */
@@ -435,16 +435,16 @@ int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const in
 
 /* Convert to floats, rounded up. */
 void md_narrow_up(const int64_t *numbers, size_t n, float *out);
-/* Convert floats to whole numbers, 0 for those that the bitmap `valid` (NULL: all valid) excludes; -1 if
- * one does not fit. */
+/* Convert floats to whole numbers, and those that the bitmap `valid` (NULL: all valid) excludes to 0; return
+ * -1 if a number does not fit. */
 int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out);
 /* Replace codes by their numbers; return the index of the first code that is not below `known` or has a
  * negative number, otherwise n. */
 size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
 void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
 uint16_t md_greatest_code(const uint16_t *codes, size_t n);
-/* Write the indexes of the rows of a drive's register to `places`, which holds `n`; return how many there
- * are. */
+/* Write the indexes of the rows of a drive's register to `places`, which has room for `n`; return their
+ * number. */
 size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
                      uint16_t reg, uint32_t *places);
 
@@ -458,13 +458,13 @@ void md_row_queue_free(struct md_row_queue *row_queue);
 /* Add rows for values that were due at `due_ns` but not requested. */
 void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
                        int64_t due_ns);
-struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
+struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* remove the oldest chunk */
 void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
-/* Return how many chunks hold rows, including the newest one, which still grows. */
+/* Return the number of chunks with rows, including the newest one, which is not full yet. */
 size_t md_row_queue_chunks(struct md_row_queue *row_queue);
-uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* dropped rows */
+uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* number of dropped rows */
 void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client */
-/* Wait for a call, at most `timeout_ns`; write each called number once, and return how many. */
+/* Wait for a call, at most `timeout_ns`; write each called number once, and return how many were called. */
 int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room);
 /* cdef: end */
 

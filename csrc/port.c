@@ -5,7 +5,7 @@
 enum {
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to stop watching */
     HELD_UP_NS = 200000,      /* a longer write means that the thread was suspended */
-    MOST_SPINNING = 4,        /* ports; with more of them the processor has other work */
+    MOST_SPINNING = 4,        /* most ports with spinning; with more, the processor has other work */
     NO_SLEEP_NS = 1000        /* a shorter sleep costs more than spinning */
 };
 static const int64_t RETRY_WRITE_NS = 1000000;
@@ -20,7 +20,7 @@ static void watch(struct md_port *port, int is_watched)
 
 static void lose(struct md_port *port, int error)
 {
-    md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is always ready */
+    md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is always readable */
     md_turn_lose(&port->turn, error);
 }
 
@@ -47,7 +47,7 @@ int64_t md_port_receive(struct md_port *port)
 }
 
 /* Return 1 if this process may still send, 0 if the request must wait or has ended. Call this right before
- * write(2); only the switching of a transceiver by RTS may come in between. */
+ * write(2); only a switch of the transceiver by RTS may come in between. */
 static int may_send(struct md_port *port)
 {
     struct md_line *line = &port->turn.line;
@@ -109,12 +109,12 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     int64_t begun_ns = md_now_ns();
     int refused = md_port_set(port->fd, settings);
     int64_t now_ns = md_now_ns();
-    port->turn.line.wake_ns += now_ns - begun_ns; /* the port took no bytes meanwhile */
+    port->turn.line.wake_ns += now_ns - begun_ns; /* extend the wait: meanwhile the port took no bytes */
     progress->switching_ns += now_ns - begun_ns;
     md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;
     if (refused < 0 || (refused & port->must_take))
-        port->settings = (struct md_settings){0}; /* unknown: the port may have taken some of them */
+        port->settings = (struct md_settings){0}; /* unknown: it may have taken some of them */
     if (refused < 0)
         lose(port, -refused);
     else if (refused & port->must_take)
@@ -122,7 +122,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     return now_ns;
 }
 
-/* Return 1 if the request has left and the reply is due. */
+/* Return 1 if the request has been sent and its reply is awaited. */
 static int is_sent(const struct md_port *port)
 {
     return port->turn.source != MD_NO_SOURCE && port->turn.line.completion->sent_ns;
@@ -154,7 +154,7 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
 {
     const struct md_exchange *exchange = port->turn.line.exchange;
     switch (want) {
-    case MD_WRITE: /* after a switch of settings ask again, because a stop may have come */
+    case MD_WRITE: /* after a change of settings check again: a stop may have come */
         if (!is_in_force(port, &exchange->settings)) {
             *now_ns = apply(port, &exchange->settings);
             return 1;
@@ -199,7 +199,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
     int want, failure = md_rs485_look(port, now_ns);
     if (failure && !turn->progress.lost)
         lose(port, -failure);
-    if (port->is_closing) { /* only wait until the last request has left */
+    if (port->is_closing) { /* only wait until the last request has been sent */
         engine->wakes[port->index] = direction_ns(port);
         return now_ns;
     }

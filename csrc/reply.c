@@ -45,8 +45,8 @@ static void learn(struct md_line *line, int echo)
         line->echo = (uint8_t)echo;
 }
 
-/* Return the time by which an echo of the request in flight would be whole, on a line not known to echo; 0
- * if the drive's delay is not known well enough. */
+/* Return the time by which an echo of the request in flight would be whole,if the line is known not to echo;
+ * 0 if the drive's delay is not known well enough. */
 static int64_t echo_whole_ns(const struct md_line *line)
 {
     int64_t due_ns = line->echo == MD_NO_ECHO ? md_reply_due_ns(line->exchange) : 0;
@@ -59,9 +59,9 @@ static int is_timely_copy(const struct md_line *line)
     return line->copy_by_ns && line->missing_ns >= line->copy_by_ns;
 }
 
-/* Learn from a reply. A copy before it shows an echo. Two copies do too, unless the adapter did not echo
- * so far: then the reply may have come twice. A few stray bytes are not an echo, but may be the rest of a
- * known one. */
+/* Learn from a reply whether the adapter echoes. A copy of the request before the reply shows an echo. So do
+ * two copies, unless the adapter did not echo so far: then the reply may have come twice. A few stray bytes
+ * are no echo, but if the adapter echoes, they may be the rest of one. */
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
     int is_copy = md_echo_is_copy(line, reply_at);
@@ -78,8 +78,8 @@ static void learn_echo(struct md_line *line, size_t reply_at)
 
 enum copy { IS_ECHO, MAY_BE_REPLY, IS_REPLY };
 
-/* Classify a copy without other bytes: the adapter's echo, or the drive's reply if that may equal the
- * request. */
+/* Classify a copy of the request without other bytes: it is the adapter's echo, or the drive's reply if that
+ * may equal the request. */
 static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
 {
     if (!may_be_reply || line->echo == MD_ECHO) {
@@ -93,7 +93,7 @@ static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
     return IS_REPLY;
 }
 
-/* An adapter may have started to echo: then the drive that seems to answer may be dead. */
+/* An adapter may have started to echo: then a drive that seems to answer with copies may be dead. */
 int md_echo_is_in_doubt(const struct md_line *line)
 {
     return line->echo == MD_ECHO_UNKNOWN || line->lone_copies == MOST_LONE_COPIES;
@@ -112,7 +112,7 @@ void md_echo_keep(struct md_line *line)
 /* ---- replies ---- */
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
-static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; age limit of such values in rows */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; a row may have no older value in doubt */
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {
@@ -131,7 +131,7 @@ void md_reply_await(struct md_line *line, int reply_len)
     line->give_up_ns = line->quiet_ns + timeout_ns + reply_ns;
     line->ready_ns = 0;
     line->begun_by_ns = line->give_up_ns;
-    if (line->burst > 0 && drive->delay_ns) /* else the adapter hands over whole replies */
+    if (line->burst > 0 && drive->delay_ns) /* otherwise the adapter may deliver whole replies */
         line->ready_ns = line->quiet_ns + md_look_ns(exchange) + reply_ns;
     if (line->burst > 0 && drive->failures == 0) {
         int64_t begun_ns = timeout_ns + (line->burst + 2) * exchange->character_ns;
@@ -152,7 +152,7 @@ int md_reply_has_begun(const struct md_line *line)
     return line->rx_len > 0 && !(line->rx_len == line->tx_len && md_echo_is_copy(line, 0));
 }
 
-/* A reply comes character by character: wait for several before each read. */
+/* A reply comes character by character: wait for several characters before each read. */
 void md_reply_foresee(struct md_line *line, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -180,7 +180,7 @@ void md_reply_extend(struct md_line *line)
 
 /* ---- a reply ---- */
 
-/* Record the drive's response delay and the line time of the exchange. */
+/* Record the drive's response delay and the time that the exchange took on the line. */
 static void measure(struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -204,7 +204,7 @@ static void measure(struct md_line *line, int reply_len)
     md_counters_answer(drive, delay_ns, sooner(ideal_ns, took_ns));
 }
 
-/* If the first read found only part of the reply, the adapter hands over bursts, not whole replies. */
+/* If the first read found only part of the reply, the adapter delivers bursts, not whole replies. */
 static void learn_burst(struct md_line *line, size_t at, int reply_len)
 {
     if (line->sight_at == at && line->sight < reply_len && line->sight <= MOST_BURST &&
@@ -255,7 +255,7 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
     }
 }
 
-/* End with a reply that answers this request or an earlier one; the other reply may still come. A row can
+/* End the exchange with a reply to this request or an earlier one; the other reply may still come. A row can
  * hold this value, with an uncertainty that covers both requests. A client that waits needs the present
  * value: read it again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
@@ -277,8 +277,8 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
     return (struct md_ending){used, at, (size_t)used};
 }
 
-/* The first reply may answer another process's request: send the request again. The reply still shows whether
- * the adapter echoes. */
+/* The first reply may be to another process's request: end the exchange so that it is sent again. The reply
+ * still shows whether the adapter echoes. */
 static struct md_ending doubt_first(struct md_line *line, size_t at, int used, int64_t now_ns)
 {
     line->completion->skipped -= (uint32_t)used;
@@ -307,7 +307,7 @@ int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_me
         *ending = (struct md_ending){used, at, (size_t)used};
         return 1;
     }
-    /* The reply took this long, whichever request it answers. */
+    /* The reply came at least this long after its request, whichever request it answers. */
     md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0);
     md_reply_extend(line);
     if (md_is_read(exchange->framing, exchange->request.function)) {
@@ -326,7 +326,7 @@ static size_t find_foreign_read(const struct md_line *line, size_t reply_at)
     const struct md_message *own = &exchange->request;
     struct md_message request;
     if (exchange->framing == MD_DELIXI || !md_is_read(exchange->framing, own->function))
-        return SIZE_MAX; /* Delixi replies look like requests */
+        return SIZE_MAX; /* Delixi's replies look like requests */
     for (size_t at = 0; at < reply_at; at++) {
         int used = md_parse_request(exchange->framing, line->rx + at, reply_at - at, &request);
         if (used > 0 && request.address == own->address && request.function == own->function &&
@@ -347,7 +347,7 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
         if (used > 0 && line->echo_due && may_become_copy(line, at))
             used = MD_INCOMPLETE;
         if (used > 0 && line->echo_due && md_echo_is_copy(line, at) && !is_timely_copy(line)) {
-            line->echo_due = 0; /* the adapter's echo, or indistinguishable from it */
+            line->echo_due = 0; /* this copy is the adapter's echo, or looks the same */
             at += line->tx_len;
             first_open = SIZE_MAX;
             continue;

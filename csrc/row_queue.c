@@ -12,18 +12,18 @@
 enum { MOST_SPARE = 64, WORDS = MD_MOST_NUMBERS / 64 };
 
 struct md_row_queue {
-    pthread_mutex_t mutex; /* guards all below */
+    pthread_mutex_t mutex; /* guards all fields below */
     pthread_cond_t is_called;
     size_t chunk_rows, most_chunks;
     struct md_columns **chunks; /* a ring buffer */
-    size_t first, count;        /* of the chunks that hold rows */
-    struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
+    size_t first, count;        /* index of the oldest chunk with rows, and their number */
+    struct md_columns *spare[MOST_SPARE]; /* empty chunks that clients gave back */
     size_t spares;
-    size_t lent;                /* chunks that clients hold, plus ports that report to the queue */
+    size_t lent;                /* number of chunks that clients hold, plus ports that report to the queue */
     int is_done;                /* its client has freed it */
     uint64_t dropped;
     uint64_t called[WORDS];     /* a bit for each called number */
-    uint32_t calls;             /* bits that are set */
+    uint32_t calls;             /* number of bits that are set in `called` */
 };
 
 #if defined __APPLE__ || defined _WIN32 /* their conditions do not support CLOCK_MONOTONIC */
@@ -121,7 +121,7 @@ static struct md_columns *newest(struct md_row_queue *queue)
     return queue->count ? queue->chunks[(queue->first + queue->count - 1) % queue->most_chunks] : NULL;
 }
 
-/* Return an empty chunk: a new one, otherwise the newest one without its rows. */
+/* Return an empty chunk: a spare or new one, or else the newest chunk, whose rows are dropped. */
 static struct md_columns *begin_chunk(struct md_row_queue *queue)
 {
     struct md_columns *chunk = NULL;

@@ -9,7 +9,7 @@
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
-static const int64_t MOST_HELD_NS = 100000000; /* ns; after a longer delay the port counts as broken */
+static const int64_t MOST_HELD_NS = 100000000; /* if sending takes longer, the port is broken */
 
 static int is_by_rts(const struct md_rs485 *rs485)
 {
@@ -22,7 +22,7 @@ static int set_direction(struct md_port *port, int is_sending)
     return md_descriptor_set_rts(port->fd, is_sending == (port->rs485.mode == MD_RS485_RTS_UP));
 }
 
-/* Return 1 if the last bit has left; otherwise set look_ns. */
+/* Return 1 if the last bit has left; otherwise set look_ns, the time of the next check. */
 static int has_left(struct md_port *port, int64_t now_ns)
 {
     struct md_rs485 *rs485 = &port->rs485;
@@ -92,7 +92,7 @@ int md_rs485_look(struct md_port *port, int64_t now_ns)
             return 0;
     }
     int failure = set_direction(port, 0);
-    if (port->is_closing) /* the closing waits for this */
+    if (port->is_closing) /* the engine waits for this switch before it closes the port */
         md_wakeup_ring(&port->engine->wakeup);
     return is_stuck ? -ETIMEDOUT : failure;
 }

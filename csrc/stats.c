@@ -1,5 +1,5 @@
-/* A drive's statistics: from its response delays, when to read the port and how long to wait; and its
- * counters. */
+/* A drive's statistics: its counters, and its response delays, which determine when to read the port and how
+ * long to wait. */
 #include "internal.h"
 
 /* ---- when to read the port ---- */
@@ -54,10 +54,10 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
 }
 
 /* The first request after a failure gets the longest timeout that the document allows, because the drive
- * may have become slower. While the drive stays silent, only one request in RARELY gets it, because the
- * other drives lose that time. A stop must be repeated sooner: its timeout doubles after each failure
- * except the first, which is the identity check's. If replies are known to be late, a stop may wait as
- * long as its sender allows. */
+ * may have become slower. While the drive stays silent, only one request in RARELY gets it,
+ * because the other drives lose that time. A stop must be repeated sooner: its timeout doubles after each
+ * failure except the first, which is the identity check's. If replies are known to be late, a stop may wait
+ * as long as its sender allows. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
@@ -134,7 +134,7 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
         delay_ns = sooner(delay_ns, drive->delay_ns);
     } else {
         drive->sure_looks = is_whole ? 0 : SURE - 1;
-        if (is_whole) /* an upper bound only */
+        if (is_whole) /* the measured delay is only an upper bound */
             delay_ns = sooner(delay_ns, early_look_ns(exchange));
         smooth(drive, delay_ns);
     }
@@ -159,7 +159,7 @@ void md_learn_silence(struct md_drive *drive)
 
 /* ---- counters ---- */
 
-/* Counters only grow, so the figures of a time span are the difference of two readings. Response delays are
+/* Counters only grow, so the counts of a time span are the difference of two readings. Response delays are
  * counted in buckets, PARTS to each doubling. */
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket starts near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
@@ -189,7 +189,7 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
     struct md_counters *counters = &drive->counters;
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
     if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
-        values = 0; /* not counted: the client reads them again */
+        values = 0; /* not counted as missing: the client reads them again */
     uint8_t exception = completion->reply.exception;
     counters->exchanges++;
     counters->sent += completion->sent_ns != 0;

@@ -8,11 +8,11 @@
 
 /* The header of bytes in the ring buffer. */
 struct mark {
-    int64_t time_ns; /* of CLOCK_MONOTONIC, or UTC with IS_UTC in `side` */
+    int64_t time_ns; /* CLOCK_MONOTONIC; UTC if `side` has IS_UTC */
     uint32_t len, side;
 };
 
-enum { IS_UTC = 1 << 16 }; /* flag in `side` */
+enum { IS_UTC = 1 << 16 }; /* flag in `side`: the time is UTC */
 
 static uint32_t get(const uint32_t *counter)
 {

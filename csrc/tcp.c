@@ -1,7 +1,7 @@
 /* Modbus TCP (messaging guide V1.0b): frames from a stream, and the matching of replies.
  *
- * A reply repeats its request's transaction id. One with another id is late or foreign, and is skipped, so no
- * late reply can be mistaken for the reply to another request. If a gateway replies with its own ids, the
+ * A reply repeats its request's transaction id. A frame with another id is late or foreign and is skipped, so
+ * no late reply can be mistaken for the reply to another request. If a gateway replies with its own ids, the
  * rules of late.c apply instead.
  *
  * Only the header gives a frame's length. If a device sends more or fewer bytes, the header of the awaited
@@ -55,7 +55,7 @@ static int frame_length(const struct md_line *line)
     return line->frame_len < KNOWN_HEAD || whole < 0 ? KNOWN_HEAD : whole;
 }
 
-/* Report bytes outside of frames. */
+/* Pass bytes outside of frames to the tap, and count them. */
 static void skip(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
@@ -119,7 +119,7 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
 {
     size_t enough = line->transactions == MD_IGNORED ? KNOWN_HEAD : MD_TCP_HEAD;
     if (line->is_adrift && line->frame_tapped && len >= enough && may_be_awaited(line, bytes, len))
-        drop(line, now_ns); /* the rest of the frame is missing */
+        drop(line, now_ns); /* the rest of the frame did not come */
     if (line->is_adrift && !line->frame_tapped)
         return seek(line, bytes, len, now_ns);
     int whole = frame_length(line);
@@ -136,10 +136,10 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
     return taken;
 }
 
-/* Append the current frame to rx and return its index. Do not report a byte twice. */
+/* Append the current frame to rx and return its index in rx. Do not pass a byte to the tap twice. */
 static size_t keep(struct md_line *line)
 {
-    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* too many unrelated frames */
+    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* too many frames that were no reply */
         md_tap_put(line->tap, MD_NOISE, line->completion->last_ns, line->rx, line->rx_len);
         line->rx_len = 0;
     }
@@ -151,8 +151,8 @@ static size_t keep(struct md_line *line)
 
 /* ---- late replies ---- */
 
-/* Add the request to the drive's outstanding ones. When the list is full, drop every second one, to keep
- * both old and new ones. */
+/* Add the request to the drive's outstanding requests. When the list is full, drop every second request, so
+ * that both old and new ones remain. */
 static void remember(struct md_line *line)
 {
     struct md_drive *drive = line->exchange->drive;
@@ -279,7 +279,7 @@ int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
         learn_late(line, now_ns);
         md_reply_extend(line);
         drop(line, now_ns);
-        if (line->rx_len == 0) /* the reply's first byte has not come */
+        if (line->rx_len == 0) /* no byte of the reply has come */
             line->completion->first_ns = 0;
     } else {
         pass(line, now_ns);

@@ -1,4 +1,4 @@
-/* Sets a port's speed and character format, then reads back the values that the driver took.
+/* Set a port's speed and character format, then read back the values that the driver took.
  *
  * tcsetattr() fails with EINVAL if no requested change took effect: a pty could not be reopened at even
  * parity. Linux's ioctl does not fail then, and takes any speed; other systems take the speeds in termios. */
@@ -9,7 +9,7 @@
 #ifdef __linux__
 #include <asm/termbits.h>
 #include <sys/ioctl.h>
-#ifndef TCGETS2 /* musl does not define them, and its ioctl() takes an int */
+#ifndef TCGETS2 /* musl does not define these requests, and its ioctl() takes an int */
 #define TCGETS2 ((int)_IOR('T', 0x2A, struct termios2))
 #define TCSETS2 ((int)_IOW('T', 0x2B, struct termios2))
 #endif
@@ -78,8 +78,8 @@ static struct md_settings describe(const attributes *now)
     };
 }
 
-/* Adapters report the speed that their divisor yields. A deviation of 2 % is tolerated by receivers, and
- * is also the kernel's limit. */
+/* Adapters report the speed that their divisor yields. Receivers tolerate a deviation of 2 %, which is also
+ * the kernel's limit. */
 static int is_near(uint32_t baudrate, uint32_t wanted)
 {
     uint32_t off = baudrate > wanted ? baudrate - wanted : wanted - baudrate;

@@ -1,5 +1,5 @@
-/* The order of exchanges on a line: first urgent requests, then queued ones that are due, then repeated ones.
- * The last two keep a share of the line beside endless urgent requests, except beside stops.
+/* The order of exchanges on a line: first urgent ones, then queued ones that are due, then repeated ones.
+ * Queued and repeated exchanges keep a share of the line beside endless urgent ones, but not beside stops.
  *
  * The caller passes the time, moves the bytes, and holds the engine's lock; only md_turn_submit() needs
  * none. */
@@ -7,7 +7,7 @@
 
 /* ---- requests before an exchange ---- */
 
-enum { MOST_PROOFS_SENT = 12 }; /* before one exchange */
+enum { MOST_PROOFS_SENT = 12 }; /* most proofs sent before one exchange */
 
 /* Return the request to send before the exchange: an echo probe, or a proof, so that no late reply is
  * mistaken for the exchange's. NULL: send the exchange itself. */
@@ -30,8 +30,8 @@ static const struct md_exchange *find_before(struct md_before *before, const str
     return exchange->echo_probe;
 }
 
-/* Return 1 if the exchange must be sent again, because its reply may belong to an earlier request. A write is
- * never repeated: it may have started a motor. */
+/* Return 1 if the exchange must be sent again, because its reply may belong to an earlier request. Never
+ * repeat a write: it may have started a motor. */
 static int is_again(struct md_before *before, const struct md_exchange *exchange,
                     const struct md_completion *completion)
 {
@@ -77,10 +77,10 @@ uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *e
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 {
     struct md_urgent **at = &turn->urgent;
-    if (*at && turn->source == MD_URGENT) /* the first one is in flight */
+    if (*at && turn->source == MD_URGENT) /* the first urgent request is in flight: stay behind it */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* otherwise in order of arrival */
+        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* else it goes in front */
             at = &(*waiting)->next;
     urgent->next = *at;
     *at = urgent;
@@ -89,7 +89,7 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 void md_turn_set_echo(struct md_turn *turn, int echo)
 {
     turn->line.echo = (uint8_t)echo;
-    turn->line.echo_is_configured = echo == MD_ECHO; /* MD_NO_ECHO is unlearnt if an echo comes */
+    turn->line.echo_is_configured = echo == MD_ECHO; /* MD_NO_ECHO is not final: an echo changes it */
     md_store(&turn->progress.echo, (uint32_t)echo);
 }
 
@@ -148,7 +148,7 @@ static void call(struct md_turn *turn)
         md_row_queue_call(turn->row_queue, turn->number);
 }
 
-/* Return 1 if the time has come; otherwise set wake_ns to it. */
+/* Return 1 if the time `from_ns` has come; otherwise set wake_ns to it at the latest. */
 static int is_time(int64_t from_ns, int64_t *wake_ns, int64_t now_ns)
 {
     if (now_ns >= from_ns)
@@ -190,7 +190,7 @@ static int is_overtaken(const struct md_turn *turn)
 }
 
 /* Move the first request that may be sent now to the front and return it; otherwise set wake_ns. While a stop
- * waits for its drive, only other stops are sent: it must not wait for further exchanges. */
+ * waits for its drive, send only other stops: the stop must not wait for further exchanges. */
 static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
 {
     for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
@@ -238,7 +238,7 @@ static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    if (turn->is_ending || turn->progress.lost) /* the client moves its queue itself */
+    if (turn->is_ending || turn->progress.lost) /* the client takes its queued exchanges back */
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;
@@ -258,7 +258,7 @@ static void stop_repeating(struct md_turn *turn)
 
 /* ---- turns ---- */
 
-/* Count the line time of an exchange. */
+/* Update the line time that urgent requests owe to polling. */
 static void settle(struct md_turn *turn, int64_t took_ns)
 {
     if (turn->source == MD_URGENT)
@@ -283,8 +283,8 @@ static int is_stop_waiting(const struct md_turn *turn)
     return 0;
 }
 
-/* Return 1 if it is a polled exchange's turn before the urgent requests: never twice in a row, and never
- * before a stop. */
+/* Return 1 if a polled exchange may precede the urgent requests: never twice in a row, and never before a
+ * stop. */
 static int is_polling_due(const struct md_turn *turn)
 {
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
@@ -305,13 +305,13 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     }
     if (!turn->is_ending && !pending(turn)) {
         md_store(&turn->is_idle, 1);
-        if (pending(turn)) /* queued since the check above */
+        if (pending(turn)) /* exchanges were queued since the check above */
             *wake_ns = now_ns;
     }
     return 0;
 }
 
-/* Hand over the result of a polled exchange. */
+/* Add the rows of a polled exchange, and call the client if the port needs attention. */
 static void report(struct md_turn *turn)
 {
     const struct md_exchange *exchange = turn->line.exchange;
@@ -360,11 +360,11 @@ static void finish(struct md_turn *turn)
         if (left == turn->room / 4 || left == 0)
             call(turn);
     } else if (turn->completion.result < 0 && !turn->completion.sent_ns) {
-        stop_repeating(turn); /* otherwise the exchange would fail repeatedly */
+        stop_repeating(turn); /* otherwise the same exchange would fail again and again */
     }
 }
 
-/* If the exchange in flight only listens so far, put it back, because a stop must not wait for it. */
+/* If the exchange in flight is still listening, put it back, because a stop must not wait for it. */
 static void give_way(struct md_turn *turn)
 {
     int source = turn->source;
@@ -417,7 +417,7 @@ void md_turn_lose(struct md_turn *turn, int error)
 }
 
 /* Waiting clients get a completion that shows whether their request left. A polled exchange that is ended
- * here still gets its rows. */
+ * here still produces its rows. */
 void md_turn_close(struct md_turn *turn)
 {
     int is_reported = turn->source == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;

@@ -1,4 +1,4 @@
-/* Waits for many descriptors together, with epoll. */
+/* Wait for many descriptors together, with epoll. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -9,10 +9,10 @@
 #include <unistd.h>
 
 #ifndef SYS_epoll_pwait2
-#define SYS_epoll_pwait2 (-1) /* headers older than Linux 5.11 lack it; no kernel has a call -1 */
+#define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11 lack it; a call -1 always fails */
 #endif
 
-enum { EVENTS = 256 }; /* fetched per system call */
+enum { EVENTS = 256 }; /* most events fetched by a system call */
 
 typedef int wait_function(int epoll, struct epoll_event *events, int most, int64_t timeout_ns);
 
@@ -21,7 +21,7 @@ struct md_waiter {
     wait_function *wait;
 };
 
-/* Calls epoll_pwait2() by its number, because musl and glibc before 2.35 have no function for it. The two
+/* Call epoll_pwait2() by its number, because musl and glibc before 2.35 have no function for it. The two
  * fields of its timeout are 64 bits wide on all systems. */
 static int wait_at_once(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
@@ -29,7 +29,7 @@ static int wait_at_once(int epoll, struct epoll_event *events, int most, int64_t
     return (int)syscall(SYS_epoll_pwait2, epoll, events, most, timeout_ns < 0 ? NULL : span, NULL, (size_t)0);
 }
 
-/* Waits without epoll_pwait2(), which Linux before 5.11 lacks and some containers forbid. */
+/* Wait without epoll_pwait2(), which Linux before 5.11 lacks and some containers forbid. */
 static int poll_first(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
     struct pollfd any = {.fd = epoll, .events = POLLIN};

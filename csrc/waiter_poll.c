@@ -1,4 +1,4 @@
-/* Waits for many descriptors together, with poll(), which every POSIX system has. */
+/* Wait for many descriptors together, with poll(), which every POSIX system has. */
 #ifdef __linux__
 #define _GNU_SOURCE
 #endif

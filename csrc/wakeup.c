@@ -1,4 +1,4 @@
-/* A pipe by which any thread wakes the waiting one. */
+/* A pipe with which any thread wakes the waiting thread. */
 #include "internal.h"
 
 #include <fcntl.h>
@@ -33,7 +33,7 @@ void md_wakeup_ring(struct md_wakeup *wakeup)
         (void)!write(wakeup->ringer, "", 1);
 }
 
-/* A call of md_wakeup_ring() meanwhile leaves a byte in the pipe, so it is not lost. */
+/* If another thread calls md_wakeup_ring() meanwhile, its byte stays in the pipe: no wake-up is lost. */
 void md_wakeup_silence(struct md_wakeup *wakeup)
 {
     char byte;

@@ -1,4 +1,4 @@
-"""Captured bytes of a line: written by a tap, cut into frames, and decoded."""
+"""Capture the bytes on a line, cut them into frames, and decode the frames into rows."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Side(IntEnum):
     EITHER = lib.MD_EITHER_SIDE  # unknown
     ASKING = lib.MD_ASKING
     ANSWERING = lib.MD_ANSWERING
-    FAILED = lib.MD_FAILED  # bytes instead of a reply, marked by the capturing master
-    NOISE = lib.MD_NOISE  # stray bytes, echo, late replies, marked likewise
+    FAILED = lib.MD_FAILED  # bytes that came instead of a good reply, as marked by the capturing master
+    NOISE = lib.MD_NOISE  # stray bytes, echoes and late replies, as marked by the capturing master
 
 
 class Kind(IntEnum):
@@ -26,9 +26,9 @@ class Kind(IntEnum):
 
     JUNK = lib.MD_JUNK
     REQUEST = lib.MD_REQUEST
-    EITHER = lib.MD_EITHER  # a request, or its confirming copy
+    EITHER = lib.MD_EITHER  # a request, or a reply that is a copy of its request
     REPLY = lib.MD_REPLY
-    STRAY = lib.MD_STRAY  # a reply without its request
+    STRAY = lib.MD_STRAY  # a reply whose request was not captured
 
 
 class FrameSpan(NamedTuple):
@@ -59,7 +59,7 @@ class Stream:
     def put(
         self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False
     ) -> None:
-        """Append bytes of this time; a pause before them hints at the start of a frame."""
+        """Append bytes received at `time_ns`. With `after_pause` a frame probably starts with them."""
         piece = {"time_ns": time_ns, "side": side, "is_after_pause": after_pause}
         if not lib.md_stream_put(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
             raise BufferError("the stream is full: split it first")
@@ -77,7 +77,7 @@ class Splitter:
         self._span = ffi.new("struct md_span *")
 
     def spans(self, stream: Stream) -> Iterator[FrameSpan]:
-        """Yield and discard all complete spans. Every byte is part of one."""
+        """Yield all complete spans, and remove their bytes from the stream. Every byte is part of a span."""
         span = self._span
         while lib.md_split(self._c, stream.c, span):
             raw = bytes(ffi.buffer(stream.c.bytes + span.at, span.len))
@@ -97,15 +97,15 @@ class Decoder:
         self._c.known, self._c.places = self._known, self._PLACES
 
     def forget(self) -> None:
-        """Forget all requests."""
+        """Forget all requests and the layouts of their replies."""
         self._c.block = ffi.NULL
         ffi.buffer(self._known)[:] = bytes(ffi.sizeof(self._known))
         self._c.taken = 0
-        self._blocks.clear()  # last, after the core has forgotten them
+        self._blocks.clear()  # last, because the core used them until now
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """The request that stopped `decode` with UNKNOWN; call `know` with the layout of its replies."""
+        """Framing and content of the request for which `decode` returned UNKNOWN; call `know` for it."""
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
@@ -157,8 +157,8 @@ class Unpacker:
         self.look_at(b"", at)
 
     def look_at(self, piece: bytes, at: int) -> None:
-        """Continue with these bytes of the file, the first of which is byte `at`."""
-        self._c.len = self._c.at = 0  # before freeing the last piece, until the core has this one
+        """Continue with this piece of the file, which starts at byte `at` of the file."""
+        self._c.len = self._c.at = 0  # before the assignment below frees the last piece
         self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
         self._c.bytes, self._c.len = self._piece, len(piece)
 
@@ -188,7 +188,7 @@ _TAKEN = 1 << 16  # bytes of packets read at a time
 
 
 class Wrappings:
-    """Headers and trailers of packets, by side and by whether the bytes start with ':'."""
+    """Headers and trailers of a capture file's packets, by side and by whether a frame starts with ':'."""
 
     def __init__(self, wrappings: Mapping[tuple[Side, bool], tuple[bytes, bytes]]) -> None:
         self._kept: list[Any] = []
@@ -203,7 +203,7 @@ class Wrappings:
         return self._kept[-1]
 
     def packet(self, interface: int, side: Side, time_ns: int, raw: bytes) -> bytes:
-        """Return a packet with these bytes."""
+        """Return a packet of the capture file: a header, these bytes of a line, and a trailer."""
         length = lib.md_packet_length(self.c, side, raw[0] if raw else 0, len(raw))
         out = ffi.new("uint8_t[]", length)
         lib.md_put_packet(self.c, interface, side, time_ns, raw, len(raw), out)

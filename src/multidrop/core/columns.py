@@ -1,4 +1,4 @@
-"""Columns of rows in the core's memory, and the narrow columns of recordings."""
+"""Columns of rows in the core's memory, and conversions from and to the narrower columns of recordings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class NumberFormat(IntEnum):
     U32_EITHER = lib.MD_U32_EITHER
     F32 = lib.MD_F32
     BIT = lib.MD_BIT
-    I8 = lib.MD_I8  # the low byte of a word
+    I8 = lib.MD_I8  # the low byte of a 16-bit word
     U64 = lib.MD_U64
     I64 = lib.MD_I64
     F64 = lib.MD_F64
@@ -33,7 +33,7 @@ class NumberFormat(IntEnum):
 
 
 LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # order flag
-LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # order flag, within each word
+LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # order flag, within each 16-bit word
 MOST_INVALID: int = lib.MD_MOST_INVALID
 
 _MAY_LACK = frozenset(
@@ -45,7 +45,7 @@ _MAY_LACK = frozenset(
 
 
 def raw_value(data: bytes, at: int, number_format: int) -> float:
-    """Return the number at word (BIT: bit) `at` of a reply's data; NaN if the data is too short.
+    """Return the number at the 16-bit word (BIT: the bit) `at` of a reply's data; NaN if data is missing.
 
     `number_format` includes the order flags.
     """
@@ -56,10 +56,10 @@ class Extra(NamedTuple):
     """Properties that few fields have (struct md_extra): value = (raw * multiplier + addend) / divisor."""
 
     addend: float = 0.0
-    low: int = 0  # lowest bit of raw
-    bits: int = 0  # number of bits; 0: all
-    scale_at: int | None = None  # word of the decimal exponent
-    scale_format: int = NumberFormat.I16  # its low 16 bits are signed
+    low: int = 0  # lowest bit of the raw number that belongs to the field
+    bits: int = 0  # number of bits that belong to the field; 0: all
+    scale_at: int | None = None  # offset of the 16-bit word that holds the decimal exponent
+    scale_format: int = NumberFormat.I16  # of the exponent, whose low 16 bits are signed
     invalid: tuple[tuple[int, int], ...] = ()  # masks and patterns that mean "no value"
     scale_invalid: tuple[tuple[int, int], ...] = ()
 
@@ -88,7 +88,7 @@ class Field(NamedTuple):
 
 @lru_cache(maxsize=1024)
 def _shared(fields: tuple[Field, ...]) -> tuple[Any, Any]:
-    """Return arrays of fields and extras; drives of a model share them, so they stay in the cache."""
+    """Return C arrays of the fields and their extras, cached because all drives of a model share them."""
     extras = list(dict.fromkeys(field.extra for field in fields if field.extra is not None))
     places = {extra: place for place, extra in enumerate(extras, 1)}
     return (
@@ -139,7 +139,7 @@ class RowLayout:
 
     @property
     def refusal(self) -> int:
-        """The last exception's code."""
+        """The code of the last exception."""
         return int(self.c.refusal)
 
     @property
@@ -149,11 +149,11 @@ class RowLayout:
 
     @property
     def is_answered(self) -> bool:
-        """True once a good reply without exception came."""
+        """True once a good reply came; an exception is none."""
         return bool(self.c.is_answered)
 
     def forget(self) -> None:
-        """Reset the counts to those before the first exchange."""
+        """Reset `refusals`, `failures` and `is_answered`, as before the first exchange."""
         self.c.refusals = self.c.failures = self.c.is_answered = 0
 
 
@@ -176,7 +176,7 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """Return columns over memory of the core; `give_back` is called when the last view is gone."""
+        """Return columns over the core's memory `made`; after the last view, `give_back` gets that memory."""
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -190,16 +190,16 @@ class Columns:
         return int(self.c.rows)
 
     def _at(self, name: str) -> int:
-        """Return the offset of a column from the struct."""
+        """Return the offset in bytes from the start of the struct to this column."""
         return int(ffi.cast("uint8_t *", getattr(self.c, name)) - ffi.cast("uint8_t *", self.c))
 
     @cached_property
     def _memory(self) -> memoryview[Any]:
-        """The struct and all columns in one buffer, which lives as long as any view."""
+        """A buffer over the struct and all columns, whose memory lives as long as any view of it."""
         return memoryview(ffi.buffer(self.c, self._at("valid") + (self.c.room + 7) // 8))
 
     def array(self, name: str) -> memoryview[Any]:
-        """Return a column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""
+        """Return a view of a column. The column `valid` is a bitmap, least significant bit first."""
         rows, at = len(self), self._at(name)
         if name == "valid":
             return self._memory[at : at + (rows + 7) // 8]
@@ -208,16 +208,16 @@ class Columns:
 
 
 class Spelling(NamedTuple):
-    """Names joined into one text, for the core."""
+    """Names joined into one text, from which the core builds Arrow columns."""
 
     names: int
     longest: int
     text: bytes
-    ends: Any  # int32_t[]: the start of each name, and the end of the last
+    ends: Any  # int32_t[]: the start of each name in the text, and the end of the last name
 
 
 class Names:
-    """Names and their numbers in columns. Names are never removed, so a number keeps its name."""
+    """Names, and the numbers (codes) that stand for them in columns. A name is never removed."""
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self._names = list(names)
@@ -275,11 +275,11 @@ def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memory
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))
 
 
-MOST_NARROW = 256  # names with codes of one byte
+MOST_NARROW = 256  # most names that codes of one byte can distinguish
 
 
 class CodeTable:
-    """Codes of one byte for names with codes of two bytes, assigned in the order of first use."""
+    """Translates two-byte codes of names into one-byte codes, assigned in the order of first use."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
@@ -287,12 +287,12 @@ class CodeTable:
         self.used: tuple[str, ...] = ()
 
     def forget(self) -> None:
-        """Forget all assigned codes."""
+        """Forget all assigned one-byte codes."""
         self._numbers[0 : len(self._names)] = [-1] * len(self._names)
         self.used = ()
 
     def narrow(self, codes: memoryview[Any]) -> memoryview[Any] | None:
-        """Return each code as a byte; None if there are more names than a byte has values.
+        """Return the one-byte code for each two-byte code; None if a byte has too few values.
 
         Raises ValueError if a code has no name.
         """
@@ -309,7 +309,7 @@ class CodeTable:
 
 
 def _copy(kind: str, column: bytes | memoryview[Any], size: int) -> Any:
-    """Return a copy of a column as an aligned array; its place in a file may not be aligned."""
+    """Return a column read from a file as an aligned C array; in the file it may not be aligned."""
     made = ffi.new(kind, max(memoryview(column).nbytes // size, 1))
     ffi.memmove(made, column, memoryview(column).nbytes)
     return made
@@ -326,7 +326,7 @@ def narrow_up(numbers: memoryview[Any]) -> memoryview[Any]:
 def widen(
     numbers: bytes | memoryview[Any], valid: bytes | memoryview[Any] | None, rows: int
 ) -> memoryview[Any]:
-    """Return float32 numbers as int64, 0 for those that `valid` excludes.
+    """Return float32 numbers as int64; those that the bitmap `valid` excludes become 0.
 
     Raises ValueError if a number is not finite or too large.
     """

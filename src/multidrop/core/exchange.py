@@ -25,17 +25,17 @@ class Counters(NamedTuple):
     values: int = 0
     sent: int = 0  # requests of which at least one byte left
     exceptions: int = 0  # exchanges that ended with an exception
-    naks: int = 0  # with code 07
-    busies: int = 0  # with code 06
+    naks: int = 0  # exceptions with code 07
+    busies: int = 0  # exceptions with code 06
     late: int = 0
     stray_bytes: int = 0
     ideal_ns: int = 0
-    longest_ns: int = 0  # response delay
-    timeout_ns: int = 0  # present timeout
-    ended: Counter[Status] = Counter()  # exchanges without a reply; broadcasts are OK
-    missed: Counter[Status] = Counter()  # values, by status
-    refused: Counter[int] = Counter()  # values, by exception code
-    delays: Counter[int] = Counter()  # replies, by the bucket of their response delay
+    longest_ns: int = 0  # longest response delay
+    timeout_ns: int = 0  # usual timeout of a read
+    ended: Counter[Status] = Counter()  # exchanges without a reply, by status; broadcasts are OK
+    missed: Counter[Status] = Counter()  # number of missing values, by status
+    refused: Counter[int] = Counter()  # number of missing values, by exception code
+    delays: Counter[int] = Counter()  # number of replies, by the bucket of their response delay
 
 
 DELAY_BUCKETS: int = lib.MD_DELAY_BUCKETS
@@ -43,12 +43,12 @@ _EDGES_NS = tuple(int(lib.md_delay_edge(bucket)) for bucket in range(DELAY_BUCKE
 
 
 def delay_edge(bucket: int) -> int:
-    """Return the least response delay of a bucket, in ns; the next bucket's is its end."""
+    """Return the least response delay of a histogram bucket, in ns."""
     return _EDGES_NS[bucket]
 
 
 def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
-    """Return the counters of a struct md_drive; `unasked` counts values that were due but not asked for."""
+    """Return the counters of a struct md_drive; `unasked` counts due values that were not requested."""
     c, history = drive.counters, drive.history
     return Counters(
         c.exchanges,
@@ -75,13 +75,13 @@ def _by_status(array: Any) -> Counter[Status]:
 
 
 def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
-    """Return the numbers other than 0, by their index."""
+    """Return the elements of a C array that are not 0, by their index."""
     numbers = memoryview(ffi.buffer(array)).cast(kind)
     return Counter({index: number for index, number in enumerate(numbers) if number})
 
 
 def _number(path: str) -> int:
-    """Return a property that reads a number of the struct `c`; attrgetter is faster than a function."""
+    """Return a property that reads a number of the struct `c`, by attrgetter because it is fastest."""
     return cast(int, property(attrgetter(path)))
 
 
@@ -96,7 +96,7 @@ class Completion:
     Times are CLOCK_MONOTONIC, in ns. `numbers` are the values of the exchange's fields, NaN for a missing
     value. `count` is the number of values that exist; -1 without a good reply and after an exception. A
     successful read uses only these two, because with cold caches each further field and call costs
-    microseconds. A completion can be reused for an exchange with the same number of values (`room`).
+    microseconds. An exchange with the same number of values (`room`) can reuse a completion.
     """
 
     __slots__ = ("c", "count", "numbers", "room", "values")
@@ -108,40 +108,40 @@ class Completion:
         self.values = ffi.new(_VALUES, room)
         self.numbers = memoryview(ffi.buffer(self.values)).cast("d") if room else _NO_NUMBERS
 
-    result = _number("c.result")  # the reply's length; 0: a broadcast; else a Failure or a FrameFault
+    result = _number("c.result")  # > 0: length of the reply; 0: a broadcast; < 0: a Failure or FrameFault
     error = _number("c.error")  # the errno of a lost line, or the mask of REFUSALS of settings
-    begun_ns = _number("c.begun_ns")  # the time at which its turn came
-    sent_ns = _number("c.sent_ns")  # the time at which the request left; 0: never
-    first_ns = _number("c.first_ns")  # the arrival of the first byte after the request; 0: none came
-    last_ns = _number("c.last_ns")  # the arrival of the last byte; 0: none came
+    begun_ns = _number("c.begun_ns")  # when the exchange's turn came
+    sent_ns = _number("c.sent_ns")  # when the request was sent; 0: never
+    first_ns = _number("c.first_ns")  # when the first byte after the request arrived; 0: none came
+    last_ns = _number("c.last_ns")  # when the last byte arrived; 0: none came
     late_until_ns = _number("c.late_until_ns")  # the drive's `late_until_ns` at the time of the call
-    stale = _number("c.stale")  # bytes that were discarded before the request left
-    skipped = _number("c.skipped")  # bytes after the request outside of the reply
+    stale = _number("c.stale")  # number of bytes discarded before the request was sent
+    skipped = _number("c.skipped")  # number of bytes after the request that are not part of the reply
 
     @property
     def reply(self) -> Message:
-        """The good reply, or an exception."""
+        """The reply as a message: a good reply or an exception."""
         return from_c(self.c.reply)
 
     @property
     def data(self) -> bytes:
-        """Data of the good reply; empty without one."""
+        """The data of the good reply; empty if there is no good reply."""
         reply = self.c.reply
         return bytes(ffi.buffer(reply.data, reply.data_len)) if self.count >= 0 else b""
 
     def values_of(self, layout: RowLayout) -> list[float | None]:
-        """Return the values of other fields in the good reply; None for a missing one."""
+        """Return the values of this layout's fields in the good reply; None for a missing value."""
         values = ffi.new(_VALUES, layout.count)
         lib.md_values(layout.c, ffi.addressof(self.c, "reply"), values)
         return [None if value != value else value for value in ffi.unpack(values, layout.count)]
 
     @property
     def raw(self) -> bytes:
-        """The reply's bytes; after a failure the last bytes received."""
+        """The bytes of the reply; after a failure, the last bytes received."""
         return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
 
     def unanswered(self) -> Completion:
-        """Return a copy without a reply, for a reply that was only the request's echo."""
+        """Return a copy of this completion without a reply, because the reply was only the request's echo."""
         found = ffi.new("struct md_completion *", self.c[0])
         found.result, found.raw_len = lib.MD_NO_REPLY, 0
         return Completion(found)
@@ -173,36 +173,36 @@ class Peer:
         )
         self.number = next(_NUMBERS)  # unique in this process
         self.proofs: tuple[Exchange, ...] = ()
-        self.unasked: Counter[Status] = Counter()  # values that were due but not asked for
+        self.unasked: Counter[Status] = Counter()  # due values that were not requested, by status
 
-    exchanges = _number("c.counters.exchanges")  # exchanges so far
+    exchanges = _number("c.counters.exchanges")  # number of exchanges so far
 
     @property
     def has_answered(self) -> bool:
-        """True once any reply came, including exceptions, late and doubtful ones."""
+        """True once any reply came, even an exception, a late reply or a doubtful reply."""
         return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
-    failures = _number("c.failures")  # exchanges in a row without an answer
-    late = _number("c.history.late")  # recognised replies after their timeout
-    late_until_ns = _number("c.late_until_ns")  # replies to earlier requests may come until then
+    failures = _number("c.failures")  # number of exchanges in a row without a reply
+    late = _number("c.history.late")  # number of replies recognised after their timeout
+    late_until_ns = _number("c.late_until_ns")  # until when replies to earlier requests may come
 
     @property
     def owes(self) -> bool:
-        """True while a slow path may still deliver replies to earlier requests."""
+        """True while replies to earlier requests may still come through a slow gateway or network."""
         return bool(self.c.owed_count)
 
-    answered_ns = _number("c.answered_ns")  # about the time of its newest reply; 0 before the first one
-    pauses = _number("c.history.pauses")  # replies PAUSE_NS or more after the previous one
-    ready_ns = _number("c.ready_ns")  # the earliest time of the next request
+    answered_ns = _number("c.answered_ns")  # about when the last reply came; 0 before the first
+    pauses = _number("c.history.pauses")  # replies PAUSE_NS or more after the previous reply
+    ready_ns = _number("c.ready_ns")  # earliest time of the next request
 
     def inherit(self, before: Peer) -> None:
-        """Take over the outstanding requests of the peer that this one replaces at its address."""
+        """Take over the outstanding requests of `before`, the peer that this peer replaces at its address."""
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Set the proofs: reads of which one is sent first whenever a late reply could be mistaken.
+        """Set the proofs: if a late reply could be mistaken for a new one, the core sends a proof first.
 
-        Only the first MOST_PROOFS are used. Their replies must differ from one another. Call this once,
+        A proof is a read. Only the first MOST_PROOFS are used; their replies must all differ. Call this once,
         before the first exchange, because the core reads the list from then on.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
@@ -212,15 +212,15 @@ class Peer:
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
-        """Repeat the first read after a proof, because its first reply may be for another process.
+        """Repeat the first read after a proof, because its first reply may be to another process.
 
-        Without proofs the first reply is accepted.
+        If the peer has no proofs, its first reply is accepted.
         """
         self.c.is_doubted = True
 
     @property
     def timeout(self) -> float:
-        """The present timeout, in s."""
+        """The usual timeout of a read, in s; after failures see `next_timeout_ns`."""
         return float(lib.md_present_timeout_ns(self.c)) / 1e9
 
     @property
@@ -230,12 +230,12 @@ class Peer:
 
     @property
     def next_timeout_ns(self) -> int:
-        """The timeout of the next read if the drive stays silent."""
+        """The timeout of the next read in ns, which is sometimes longer while the drive is silent."""
         return int(lib.md_next_timeout_ns(self.c))
 
     @property
     def silences(self) -> int:
-        """Exchanges that ended without a reply."""
+        """Number of exchanges that ended without a reply."""
         return int(self.c.history.ended[Status.NO_REPLY])
 
     def counters(self) -> Counters:
@@ -244,7 +244,7 @@ class Peer:
 
 
 class Exchange:
-    """A request with its drive, timing and settings; made once, carried out as often as needed.
+    """A request with its drive, timing and settings; created once, carried out as often as needed.
 
     Times are in seconds: `character` is the duration of one character, `silence` precedes the request and
     follows its reply, `turnaround` follows a broadcast, `period` is the period of its slots (0: none). With
@@ -289,7 +289,7 @@ class Exchange:
         echo_probe: Exchange | None = None,
         permit: Permit | None = None,
     ) -> None:
-        least, most = answer or (0, -1)  # (0, -1): no range
+        least, most = answer or (0, -1)  # (0, -1): any value
         frame = build_request(framing, request)
         kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""  # the core rebuilds longer frames
         self.framing = framing
@@ -297,7 +297,7 @@ class Exchange:
         self.peer = peer
         self.block = block
         self.values = values
-        self.room = values.count if values else 0  # values in a completion
+        self.room = values.count if values else 0  # number of values in a completion
         self.echo_probe = echo_probe
         self.permit = permit
         self.settings = (baudrate, format)

@@ -1,6 +1,6 @@
 """Forks: a child process inherits all objects of its parent, but no threads.
 
-In the child, a lock that another thread held stays locked forever, and other threads' answers never come.
+In the child, a lock that another thread held stays locked forever, and work of other threads never ends.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from weakref import WeakSet
 
 class Inherited(Protocol):
     def forked(self) -> None:
-        """Called in the child: give up the parent's resources without waiting."""
+        """Give up the parent's resources without waiting; called in the child process."""
 
 
 _registered: WeakSet[Inherited] = WeakSet()
@@ -25,7 +25,7 @@ def register_at_fork(inherited: Inherited) -> None:
 
 
 def _call_all() -> None:
-    for inherited in list(_registered):  # a list, so that none is freed during the calls
+    for inherited in list(_registered):  # a list keeps every object alive during the calls
         inherited.forked()
 
 
@@ -34,7 +34,7 @@ if hasattr(os, "register_at_fork"):  # Windows has no fork
 
 
 def only_here(act: Callable[..., object]) -> Callable[..., None]:
-    """Return a function that acts in this process only, and not in its children."""
+    """Return a function that calls `act` in this process, and does nothing in forked children."""
     here = os.getpid()
 
     def act_here(*details: object) -> None:

@@ -1,4 +1,4 @@
-"""Frames in four framings: built and parsed."""
+"""Build and parse frames in four framings."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Message:
     transaction: int = 0  # Modbus TCP only
 
 
-MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # framings of the same PDU
-_LONGER_THAN_RTU = 4  # additional bytes of a Modbus TCP frame
+MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # framings that carry the standard's PDU
+_LONGER_THAN_RTU = 4  # by how many bytes a Modbus TCP frame is longer than the same frame in RTU
 
 
 def characters_on_wire(framing: Framing, length: int) -> int:
-    """Return the characters of a frame on the drive's own wire: behind a gateway the frame is RTU."""
+    """Return the number of characters that a frame has on the serial wire; a gateway turns TCP into RTU."""
     return length - _LONGER_THAN_RTU if framing is Framing.TCP else length
 
 
@@ -109,7 +109,7 @@ def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | Non
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """Parse the reply to `request`, as parse_request does; the transaction may differ."""
+    """Parse the reply to `request`; return the same as parse_request. Its transaction id may differ."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None

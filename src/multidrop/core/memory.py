@@ -1,4 +1,4 @@
-"""Memory for structs that the core uses at every exchange: adjacent, and in whole cache lines.
+"""Allocate structs that the core uses at every exchange side by side, in whole cache lines.
 
 With many lines, this memory and its page translations are no longer cached when a line's next exchange
 starts. The structs of a drive are allocated together, so that they share a page or two.
@@ -16,7 +16,7 @@ CACHE_LINE = 64
 
 
 class Chunk:
-    """A piece of memory from which structs are allocated."""
+    """A piece of memory that holds several structs."""
 
     def __init__(self, size: int) -> None:
         self.owner = ffi.new("uint8_t[]", size + CACHE_LINE)
@@ -34,16 +34,16 @@ class Chunk:
 
 
 class Chunks:
-    """The structs of a process, allocated chunk by chunk."""
+    """Allocator of structs, from one chunk after another."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._present = Chunk(0)
 
     def take(self, kind: str) -> tuple[Any, Any]:
-        """Return a pointer to a struct of zeros, and the owner of its memory."""
+        """Return a pointer to a new struct of this C type, all zero, and the object that owns its memory."""
         size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
-        if not self._lock.acquire(blocking=False):  # used by another thread, or in a signal handler
+        if not self._lock.acquire(blocking=False):  # by a thread, or below a signal handler
             chunk = Chunk(size)
             return chunk.take(kind, size), chunk.owner
         try:
@@ -58,9 +58,9 @@ _chunks = Chunks()
 
 
 def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
-    """Return a pointer to a new struct, adjacent to the previous one, and the owner of its memory.
+    """Return a pointer to a new struct, placed after the previous one, and the object that owns its memory.
 
-    Keep both: the struct lives as long as the owner.
+    Keep a reference to the owner: the struct exists only as long.
     """
     made, owner = _chunks.take(kind)
     made[0] = fields
@@ -68,6 +68,6 @@ def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def new_apart(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
-    """Return a pointer to a new, rarely used struct in memory of its own, and the owner of that memory."""
+    """Return a pointer to a new, rarely used struct in separate memory, and the owner of that memory."""
     made = ffi.new(f"{kind} *", fields)
     return made, made

@@ -1,4 +1,4 @@
-"""Permissions to send: a stop ends a drive's permits, a deadline ends a process's mastership."""
+"""Permissions to send: a drive's stop invalidates its permits, a deadline ends a process's mastership."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Latch:
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # reason of the last rise, or of the shutting
+        self.why = ""  # why permits were last invalidated, or why they always will be
         self._is_shut = False
-        self._holds: set[object] = set()  # stops in progress
+        self._holds: set[object] = set()  # stops in progress, during which new permits are invalid
 
     def rise(self, why: str) -> None:
         """Invalidate all existing permits."""
@@ -38,29 +38,29 @@ class Latch:
         self.rise(why)
 
     def hold(self, stop: object, why: str) -> None:
-        """Invalidate all permits, including new ones until `let_go` is called for this stop."""
+        """Invalidate all permits, and all new permits until `let_go` is called for this stop."""
         self._holds.add(stop)
         self.rise(why)
 
     def let_go(self, stop: object) -> None:
-        """End the stop's hold, if it has one."""
+        """Allow valid permits again, unless another stop is in progress."""
         self._holds.discard(stop)
 
     def permit(self, seen: int | None = None) -> Permit:
-        """Return a permit that is good until the latch rises; during a stop it is never good.
+        """Return a permit that is valid until the next `rise`; never valid during a stop or after `shut`.
 
         `seen`: the value of `c[0]` at the start of the call that needs the permit.
         """
         if seen is None:
             seen = int(self.c[0])
-        if self._is_shut or self._holds:  # read after `seen`: a rise in between invalidates the permit
+        if self._is_shut or self._holds:  # after reading `seen`: a rise in between counts
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)
 
 
 @dataclass(frozen=True)
 class Permit:
-    """The permission for a write that may move a motor, until a stop is called."""
+    """The permission for a write that may move a motor; it ends when the drive's stop is called."""
 
     latch: Latch
     seen: int
@@ -103,13 +103,13 @@ class Mastership:
             raise OSError(ffi.errno, "the kernel's timer cannot be made")
         self.c: Any = c
         self._free = finalize(self, lib.md_mastership_free, c)
-        self._free.atexit = False  # ports may still use it
+        self._free.atexit = False  # ports may still use the struct at exit
         self._is_inherited = False
         self._lock = threading.Lock()  # keeps the deadline and its timer consistent
         register_at_fork(self)
 
     def forked(self) -> None:
-        """End the mastership in a forked child, because it and its timer belong to the parent."""
+        """End the mastership in a forked child, because the mastership and its timer belong to the parent."""
         self._free.detach()
         self._is_inherited = True
         self._lock = threading.Lock()
@@ -125,7 +125,7 @@ class Mastership:
 
     @property
     def holds(self) -> bool:
-        """True until the deadline."""
+        """True before the deadline."""
         return not self._is_inherited and bool(lib.md_mastership_holds(self.c))
 
     def extend(self, until_ns: int) -> None:

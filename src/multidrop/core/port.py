@@ -1,4 +1,4 @@
-"""Ports, whose exchanges the core's thread carries out, and the queue of their rows."""
+"""Ports, on which the core's thread carries out exchanges, and the queue of the resulting rows."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from multidrop.core.permissions import Mastership
 from multidrop.core.result import Status
 
 CHUNK_ROWS = 1 << 12
-MOST_CHUNKS = 256  # when all are full, the queue drops and counts new rows
+MOST_CHUNKS = 256  # when all chunks are full, the queue drops new rows and counts them
 
 
 class RowQueue:
-    """Rows from ports, and the numbers of ports that need attention (struct md_row_queue)."""
+    """A queue of rows from ports, and of the numbers of ports that need attention (struct md_row_queue)."""
 
     _MOST_AT_ONCE = 1024
 
@@ -41,21 +41,21 @@ class RowQueue:
         self._give_back = only_here(partial(lib.md_row_queue_give_back, self.c))
 
     def forked(self) -> None:
-        """Start empty in a forked child: the rows belong to the parent."""
+        """Empty the queue in a forked child, because the rows belong to the parent."""
         self._begin()
 
     def take(self) -> Columns | None:
-        """Return the oldest rows; None without rows."""
+        """Remove and return the oldest chunk of rows; None if there are no rows."""
         made = lib.md_row_queue_take(self.c)
         return None if made == ffi.NULL else Columns.lent(made, self._give_back)
 
     def add_miss(self, block: RowLayout, status: Status, due_ns: int) -> None:
-        """Add rows for values that were due at `due_ns` but not asked for."""
+        """Add rows with this status for a block's values that were due at `due_ns` but not requested."""
         lib.md_row_queue_miss(self.c, block.c, status, due_ns)
 
     @property
     def chunks(self) -> int:
-        """The number of chunks with rows; the newest chunk is still growing."""
+        """The number of chunks with rows, including the newest one, which is not full yet."""
         return int(lib.md_row_queue_chunks(self.c))
 
     @property
@@ -68,7 +68,7 @@ class RowQueue:
         lib.md_row_queue_call(self.c, number)
 
     def await_calls(self, seconds: float) -> list[int]:
-        """Wait for calls, at most `seconds`; return the numbers of the ports that need attention."""
+        """Wait at most `seconds` s; return the numbers of the ports that need attention."""
         count = lib.md_row_queue_await(self.c, round(seconds * 1e9), self._called, self._MOST_AT_ONCE)
         return ffi.unpack(self._called, count) if count else []
 
@@ -78,7 +78,7 @@ utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class Echo(StrEnum):
-    """An adapter's echo of the bytes that it sends; with `AUTO` the core learns it."""
+    """Whether an adapter returns the bytes that it sends; with `AUTO` the core finds out."""
 
     AUTO = "auto"
     ON = "on"
@@ -90,7 +90,7 @@ class Echo(StrEnum):
 
 
 class RS485(StrEnum):
-    """What switches the transceiver's direction.
+    """The party that switches the transceiver between receiving and sending.
 
     `OFF`: the adapter itself. `KERNEL`: the driver's RS-485 mode. `RTS_UP`: the core, with RTS on while a
     request is sent. `RTS_DOWN`: the core, with RTS off while a request is sent.
@@ -112,7 +112,7 @@ class RS485(StrEnum):
 
 
 class TransactionIds(StrEnum):
-    """A gateway's transaction ids: `MATCH` if replies repeat their request's, `IGNORE` if they do not."""
+    """A gateway's transaction ids: `MATCH` if a reply has the id of its request, `IGNORE` if not."""
 
     MATCH = "match"
     IGNORE = "ignore"
@@ -123,10 +123,10 @@ class TransactionIds(StrEnum):
 
 
 class Transactions(IntEnum):
-    """The use of transaction ids on a port (enum md_transactions)."""
+    """How a port uses transaction ids (enum md_transactions)."""
 
     NONE = lib.MD_NO_TRANSACTIONS  # every framing except Modbus TCP
-    MATCHED = lib.MD_MATCHED  # a reply repeats its request's id; all others are late or foreign
+    MATCHED = lib.MD_MATCHED  # a reply has the id of its request; replies with other ids are late or foreign
     IGNORED = lib.MD_IGNORED  # a gateway replies with its own ids
 
 
@@ -150,7 +150,7 @@ class _Engine:
 
     def forked(self) -> None:
         """Forget the thread in a forked child: the next port starts another one."""
-        self._starting = threading.Lock()  # several threads may open ports
+        self._starting = threading.Lock()  # several threads may open the first port
         self._c: Any = None
 
     @property
@@ -166,20 +166,20 @@ class _Engine:
 
 
 class _PortMemory:
-    """All of Python's memory that the core's thread reads and writes for one port.
+    """All memory of Python objects that the core's thread reads or writes for one port.
 
     Store an object here before passing it to the core.
     """
 
     def __init__(self, room: int, mastership: Mastership | None) -> None:
         self.mastership = mastership
-        self.lasting: set[object] = set()  # kept until the port closes
+        self.lasting: set[object] = set()  # objects kept until the port closes
         self.queued: list[Exchange | None] = [None] * room  # same indexes as the core's ring
         self._newest: dict[str, tuple[object, ...]] = {}
 
     @contextmanager
     def replacing(self, kind: str, new: object) -> Iterator[None]:
-        """Keep the new object of a kind, and the old one until the core has switched to the new one."""
+        """Keep the new object of a kind, and the old object until the core uses the new one."""
         self._newest[kind] = (*self._newest.get(kind, ()), new)
         yield
         self._newest[kind] = (new,)
@@ -211,7 +211,7 @@ class Port:
 
     `must_take` is the mask of REFUSALS that are failures; -1 means a port without settings. `room` is the
     length of the queue, a power of two. `transactions` is NONE unless all exchanges are Modbus TCP. With a
-    `mastership`, requests are sent only while that holds.
+    `mastership`, requests are sent only before its deadline.
 
     Raises OSError if the descriptor cannot be polled.
     """
@@ -247,7 +247,7 @@ class Port:
         self._is_inherited = True
 
     def tap(self, tap: Tap) -> None:
-        """Copy all bytes of the line to this tap, instead of the previous one."""
+        """Copy all bytes of the line to this tap from now on, and none to the previous tap."""
         with self._memory.replacing("tap", tap):
             lib.md_port_tap(self.c, tap.c)
 
@@ -256,7 +256,7 @@ class Port:
         lib.md_port_set_echo(self.c, _ECHOES[echo])
 
     def switch(self, rs485: RS485) -> None:
-        """Set what switches the transceiver's direction. Call it before the first request.
+        """Set who switches the transceiver between receiving and sending. Call it before the first request.
 
         Raises OSError if the driver refuses.
         """
@@ -269,11 +269,11 @@ class Port:
         return bool(lib.md_port_is_asking(self.c, peer.c))
 
     def counted_ns(self) -> int:
-        """Return the time up to which all line use has been counted."""
+        """Return the time in ns up to which the use of the line has been counted."""
         return int(lib.md_port_counted_ns(self.c))
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` take over the outstanding requests of `before`, which it replaces."""
+        """Let `peer` take over the outstanding requests of `before`, the peer that it replaces."""
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
@@ -283,7 +283,7 @@ class Port:
         return bool(self._progress.cut_off)
 
     def end(self) -> bool:
-        """From now on start only urgent exchanges; return True while a polled exchange is in flight."""
+        """Start only urgent exchanges from now on. Return True while a polled exchange is in flight."""
         return bool(lib.md_port_end(self.c))
 
     def stop(self) -> None:
@@ -296,20 +296,20 @@ class Port:
     def report_to(self, row_queue: RowQueue, number: int) -> None:
         """Deliver rows to `row_queue`, and call its client with `number` when the port needs attention.
 
-        The port needs attention if its queue runs low, if it is lost or has stopped repeating, and if a drive
-        refuses, fails to answer, or answers again.
+        The port needs attention if its queue runs low, the port is lost or has stopped repeating, or a drive
+        refuses a request, does not answer, or answers again.
         """
         with self._memory.replacing("rows", row_queue):
             lib.md_port_report(self.c, row_queue.c, number)
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        """Carry out these exchanges in turn whenever no queued exchange is due, until they are replaced.
+        """Carry out these exchanges in turn whenever no queued exchange is due, until the next call.
 
-        Return the index of the next exchange in the round that they replace; 0 on a closed port.
+        Return the index of the exchange that was next in the previous round; 0 on a closed port.
         """
         if self.c is None:
             return 0
-        self._memory.lasting.update(exchanges)  # one may be in flight when they are replaced
+        self._memory.lasting.update(exchanges)  # may be in flight when a new round replaces them
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         with self._memory.replacing("round", rounds):
             return int(lib.md_port_repeat(self.c, rounds, len(exchanges)))
@@ -320,10 +320,10 @@ class Port:
         return bool(self._progress.repeating)
 
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
-        """Queue exchanges, each with its earliest start; return how many fitted into the queue."""
+        """Queue exchanges, each with its earliest start in ns; return how many fitted into the queue."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
-        self._memory.lasting.update(exchange.peer for exchange in exchanges)  # a late reply may come
+        self._memory.lasting.update(exchange.peer for exchange in exchanges)  # a late reply may still come
         free = exchanges[: self.room - self.pending]
         for at, exchange in enumerate(free, int(self._progress.submitted)):
             self._memory.queued[at & (self.room - 1)] = exchange
@@ -351,12 +351,12 @@ class Port:
 
     @property
     def foreign(self) -> int:
-        """Number of bytes received while listening before the first request, from another master."""
+        """Number of another master's bytes, received while the port listened before its first request."""
         return int(self._progress.foreign)
 
     @property
     def switching(self) -> float:
-        """The average seconds of a change of baud rate or format; 0 before the first one."""
+        """The average duration of a change of baud rate or format, in s; 0 before the first change."""
         return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)
 
     def carry_out(
@@ -368,10 +368,10 @@ class Port:
     ) -> Completion:
         """Carry out an exchange before all queued ones, wait for it, and return its completion.
 
-        Reuses the completion `into` if it has room for the values. The exchange is not sent after
+        Reuse the completion `into` if it has room for the values. The request is not sent after
         `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop that ends its permit.
         """
-        self._memory.lasting.add(exchange.peer)  # a late reply may come
+        self._memory.lasting.add(exchange.peer)  # a late reply may still come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)
         found.count = lib.md_port_carry_out(
             self.c, exchange.c, not_before_ns, expires_ns, found.c, found.values

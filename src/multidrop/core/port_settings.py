@@ -1,4 +1,4 @@
-"""A port's baud rate and format: parsed, set and read back."""
+"""Parse a port's baud rate and character format, set them, and read them back."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REFUSALS = {
 
 
 class CharacterFormat(NamedTuple):
-    """The bits of a character."""
+    """Data bits, parity and stop bits of a character."""
 
     databits: int
     parity: str
@@ -33,17 +33,17 @@ def is_pseudo_terminal(device: str) -> bool:
 
 
 def must_take(device: str) -> int:
-    """Return the mask of REFUSALS that are failures: a pseudo-terminal ignores all but the baud rate."""
+    """Return the mask of REFUSALS that are failures; a pseudo-terminal may refuse all but the baud rate."""
     return int(lib.MD_REFUSED_BAUDRATE) if is_pseudo_terminal(device) else sum(REFUSALS)
 
 
 def refused_names(mask: int) -> str:
-    """Name the refused settings."""
+    """Return the names of the refused settings, as text."""
     return ", ".join(name for bit, name in REFUSALS.items() if mask & bit)
 
 
 def get_settings(fd: int) -> tuple[int, str]:
-    """Return a port's present baud rate and format. Raises OSError if it has none."""
+    """Return a port's present baud rate and format. Raises OSError if the port has no such settings."""
     settings = ffi.new("struct md_settings *")
     failure = lib.md_port_get(fd, settings)
     if failure:
@@ -52,7 +52,7 @@ def get_settings(fd: int) -> tuple[int, str]:
 
 
 def set_settings(fd: int, baudrate: int, format: str) -> int:
-    """Make a port raw with these settings; return the mask of REFUSALS.
+    """Put a port in raw mode with these settings; return the mask of REFUSALS, the settings it did not take.
 
     Raises OSError if the port has no settings.
     """

@@ -1,4 +1,4 @@
-"""Faults of frames, failures of exchanges and statuses of rows: numbers and texts."""
+"""Faults of frames, failures of exchanges and statuses of rows: their numbers and texts."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Failure(IntEnum):
 
 
 class Status(IntEnum):
-    """A row's status: why it has no value; exceptions are not members (enum md_status)."""
+    """A row's status: OK, or why the row has no value (enum md_status). Exception codes are not members."""
 
     OK = lib.MD_OK
     NO_START = -FrameFault.NO_START
@@ -92,8 +92,8 @@ _WORDS: dict[int, str] = {
     Status.POLLING_FAILED: "not asked: polling failed",
 }
 
-UNASKED = "not "  # prefix of the statuses without a request
-EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # + the exception's code
+UNASKED = "not "  # the texts of statuses without a request start with this
+EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # status of an exception, to which its code is added
 
 STATUSES = (
     *(_WORDS.get(code, "") for code in range(EXCEPTION_STATUS)),

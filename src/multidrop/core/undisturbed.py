@@ -1,4 +1,4 @@
-"""Work that no signal interrupts: a signal handler's exception ends the main thread's wait, not the work.
+"""Run work so that no signal interrupts it: a handler's exception ends the main thread's wait, not the work.
 
 Python raises KeyboardInterrupt and other exceptions of signal handlers between any two bytecodes of the main
 thread, even in `finally` and `__exit__`. Therefore separate threads open and close ports and lines.
@@ -14,14 +14,14 @@ from functools import partial, wraps
 from queue import Empty, SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
-HANDLING_S = 0.05  # longest delay of a signal that another thread received
+HANDLING_S = 0.05  # longest delay in s of a signal that the kernel gave to another thread
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 class _Act:
-    """A call that the first thread to take it carries out, once."""
+    """A call that is carried out once, by the first thread that calls `run`."""
 
     def __init__(self, act: Callable[[], Any]) -> None:
         self._untaken = SimpleQueue[Callable[[], Any]]()
@@ -52,7 +52,7 @@ class _Act:
                 raise failure
             return found
         finally:
-            del failure  # its traceback refers to this frame
+            del failure  # its traceback refers to this frame: a reference cycle
 
 
 def undisturbed(function: Callable[P, R]) -> Callable[P, R]:
