@@ -1,4 +1,4 @@
-"""Back off from silent drives, so that they take little time from the others. Callers pass the time, in ns.
+"""Back off from silent drives, so that other drives lose little time. Callers pass the time, in ns.
 
 A silent drive rests (gets no request) for longer each time. After each rest it gets its shortest request, in
 spare time or in the share of jobs without a period. All silent drives together take only a small share of the
@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 SILENT_AFTER = 2  # failures in a row after which a drive rests
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
-SILENT_SHARE = 0.015  # share of the line for requests to silent drives
+SILENT_SHARE = 0.015  # share of the line's time for requests to silent drives
 SECOND_COST_NS = 400_000_000  # limit of the total time for second requests to silent new drives
 
 
 @dataclass
 class Health:
-    """One drive's failures and rest."""
+    """A drive's failures, and its rest (the time in which it gets no request)."""
 
     is_new: bool = False  # the drive has never answered
     is_pending: bool = False  # the drive is new, and the outcome of its request is not known yet
@@ -30,20 +30,20 @@ class Health:
     late_until_ns: int = 0
     rest_ns: int = 0
     asleep_until_ns: int = 0
-    cost_ns: int = 0  # of a request without a reply
+    cost_ns: int = 0  # line time of a request without a reply
 
 
 @dataclass
 class BackOff:
-    """The health of all drives on a line, by address; `begin_rest` is called at the start of each rest."""
+    """The health of all drives on a line, by address. `begin_rest` is called when a drive's rest starts."""
 
-    begin_rest: Callable[[int, int], None]  # takes drive and time
+    begin_rest: Callable[[int, int], None]  # its arguments: the drive's address, and the time
     health: dict[int, Health] = field(default_factory=dict)
-    has_silent: bool = False  # whether any drive has failed last or is new
-    _late_until_ns: int = 0  # of all drives
+    has_silent: bool = False  # whether any drive is new, or did not answer its last request
+    _late_until_ns: int = 0  # the latest `late_until_ns` of all drives
 
     def meet(self, drive: int) -> None:
-        """Treat a drive as new, because it may be absent."""
+        """Treat a drive as new: it may be absent, so it gets only one request until the outcome is known."""
         self.health[drive].is_new = self.has_silent = True
 
     def forget(self, drive: int) -> None:
@@ -56,7 +56,7 @@ class BackOff:
             self.health[drive].is_pending = False
 
     def may_sleep(self, at_ns: int) -> bool:
-        """Return True if any drive may be asleep (may get no request now)."""
+        """Return True if any drive may be asleep, which means that it gets no request now."""
         return self.has_silent or at_ns < self._late_until_ns
 
     def is_asleep(self, drive: int, at_ns: int) -> bool:
@@ -64,7 +64,7 @@ class BackOff:
         return health.rest_ns > 0 or at_ns < max(health.asleep_until_ns, health.late_until_ns)
 
     def wake(self, at_ns: int) -> int | None:
-        """Return a drive whose rest is over, or None; the drive then starts its next rest."""
+        """Return a drive whose rest is over, and start its next rest; None if there is no such drive."""
         for drive, health in self.health.items():
             if health.rest_ns and at_ns >= health.asleep_until_ns and not health.is_pending:
                 health.asleep_until_ns = at_ns + health.rest_ns
@@ -81,7 +81,7 @@ class BackOff:
         cost_ns: int,
         has_answered: bool = True,
     ) -> None:
-        """Record a drive's failures in a row, and the cost of its next request if that gets no reply.
+        """Record a drive's failures in a row, and the line time of its next request if that gets no reply.
 
         Until `late_until_ns` a reply to an earlier request may come, so the drive gets no request, even if it
         has answered since. Once that late reply has come, the drive can be tried immediately.
@@ -114,18 +114,18 @@ class BackOff:
             self.begin_rest(drive, now_ns)
 
     def _fair_rest_ns(self) -> int:
-        """Return the rest in ns with which all silent drives together stay within SILENT_SHARE."""
+        """Return the rest in ns with which requests to all silent drives stay within SILENT_SHARE."""
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
-        """End the rest of another silent drive, because this drive is back."""
+        """End the rest of the silent drive that is due next, because this drive answers again."""
         resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
         if resting:
             first = min(resting, key=lambda health: health.asleep_until_ns)
             first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
-        """End the rest of silent new drives once all new drives have had a request and few are silent."""
+        """End the rest of silent new drives once all new drives have had a request, if few were silent."""
         new = [health for health in self.health.values() if health.is_new]
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:

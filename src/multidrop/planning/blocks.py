@@ -23,7 +23,7 @@ class Block:
 
     table: Table
     start: int
-    count: int  # number of addresses, including those between the registers
+    count: int  # number of addresses, including the addresses between the registers
     registers: tuple[Register[Any], ...]
     request: Message
 
@@ -42,7 +42,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Planned:
-    """A drive's block that is read every `every` seconds; None means as fast as the line allows."""
+    """A drive's block, to be read every `every` seconds (None: as fast as the line allows)."""
 
     drive: Drive
     block: Block
@@ -51,11 +51,11 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """The quickest blocks that read a drive's registers, for response delays from `least` to `most` s."""
+    """The blocks that read a drive's registers fastest, for response delays from `least` to `most` s."""
 
     planned: tuple[Planned, ...]
-    least: float  # with a shorter response delay, more requests of fewer characters would be quicker
-    most: float  # with a longer response delay, fewer requests of more characters would be quicker
+    least: float  # with shorter response delays, more but shorter requests would be quicker
+    most: float  # with longer response delays, fewer but longer requests would be quicker
 
     def suits(self, delay: float, margin: float = 0.0) -> bool:
         """Return True if no other plan is quicker at this response delay, within a relative `margin`."""
@@ -77,7 +77,7 @@ def plan(
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
         rates.setdefault(every, []).append(register)
-    overhead = silence(drive) + (drive.response_delay if delay is None else delay)  # s of each request
+    overhead = silence(drive) + (drive.response_delay if delay is None else delay)  # s that each request adds
     character = drive.settings.character
     found: list[Planned] = []
     least, most = 0.0, math.inf
@@ -96,7 +96,7 @@ def plan(
 
 
 def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
-    """Return the blocks sorted: first those with registers of `read_together`, in its order."""
+    """Return the blocks, sorted: first the blocks with registers of `read_together`, in its order."""
     places = {name: place for place, group in enumerate(drive.read_together) for name in group}
     return sorted(
         found, key=lambda one: min(places.get(each.name, len(places)) for each in one.block.registers)
@@ -106,7 +106,7 @@ def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
 def planned(
     drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
 ) -> list[Planned]:
-    """Return the blocks of `plan`."""
+    """Return the blocks of the quickest plan; see `plan`."""
     return list(plan(drive, wanted, delay).planned)
 
 
@@ -117,7 +117,7 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
 
 
 def first_block(drive: Drive) -> Block | None:
-    """Return a block with the drive's first reading, or else its first readable register; None if none."""
+    """Return a block with the drive's first reading or else first readable register; None if it has none."""
     readable = [*drive.readings(), *(each for each in drive.registers.values() if each.readable)]
     return blocks(drive, readable[:1])[0] if readable else None
 
@@ -163,13 +163,13 @@ class _Neighbours:
 
     carrier: Carrier
     registers: tuple[Register[Any], ...]
-    spans: tuple[tuple[int, int], ...]  # for each: its first address, and the one after its last
-    joined: tuple[bool, ...]  # for each and the next: whether the addresses between them may be read
-    tied: tuple[bool, ...]  # for each and the next: whether a cut between them would split a group
-    limit: int  # number of addresses that one request may read; a longer register is read whole
+    spans: tuple[tuple[int, int], ...]  # of each register: its first address, and the address after its last
+    joined: tuple[bool, ...]  # of each register: whether addresses up to the next register may be read
+    tied: tuple[bool, ...]  # of each register: whether it must be read together with the next register
+    limit: int  # most addresses in a request; a longer register is still read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
-        """Yield (begin, count) of each request that may read registers[begin:end]."""
+        """Yield (begin, count) of each allowed request for registers[begin:end]; `count` is in addresses."""
         if end < len(self.registers) and self.tied[end - 1]:
             return
         farthest = max(self.limit, max(stop - start for start, stop in self.spans))
@@ -185,7 +185,7 @@ class _Neighbours:
 
 
 def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neighbours]:
-    """Return these registers, grouped by read space."""
+    """Return these registers as one _Neighbours for each read space."""
     spaces: dict[object, list[tuple[range, Register[Any]]]] = {}
     for register in dict.fromkeys(registers):
         check_readable(drive, register)
@@ -222,9 +222,9 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 @dataclass(frozen=True)
 class _Way:
-    """A division of neighbours into requests: for their number, the one with the fewest characters."""
+    """A division of neighbours into requests, with the fewest characters for this number of requests."""
 
-    characters: int  # number of characters of the requests and their replies
+    characters: int  # total characters of the requests and their replies
     spans: tuple[tuple[int, int], ...]  # (begin, end) of each request's registers
 
     @property
@@ -234,13 +234,13 @@ class _Way:
 
 @lru_cache(maxsize=256)
 def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
-    """Return all ways that are quickest at some response delay, and maybe others; fewest requests first.
+    """Return all ways that are quickest at some response delay, and maybe more; fewest requests first.
 
     Dynamic programming over the first register of the last request.
     """
-    fronts: list[list[_Way]] = [[_Way(0, ())]]  # by the number of registers, counted from the first
+    fronts: list[list[_Way]] = [[_Way(0, ())]]  # ways for the first n registers, by n
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Way] = {}  # characters, by number of requests
+        fewest: dict[int, _Way] = {}  # the way with the fewest characters, by number of requests
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:
@@ -253,7 +253,7 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
 
 
 def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
-    """Return the ways without those that need more requests than another and no fewer characters."""
+    """Return the ways, but without each that needs more requests than another and no fewer characters."""
     kept: list[_Way] = []
     for requests in sorted(ways):
         if not kept or ways[requests].characters < kept[-1].characters:
@@ -282,7 +282,7 @@ def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
 
 
 def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
-    """Return groups of registers that are always read together, by rising address."""
+    """Return the block's groups of registers that are always read together, by rising address."""
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:
@@ -292,10 +292,10 @@ def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
 
 
 def may_be_too_long(drive: Drive, block: Block) -> bool:
-    """Return True if the request may be too long for the drive: its class states no limit."""
+    """Return True if the drive's class states no limit, so that this block may be too long for the drive."""
     return stated_limit(drive, block.table) is None and len(_units(drive, block)) > 1
 
 
 def least(drive: Drive, block: Block) -> Block:
-    """Return the block that reads the first group of registers that are always read together."""
+    """Return a block with only the first group of registers that are always read together."""
     return Block.of(drive, _units(drive, block)[0])

@@ -9,7 +9,7 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Carrier
 
-# Number of characters of a read's request and reply without data, and of each data byte.
+# Characters of a read without its data (request plus reply), and characters of each data byte.
 _FRAMES = {
     Framing.RTU: (8 + 5, 1),
     Framing.ASCII: (17 + 11, 2),
@@ -19,10 +19,10 @@ _FRAMES = {
 
 
 def silence(drive: Drive) -> float:
-    """Return the seconds of silence around a drive's exchanges: what the drive needs, plus one bit.
+    """Return the seconds of silence around a drive's exchanges: those that the drive needs, plus one bit.
 
-    ASCII frames need no silence, but get 1.5 characters: enough to notice further bytes, such as a second
-    copy of the reply, which could otherwise be mistaken for the next reply. Modbus TCP has no silence.
+    ASCII frames need no silence, but get 1.5 characters. That is enough to notice further bytes, such as a
+    second copy of the reply, which could otherwise be mistaken for the next reply. Modbus TCP has no silence.
     """
     settings = drive.settings
     if drive.framing is Framing.TCP:
@@ -32,13 +32,13 @@ def silence(drive: Drive) -> float:
 
 
 def characters(framing: Framing, carrier: Carrier, count: int) -> int:
-    """Return the number of characters of a request that reads `count` registers, plus its reply."""
+    """Return the number of characters of a request for `count` registers plus its reply."""
     around, each = _FRAMES[framing]
     return around + each * ((count + 7) // 8 if carrier is Carrier.BIT else 2 * count)
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
-    """Return the seconds from the reply of `before` to the request for `after`, on a line that is never idle.
+    """Return the seconds from the reply of `before` to the request to `after`, on a line that is never idle.
 
     `switching` is the time in s that the port takes to change baud rate or format after the silence.
     """
@@ -52,21 +52,21 @@ def switches(before: Drive, after: Drive) -> bool:
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Return silence and settings; drives that share them follow each other in the least time."""
+    """Return the drive's silence and line settings; drives that share both are read in a row fastest."""
     return silence(drive), str(drive.settings)
 
 
 def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
     """Return the drives in an order with the least silence in a bus cycle, and then the fewest switches.
 
-    The line keeps the longer of two neighbours' silences, so drives of equal silence and settings are put
-    side by side. Kinds are inserted by rising silence, each at its cheapest place. If switching takes no
-    time, no other order is shorter.
+    Between two drives the line keeps the longer of their silences. Therefore drives of the same kind (silence
+    and settings) are put side by side. Kinds are inserted by rising silence, each at its cheapest place. If
+    switching takes no time, no other order is shorter.
     """
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:
         kinds.setdefault(kind(drive), []).append(drive)
-    cycle: list[Drive] = []  # one of each kind
+    cycle: list[Drive] = []  # one drive of each kind
     for each in sorted(kinds):
         drive = kinds[each][0]
         costs = [_detour(cycle[at - 1], drive, cycle[at], switching) for at in range(len(cycle))]
@@ -75,7 +75,7 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
 
 
 def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:
-    """Return the additional cost of a drive between two others: time in ns, and number of switches."""
+    """Return the cost of inserting `drive` between two drives: time in ns, and number of settings changes."""
     seconds = gap(before, drive, switching) + gap(drive, after, switching) - gap(before, after, switching)
     more = sum(switches(one, other) for one, other in pairwise((before, drive, after)))
     return round(seconds * 1e9), more - switches(before, after)

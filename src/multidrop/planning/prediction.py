@@ -18,8 +18,8 @@ from multidrop.planning.blocks import Planned, sending
 from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s that a common computer adds to each exchange to wake up and write the request
-ENOUGH = 0.97  # fraction of a wanted rate that counts as reached
+LATENESS = 100e-6  # s that a usual computer adds to each exchange, to wake up and to write
+ENOUGH = 0.97  # fraction of a wanted rate from which the rate counts as reached
 LEAST_EXCHANGES = 1000  # minimum number of simulated exchanges
 LEAST_ROUNDS = 3  # minimum number of simulated exchanges per job
 FAR_NS = 1 << 62
@@ -33,7 +33,7 @@ class Rate:
     every: float | None
     registers: tuple[Register[Any], ...]
     requests: int
-    reached: float  # times per second
+    reached: float  # reads per second
 
     @property
     def fits(self) -> bool:
@@ -42,11 +42,11 @@ class Rate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The predicted figures of one line."""
+    """The predicted bus cycle, utilisation and rates of one line."""
 
     cycle: float  # s for one exchange of each block
-    switches: int  # number of changes of the line's settings in a cycle
-    utilisation: float  # above 1, the line would have to be faster by this factor
+    switches: int  # number of changes of baud rate or format in a cycle
+    utilisation: float  # if above 1, the line would have to be faster by this factor
     rates: tuple[Rate, ...]
 
     @property
@@ -74,12 +74,12 @@ class _PredictedJob(Job):
 
     @property
     def cost(self) -> float:
-        """Mean line time of an exchange in s."""
+        """The mean line time of an exchange, in s."""
         return self.taken / self.count if self.count else self.own + silence(self.planned.drive)
 
     @property
     def reached(self) -> float:
-        """Exchanges per second."""
+        """The simulated number of exchanges per second."""
         if self.skipped == 0 and self.planned.every:
             return 1 / self.planned.every
         return (self.count - 1) * 1e9 / (self.last_ns - self.first_ns) if self.count > 1 else 0.0
@@ -102,7 +102,7 @@ def predict(
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    has_rests = any(job.interval_ns for job in jobs)  # the line may then be idle
+    has_rests = any(job.interval_ns for job in jobs)  # then the line may be idle between exchanges
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
@@ -130,7 +130,7 @@ def predict(
 
 
 def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
-    """Return the seconds that each drive needs to carry out all of its jobs once, with its intervals."""
+    """Return the seconds that each drive needs for all of its jobs once, including its intervals."""
     found: dict[Drive, float] = {}
     for job in jobs:
         drive = job.planned.drive
@@ -164,7 +164,7 @@ def _jobs(
 
 def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
     """Run the jobs on a simulated clock, and store the results in them."""
-    ends = {job.kind: job.planned.drive for job in jobs}  # all drives of one kind need the same gaps
+    ends = {job.kind: job.planned.drive for job in jobs}  # any drive of each kind: gaps depend on the kind
     numbers = {kind: number for number, kind in enumerate(ends)}
     gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
     slots = tuple(
@@ -198,7 +198,7 @@ class _Done(NamedTuple):
     taken: float
 
 
-@lru_cache(64)  # lines of a plant are often alike, and a program may predict a plant several times
+@lru_cache(64)  # a plant often has several equal lines, and may be predicted several times
 def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...]) -> tuple[_Done, ...]:
     """Simulate the jobs in the schedule's order; return the results of each job.
 
@@ -236,7 +236,7 @@ def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...])
     return tuple(one._replace(skipped=job.skipped) for one, job in zip(done, jobs, strict=True))
 
 
-# ---- as a recording carries it ----
+# ---- the prediction in a recording's metadata ----
 
 
 def prediction_metadata(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:

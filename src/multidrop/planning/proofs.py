@@ -20,18 +20,18 @@ from multidrop.planning.blocks import Block, all_requests
 
 MOST_PROOFS = 4  # limit per drive, because each proof uses memory
 
-# For devices whose replies look alike: even an exception names the function, and a read changes nothing.
+# Tables to read if all replies of a device look alike: replies, even exceptions, name their function.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-ENOUGH = 3  # one may be outstanding itself, and the last is reserved for a drive that answers again
+ENOUGH = 3  # a proof may be outstanding itself, and the last is for a drive that is back
 
-RawRange = tuple[int, int]  # lowest and highest raw count of the only register in a reply
+RawRange = tuple[int, int]  # lowest and highest raw value of the only register in a reply
 
 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return the blocks to read from this drive as proofs.
 
-    Each has the range of raw counts that its reply is known to hold, or None. The last block is the least
-    likely to be polled. If a Modbus device has fewer than ENOUGH of them, its other tables are read too.
+    Each has the range of raw values that its reply is known to hold, or None. The last block is the least
+    likely to be polled. If a Modbus device has fewer than ENOUGH such blocks, its other tables are read too.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -40,7 +40,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     ]
     if known:
         found = [*known, *found[1:]]
-    if probe := drive.echo_probe:  # its reply cannot be mistaken for an echo
+    if probe := drive.echo_probe:  # a read whose reply cannot be mistaken for an echo
         found = [(Block.of(drive, [probe]), None), *found]
     if len(found) < ENOUGH and not known and drive.framing is not Framing.DELIXI:
         found += [(block, None) for block in _of_other_tables(drive, [block for block, _ in found])]
@@ -51,7 +51,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return registers whose replies differ in shape: the first MOST_PROOFS, and the last.
+    """Return groups of registers whose replies differ in shape: the first MOST_PROOFS groups, and the last.
 
     Readings come first, because they are polled anyway, and shorter requests before longer ones.
     """
@@ -68,7 +68,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return reads of one register, whose replies differ by function from those of the blocks found."""
+    """Return blocks of one register whose replies differ by function from those of the blocks `found`."""
     start = found[0].start if found else 0
     functions = {block.table.read for block in found}
     return [

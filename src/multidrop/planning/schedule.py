@@ -1,4 +1,4 @@
-"""Decide which exchange of a line comes next. Callers pass the time, in ns.
+"""Decide which exchange of a line is carried out next. Callers pass the time, in ns.
 
 The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
 period has slots at multiples of the period, which never drift. Of the started slots, the one that ends first
@@ -18,7 +18,7 @@ from typing import Generic, NamedTuple, TypeVar
 from multidrop.planning.back_off import BackOff, Health
 
 TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
-CREDIT_NS = 50_000_000  # of that share, which they use up in advance
+CREDIT_NS = 50_000_000  # part of that share that these jobs may use in advance
 NEVER_NS = 1 << 63
 
 
@@ -26,23 +26,23 @@ NEVER_NS = 1 << 63
 class Job:
     """One exchange that is carried out repeatedly with the drive at this address.
 
-    Jobs of one `kind` have the same line settings and silence, so they follow each other in the least time.
+    Jobs of one `kind` have the same line settings and silence, so they take the least time in a row.
     """
 
     drive: int
     period_ns: int | None
     duration_ns: int
-    silence_ns: int = 0  # part of the duration that may already pass while the line is idle
-    interval_ns: int = 0  # minimum time from the end of an exchange to the next request to the drive
+    silence_ns: int = 0  # part of the duration that may pass before the job, while the line is idle
+    interval_ns: int = 0  # minimum time from the end of an exchange to the drive's next request
     kind: Hashable = None
     due_ns: int = 0
     taken_ns: int = 0
     skipped: int = 0  # number of slots skipped because the line was busy
-    number: int = 0  # in the bus cycle
+    number: int = 0  # place in the bus cycle
 
     @property
     def end_ns(self) -> int:
-        """End of the job's present slot."""
+        """The end of the job's present slot."""
         return self.due_ns + (self.period_ns or 0)
 
 
@@ -58,7 +58,7 @@ class Turn(NamedTuple, Generic[J]):
 
 
 class Schedule(Generic[J]):
-    """The jobs of one line."""
+    """The jobs of one line, and the order in which they are carried out."""
 
     def __init__(self) -> None:
         self.clear()
@@ -66,17 +66,17 @@ class Schedule(Generic[J]):
     def clear(self) -> None:
         """Forget all jobs and the health of their drives."""
         self.jobs: list[J] = []
-        self.unasked: list[tuple[J, int]] = []  # slots skipped because of silence: job and due time
+        self.unasked: list[tuple[J, int]] = []  # slots skipped because the drive is silent: job and due time
         self.back_off = BackOff(self._begin_rest)
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # a heap of (due, number, job)
         self._begun: list[J] = []  # jobs whose slot has started
-        self._ready: dict[int, int] = {}  # by drive with an interval: time of the earliest next request
+        self._ready: dict[int, int] = {}  # earliest time of the next request, by drive with an interval
         self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
         self._round: list[J] = []  # jobs without a period
-        self._next = 0  # index in the round
-        self._owed_ns = -CREDIT_NS  # time owed to the jobs of the round
-        self._is_late = False  # whether a slot was skipped since the line last had no due job left
+        self._next = 0  # index of the next job in the round
+        self._owed_ns = -CREDIT_NS  # line time owed to the jobs of the round
+        self._is_late = False  # whether a slot was skipped since the line last had no due job
         self._kind: Hashable = None  # kind of the job that was taken last
         self._number = 0
 
@@ -107,7 +107,7 @@ class Schedule(Generic[J]):
             self._round.pop(at)
 
     def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
-        """Replace `jobs` by `others`, at the same place in the round; their first slots start at `due_ns`."""
+        """Replace `jobs` by `others` at their place in the round. The first slots start at `due_ns`."""
         rest = self._round[self._next :] + self._round[: self._next]
         at = next((at for at, job in enumerate(rest) if job in jobs), len(rest))
         for job in others:
@@ -129,20 +129,20 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the round if no job has slots or an interval and all drives answer; otherwise []."""
+        """Return the round; [] if any job has slots or an interval, or if any drive is silent."""
         if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]
 
     def go_on(self, job: J) -> None:
-        """Continue the round with this job."""
+        """Make this job the next one of the round."""
         if job in self._round:
             self._next = self._round.index(job)
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[Turn[J]]:
         """Return at most `most` turns, in order, that keep the line busy until `horizon_ns`.
 
-        `start_ns` is when the line will have carried out all earlier turns.
+        `start_ns` is the time at which the line will have carried out all earlier turns.
         """
         at = idle_since = max(now_ns, start_ns)
         taken: list[Turn[J]] = []
@@ -164,13 +164,13 @@ class Schedule(Generic[J]):
         return not self._ready or at_ns >= self._ready.get(job.drive, 0)
 
     def _next_ns(self, at_ns: int) -> int:
-        """Return the next time at which a job may be due or ready."""
+        """Return the next time at which a slot starts or a drive's interval ends."""
         times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
         times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
         return min(times, default=NEVER_NS)
 
     def _begin_slots(self, by_ns: int) -> None:
-        """Start all slots that are due, and skip those of resting drives."""
+        """Start all slots that are due, but skip slots of drives that get no request now."""
         while self._waiting and self._waiting[0][0] <= by_ns:
             job = heapq.heappop(self._waiting)[2]
             if self.back_off.is_asleep(job.drive, by_ns):
@@ -184,7 +184,7 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Return the started job whose slot ends first, or one of the last kind if no slot would be missed.
+        """Return the started job whose slot ends first, or one of the last kind if that misses no slot.
 
         If slots were skipped, return the job that has waited longest. Return None if no job can be sent.
         """
@@ -240,7 +240,7 @@ class Schedule(Generic[J]):
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
-        if job.period_ns is None or health.rest_ns:  # a resting drive's request does not use a slot
+        if job.period_ns is None or health.rest_ns:  # a request to a resting drive does not use a slot
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return Turn(job, max(health.late_until_ns, ready_ns), None)
         self._begun.remove(job)
@@ -258,7 +258,7 @@ class Schedule(Generic[J]):
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """Let slots wait again if the drive's first reply is pending, because they may start later."""
+        """Let started slots of a new drive wait again while the outcome of its first request is pending."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)
@@ -282,11 +282,11 @@ class Schedule(Generic[J]):
     # ---- slots without a request ----
 
     def _begin_rest(self, drive: int, now_ns: int) -> None:
-        """Add to `unasked` one entry for each job of the drive without slots, which becomes a miss row."""
+        """Add the drive's jobs without slots to `unasked`: each gets a row without a value."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip every slot that starts by `now_ns`; return the jobs with the slots' due times."""
+        """Skip every slot that starts by `now_ns`; return pairs of a job and the due time of its slot."""
         while self._begun:
             self._await(self._begun.pop())
         passed = []
@@ -298,5 +298,5 @@ class Schedule(Generic[J]):
         return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip all due slots, and one slot of each job without a period; return them."""
+        """Skip all due slots, and one turn of each job without a period; return them as `pass_slots` does."""
         return [*((job, now_ns) for job in self._round), *self.pass_slots(now_ns)]

@@ -1,4 +1,4 @@
-"""Suggest changes that make a line reach its rates: lower rates, a higher baud rate, fewer registers."""
+"""Suggest changes with which a line reaches its rates: lower rates, a higher baud rate, fewer registers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import silence
 from multidrop.planning.prediction import Prediction, Rate, predict
 
-WORTH_SAYING = 0.02  # least fraction of the reading time that a suggestion must save
+WORTH_SAYING = 0.02  # fraction of the reading time that a suggestion must save at least
 _NAMES = {
     HOLDING: "HOLDING",
     HOLDING_MULTIPLE: "HOLDING",
@@ -27,16 +27,16 @@ _NAMES = {
 }
 
 
-SLOWER = 1.05  # factor between attempted periods
+SLOWER = 1.05  # factor from one attempted period to the next
 
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes that each make the line fit; None if it cannot."""
+    """Three changes, each of which alone makes the line reach its rates; None if that change cannot."""
 
-    every: tuple[tuple[float, float], ...]  # pairs: a wanted period in s, and one that fits instead
+    every: tuple[tuple[float, float], ...]  # pairs: wanted period, reachable period (s)
     baudrate: tuple[int, tuple[Drive, ...]] | None  # a baud rate, and the drives that need it
-    registers: int | None  # register limit per overloaded drive
+    registers: int | None  # most registers of each drive whose rates do not fit
 
     def __str__(self) -> str:
         pairs = (f'every = "{duration_text(new)}" instead of {duration_text(old)}' for old, new in self.every)
@@ -56,7 +56,7 @@ def duration_text(seconds: float) -> str:
 
 
 def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: float = 0.0) -> Suggestions:
-    """Return changes that would make these exchanges fit; `prediction` says which do not fit.
+    """Return changes that would make these exchanges reach their rates; `prediction` shows which do not.
 
     `switching` is the time in s of a change of settings, as for `predict`.
     """
@@ -71,10 +71,10 @@ def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: flo
 def _every(
     exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...]:
-    """Multiply the periods that do not fit by a common factor, at least `least`, that makes all fit.
+    """Multiply the periods that are not reached by one factor, at least `least`, so that all are reached.
 
-    Return pairs of a wanted and a longer period. The search ends, because the other exchanges fit already,
-    and fit better the longer these periods are.
+    Return pairs of a wanted and a longer period. The search ends, because the other exchanges reach
+    their rates already, the more so the longer these periods are.
     """
     hasty = {(rate.drive, rate.every) for rate in tight}
     wanted = sorted({rate.every for rate in tight if rate.every})
@@ -98,7 +98,7 @@ def _rounded_up(seconds: float) -> float:
 
 
 def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tuple[Drive, ...]] | None:
-    """Return the lowest baud rate that makes all fit, and the drives that are slower now."""
+    """Return the lowest baud rate with which all rates are reached, and the drives that are slower now."""
     wanted: dict[Drive, list[tuple[Register[Any], float | None]]] = {}
     for each in exchanges:
         wanted.setdefault(each.drive, []).extend((register, each.every) for register in each.block.registers)
@@ -126,7 +126,7 @@ def _at(drive: Drive, baudrate: int) -> Drive:
 
 
 def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: float) -> int | None:
-    """Return the largest number of registers with which each rate would fit; None if even one is too many."""
+    """Return the most registers with which each rate is reached; None if even one register is too many."""
     crowded = {(rate.drive, rate.every) for rate in tight}
     others = [each for each in exchanges if (each.drive, each.every) not in crowded]
 
@@ -144,7 +144,7 @@ def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: f
 
 @dataclass(frozen=True)
 class ReadingGain:
-    """Readable gaps that a class could state, and the cost of its reads with them and without them (now)."""
+    """Readable gaps that a class could declare, and the cost of its reads with and without them (now)."""
 
     drive: Drive
     gaps: tuple[tuple[Table, range], ...]
@@ -162,7 +162,7 @@ class ReadingGain:
         )
 
     def _declaration(self) -> str:
-        """Return the text that declares the gaps in the family's file or class."""
+        """Return the text that would declare the gaps in the family's file or class."""
         named = [(_NAMES.get(table, table.name), gap) for table, gap in self.gaps]
         if self.drive.declared_in:
             in_file = (f"{name.lower()} = [0x{gap[0]:X}, 0x{gap[-1]:X}]" for name, gap in named)
@@ -172,7 +172,7 @@ class ReadingGain:
 
 
 def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> ReadingGain | None:
-    """Return the gain if the class stated readable gaps; None if it states some or the gain is negligible."""
+    """Return the gain if the class declared readable gaps; None if it already does, or gains too little."""
     wanted = list(wanted)
     before = planned(drive, wanted)
     unstated = {
@@ -192,7 +192,7 @@ def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | Non
 
 
 def _crossed(drive: Drive, table: Table, found: Sequence[Planned]) -> range:
-    """Return the range of addresses that these blocks read although they are not declared."""
+    """Return the range of addresses that these blocks read although no register is declared there."""
     family: Any = type(drive)
     readable = readable_addresses(family, table)
     blocks = [one.block for one in found if one.block.table.read_space == table.read_space]

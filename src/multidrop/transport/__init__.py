@@ -1,4 +1,4 @@
-"""Ports, and exchanges on them: the only room of the library that talks to the operating system's ports."""
+"""Ports, and exchanges on them. This is the only package of the library that uses the system's ports."""
 
 from multidrop.transport.statistics import Delays as Delays
 from multidrop.transport.statistics import Diagnostics as Diagnostics

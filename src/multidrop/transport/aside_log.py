@@ -1,4 +1,4 @@
-"""AsideThread: does work that may hang, such as writing a log to a disk, so that stops never wait for it."""
+"""Do work that may hang, such as writing a log to a disk, on a thread for which stops never wait."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from queue import Empty, SimpleQueue
 from multidrop.core.fork import register_at_fork
 
 MOST_FRAMES = 30  # number of innermost frames in a logged traceback
-MOST_WAITING = 10_000  # queued pieces of work; further ones are dropped
+MOST_WAITING = 10_000  # most queued pieces of work; further ones are dropped
 
 
 class AsideThread:
@@ -28,7 +28,7 @@ class AsideThread:
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._begun = threading.Lock()  # locked once the thread has started
-        # the queue of the last flush that timed out, and its timeout in s
+        # of the last flush that timed out: a queue that gets an item when its work is done; its timeout in s
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object]) -> None:
@@ -37,8 +37,8 @@ class AsideThread:
             self._work.put(work)
         if self._begun.acquire(blocking=False):
             try:
-                _thread.start_new_thread(self._run, ())  # threading would wait until the thread runs
-            except BaseException as failure:  # no thread is left, or the interpreter is ending
+                _thread.start_new_thread(self._run, ())  # `threading` would wait until it runs
+            except BaseException as failure:  # the system has no more threads, or the interpreter is ending
                 self._begun.release()
                 if not isinstance(failure, (RuntimeError, MemoryError)):
                     raise
@@ -58,7 +58,7 @@ class AsideThread:
         return True
 
     def hangs(self, seconds: float) -> bool:
-        """Return True if a `flush` of at least `seconds` s timed out, and its work is still pending."""
+        """Return True if a `flush` timed out after at least `seconds` s, and its work is still pending."""
         late = self._late
         return late is not None and late[1] >= seconds and late[0].empty()
 
@@ -74,7 +74,7 @@ _log_thread = AsideThread("multidrop log")
 
 
 def log_aside(logger: logging.Logger, level: int, text: str, *details: object) -> None:
-    """Log this on the log thread, in the order of the calls; return immediately."""
+    """Log this message on the log thread, in the order of the calls; return immediately."""
     if logger.isEnabledFor(level):
         _log_thread.put(partial(logger.log, level, text, *details))
 

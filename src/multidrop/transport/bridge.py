@@ -25,17 +25,17 @@ else:
 
 _log = logging.getLogger("multidrop.line")
 
-# All exceptions that a port may raise.
+# All exceptions that pyserial's ports may raise.
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
-# Both are shorter than WRITE_TIMEOUT, so that no write is sent after its caller got an outcome.
-MOST_STALL_MS = 750  # a connection that stalls for longer is cut
+# The next two are shorter than WRITE_TIMEOUT, so that no write is sent after its caller got an outcome.
+MOST_STALL_MS = 750  # ms; the kernel cuts a connection that stalls for longer
 MOST_AGE = 0.25  # s; an older request is not forwarded
-MOST_CHUNK = 1024  # bytes that the core reads in one call
-LOOK_EVERY = 0.1  # s between checks whether the bridge is closed
-CLOSING_TIME = 2.0  # s that closing waits for a thread blocked by the port
+MOST_CHUNK = 1024  # most bytes that the core reads in one call
+LOOK_EVERY = 0.1  # s between checks of whether the bridge is closed
+CLOSING_TIME = 2.0  # s; limit of the wait for a thread that the port blocks
 
-# On Linux such a socket keeps requests separate, and gives each the time at which the core wrote it.
+# On Linux the socket pair keeps requests separate, and states for each when the core wrote it.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; the control message is a struct timespec
@@ -106,11 +106,11 @@ class Bridge:
             raise OSError(errno.ENOMEM, str(failure)) from failure
 
     def _run(self, copy: Callable[[], None]) -> None:
-        """Copy until the port fails in any way; then hang up, which the core notices."""
+        """Copy in one direction until the port fails; then hang up, so that the core sees a lost port."""
         try:
             copy()
         except PORT_FAILURES:
-            pass  # the line logs that the port hung up
+            pass  # the line logs that the port was lost
         except BaseException as failure:
             log_aside(_log, logging.ERROR, "%s: it failed\n%s", self._port.port, traceback_of(failure))
         finally:
@@ -128,7 +128,7 @@ class Bridge:
                 self._port.write(request)
 
     def _take(self) -> tuple[bytes, bool]:
-        """Return a request of the core, and whether it is fresh (without time stamps, always True)."""
+        """Return a request of the core, and whether it is fresh (always True if there are no time stamps)."""
         if not _STAMPED:
             return self._ours.recv(MOST_CHUNK), True
         request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))
@@ -143,7 +143,7 @@ class Bridge:
                 self._hand_over(received[at : at + MOST_CHUNK])
 
     def _hand_over(self, chunk: bytes) -> None:
-        """Pass these bytes to the core. While the core takes none, further bytes stay in the port."""
+        """Pass these bytes to the core. Until the core has taken them, further bytes stay in the port."""
         while chunk and not self._closing.is_set():
             with suppress(TimeoutError):
                 chunk = chunk[self._ours.send(chunk) :]
@@ -153,7 +153,7 @@ class Bridge:
             self._ours.shutdown(socket.SHUT_RDWR)
 
     def forget(self) -> None:
-        """Close without hanging up, because the parent of the fork still uses the connection."""
+        """Close both ends of the pair without hanging up; the parent of a fork still uses the connection."""
         self._ours.close()
         self.theirs.close()
 
@@ -166,6 +166,6 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Return True if the request was written within MOST_AGE; False in doubt (the clock was set)."""
+    """Return True if the request is at most MOST_AGE s old; False in doubt, if the clock was changed."""
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]
     return any(abs(time.time() - seconds - ns / 1e9) <= MOST_AGE for seconds, ns in written)

@@ -14,7 +14,7 @@ from multidrop.core import utc_minus_monotonic_ns
 
 sleep = time.sleep
 
-if hasattr(time, "clock_gettime_ns"):  # faster than a call of the core's function
+if hasattr(time, "clock_gettime_ns"):  # faster than calling the core's function
 
     def now_ns() -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""
@@ -23,7 +23,7 @@ if hasattr(time, "clock_gettime_ns"):  # faster than a call of the core's functi
 else:
 
     def now_ns() -> int:
-        """Return the time of the core's clock in ns."""
+        """Return the core's time in ns, on a system without CLOCK_MONOTONIC in Python."""
         return int(core_now_ns())
 
 

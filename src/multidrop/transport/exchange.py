@@ -1,4 +1,4 @@
-"""Exchanges with the drives on a line, one at a time, and before queued exchanges of polling."""
+"""Carry out exchanges with a line's drives, one at a time, before the queued exchanges of polling."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def good_reply(drive: Drive, completion: Completion) -> Message:
 
 
 def no_reply(drive: Drive, completion: Completion) -> NoReply:
-    """Return the error for a silent drive, or for one that its gateway reports as silent."""
+    """Return the error for a silent drive, or for a drive that its gateway reports as silent."""
     if drive.framing is Framing.TCP and completion.raw:
         code = completion.raw[-1]
         return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
@@ -65,12 +65,12 @@ def check_master(drive: Drive, completion: Completion) -> None:
 
 
 def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveException:
-    """Return the error for an exception code; `register` is the name if only one register was requested."""
+    """Return the error for an exception code; `register`: its name, if only one was requested."""
     return DriveException(drive.name, code, drive.exception(code), register)
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
-    """Return the error for the first register without a value; it contains the other registers' values."""
+    """Return the error for the first register in `found` without a value; it carries the other values."""
     known = {name: value for name, value in found.items() if value is not None}
     return NoValue(drive.name, next(name for name in found if name not in known), known)
 
@@ -82,8 +82,8 @@ def _port_of(drive: Drive) -> str:
 T = TypeVar("T")
 
 READ_ATTEMPTS = 3
-WRITE_TIMEOUT = 1.0  # s, long, because a write wrongly reported as unconfirmed costs more than the wait
-ILLEGAL_FUNCTION = 1  # exception code to which a shorter request of the same function is no answer
+WRITE_TIMEOUT = 1.0  # s; long, because a write wrongly reported as unconfirmed costs more
+ILLEGAL_FUNCTION = 1  # exception code after which shorter requests of the function fail too
 
 
 class Exchanges:
@@ -92,21 +92,21 @@ class Exchanges:
     def __init__(self, line: Line) -> None:
         self.line = line
         self._peers = Peers(line)
-        self._answered_on: dict[Drive, object] = {}  # the port object on which it last answered
+        self._answered_on: dict[Drive, object] = {}  # the port object on which each drive last answered
         self._prepared: dict[Drive, PreparedReads] = {}
 
     # ---- the drives ----
 
     def add(self, drive: Drive) -> None:
-        """Add a drive; one that was on the line before keeps its learnt timing and late replies."""
+        """Add a drive. If it was on the line before, it keeps its learnt timing and late replies."""
         self._peers.add(drive)
 
     def close(self) -> None:
-        """Close the line; late replies still due are remembered for the next opening of the port."""
+        """Close the line, but remember which late replies are due, for the next opening of the port."""
         self._peers.close()
 
     def remember(self, before: Exchanges) -> None:
-        """Copy the peers of an earlier bus on the same line."""
+        """Take over the peers (timing and late replies) of an earlier bus on the same line."""
         self._peers.remember(before._peers)
 
     def remove(self, drive: Drive) -> None:
@@ -117,7 +117,7 @@ class Exchanges:
 
     @property
     def peers(self) -> dict[Drive, Peer]:
-        """A copy of the present drives' peers: any thread may add and remove drives."""
+        """The peers of the present drives; a copy, because any thread may add and remove drives."""
         return dict(self._peers.present)
 
     def peer(self, drive: Drive) -> Peer:
@@ -125,7 +125,7 @@ class Exchanges:
         return self._peers.of(drive)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is about to start, queued or in flight."""
+        """Return True while an exchange with this peer is about to start, is queued, or is in flight."""
         return self._peers.is_asking(peer)
 
     def has_answered(self, drive: Drive) -> bool:
@@ -135,11 +135,11 @@ class Exchanges:
     # ---- reading ----
 
     def read(self, drive: Drive, registers: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
-        """Return the registers' values by name, as `values` does, but reopen a lost port.
+        """Return the registers' values by name, as `values` does; reopen the port if it is lost.
 
         This is for a gateway that closes the connection after each reply. If the port is lost after the drive
-        has answered on it, reopen it and read block by block. Raises PortLost if a block loses the port twice
-        in a row, or if the drive had not answered.
+        has answered on it, reopen it and read block by block. Raises PortLost if the port is lost twice
+        in a row at the same block, or before the drive has answered.
         """
         try:
             return self.values(drive, registers, READ_ATTEMPTS)
@@ -160,7 +160,7 @@ class Exchanges:
         return found
 
     def read_text(self, drive: Drive, text: Text) -> str:
-        """Return a text, as `text` does, but reopen a port that is lost after the drive has answered."""
+        """Return a text, as `text` does; if the port is lost after the drive has answered, reopen it."""
         try:
             return self.text(drive, text)
         except PortLost:
@@ -176,8 +176,8 @@ class Exchanges:
     def _again(self, read: Callable[[], T]) -> T:
         """Reopen a lost port and call `read`; if the port is lost again, do both a second time.
 
-        Only for a user's own reads, not for those of a script: after a reopening, a script's writes need
-        another identity check.
+        Use this only for a user's own reads, not for a script's: after the port is reopened, a script's
+        writes need another identity check.
         """
         self._regain()
         try:
@@ -199,7 +199,7 @@ class Exchanges:
         insists: bool = False,
         timeout: float = 0.0,
     ) -> dict[str, Any]:
-        """Return the values of registers (given as such or by name) by name.
+        """Return the values of these registers (Register objects or names), by name.
 
         Each block is tried up to `attempts` times. With `insists`, send immediately even if a late reply
         could be mistaken for this one; on slow paths wait up to `timeout` seconds. If the drive does not
@@ -221,11 +221,11 @@ class Exchanges:
                     into = read.spare.pop()
                 except IndexError:
                     into = None
-                try:  # a successful read takes few calls, for speed: see Completion
+                try:  # few calls if the read succeeds, for speed: see Completion
                     reply = self._peers.carry_out(drive, exchange, into=into)
                     if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
-                    if reply.count == read.whole:  # the fast path, without `strict` and a further call
+                    if reply.count == read.whole:  # the usual case is fast: no `strict`, no further call
                         values = dict(zip(read.names, reply.numbers.tolist()))  # noqa: B905
                     else:
                         values = read.decode(reply)
@@ -250,7 +250,7 @@ class Exchanges:
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
     ) -> tuple[Block, ...]:
-        """Return smaller blocks to read instead of a failed block; raise the failure if they cannot help."""
+        """Return smaller blocks to read instead of a failed block; if they cannot help, raise the failure."""
         block = read.block
         if isinstance(failure, DriveException):
             helps = failure.code != ILLEGAL_FUNCTION and not drive.is_temporary(failure.code)
@@ -282,7 +282,7 @@ class Exchanges:
         *,
         insists: bool = False,
     ) -> Any:
-        """Return one register's value, or a text."""
+        """Return the value of one register, or a text."""
         if isinstance(register, Text):
             return self.text(drive, register, attempts, insists=insists)
         return self.values(drive, [register], attempts, insists=insists)[register.name]
@@ -307,9 +307,9 @@ class Exchanges:
         return prepared
 
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
-        """Read a register of `other`, a drive of another family, from this drive; return the value.
+        """Read a register of `other`, a drive of another family, at the address of `drive`; return the value.
 
-        Each request is sent only once, with `insists`.
+        Each request is sent only once, and even if a late reply could be mistaken for its reply.
         """
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
@@ -345,7 +345,7 @@ class Exchanges:
         return good_reply(drive, completion).data
 
     def _note_answer(self, drive: Drive, completion: Completion) -> None:
-        if completion.result > 0:  # an exception also shows that the drive is there
+        if completion.result > 0:  # an exception also shows that the drive answers
             self._answered_on[drive] = self.line.queue
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Completion:
@@ -357,14 +357,14 @@ class Exchanges:
     def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
         """Return the good reply to a read that was sent once, with `completion`; retry it if that failed.
 
-        If all attempts fail, raises BadReply if any of them received bytes, else NoReply.
+        If all attempts fail: raises BadReply if bytes were received in any attempt, else NoReply.
         """
         came: BadReply | None = None
         while completion.count < 0:
             attempts -= 1
             self._note_answer(drive, completion)
             try:
-                good_reply(drive, completion)  # raises
+                good_reply(drive, completion)  # raises: the completion has no good reply
             except (NoReply, BadReply, DriveException) as failure:
                 if isinstance(failure, BadReply):
                     came = failure
@@ -388,12 +388,12 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Send a write once, before queued polling, after late replies have come in or expired.
+        """Send a write once, before queued polling, once late replies have come or can no longer come.
 
         The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or if `permit` was withdrawn.
-        It waits for its reply at least `timeout` seconds. With `insists` it does not wait for late replies,
-        and on slow paths waits up to `timeout` seconds for its own reply. Raises NoReply without sending if
-        late replies are due and the drive is silent.
+        It waits for its reply at least `timeout` seconds. With `insists` it does not wait for late replies;
+        on a slow connection, it waits up to `timeout` seconds for its own reply. Raises NoReply without
+        sending if late replies are due and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit

@@ -40,9 +40,9 @@ class LineLog:
 
     def __init__(self, port: str) -> None:
         self.foreign = 0  # number of bytes received while listening before a request
-        self.shows = _log.isEnabledFor  # takes a level
+        self.shows = _log.isEnabledFor  # function of a log level: whether it is logged
         self._port = port
-        self._foreign_here = 0  # the same since the port was last opened
+        self._foreign_here = 0  # part of `foreign` since the port was last opened
         self._is_lost = False
         self._why_unopened = ""
         self.forked()
@@ -52,7 +52,7 @@ class LineLog:
         self._noting = threading.Lock()
 
     def opened(self, identity: str) -> None:
-        """Log that the port was opened, and reset the state of its last opening."""
+        """Log that the port was opened; from now on, a loss of the port is logged again."""
         again = " again" if self._is_lost else ""
         log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
         self._is_lost, self._foreign_here, self._why_unopened = False, 0, ""
@@ -64,7 +64,7 @@ class LineLog:
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
 
     def unopened(self, why: str) -> None:
-        """Log why the port could not be opened or reopened, unless the same reason was logged last."""
+        """Log why the port could not be opened or reopened, unless the last attempt had the same reason."""
         if why != self._why_unopened:
             self._why_unopened = why
             again = " again" if self._is_lost else ""
@@ -96,7 +96,7 @@ class LineLog:
         log_aside(_log, logging.DEBUG, "%s < %.6f %s %s", self._port, at, came, meaning)
 
 
-LOGGING_S = 1.0  # how long closing waits for the log thread
+LOGGING_S = 1.0  # s; limit of the wait for the log thread when a line is closed
 
 UNOPENED = (
     "it is not opened: this process is not its master, and opening it could end the master's connection"
@@ -132,14 +132,14 @@ class Line:
         self.ids = ids
         self._echo = echo
         self._opened = OpenPort(port, ids, rs485, mastership, settle)
-        # The core's port, on which exchanges are queued; None before it is opened, and once it is dropped.
+        # The core's port, on which exchanges are queued; None before `open`, and after `drop`.
         self.queue: Port | None = None
         self._tap: Tap | None = None
         self._log = LineLog(port)
         self._is_over = False
         self._why_closed = "it is closed"
         self._why_lost: str | None = None
-        self.why_closing: str | None = None  # why calls already fail, before `close` is called
+        self.why_closing: str | None = None  # why calls fail although `close` was not called yet
         self._make_locks()
         register_at_fork(self)
 
@@ -147,7 +147,7 @@ class Line:
         self._lock = threading.RLock()  # one thread opens or closes at a time
 
     def forked(self) -> None:
-        """Close the line in a forked child: a descriptor left open there would keep the port busy."""
+        """Close the line in a forked child: a descriptor that stays open there would keep the port busy."""
         self._make_locks()
         self._log.forked()
         self._is_over = True
@@ -157,20 +157,20 @@ class Line:
 
     @property
     def identity(self) -> str:
-        """The port's identity once it is open, the same for all names of the port; see port_identity."""
+        """The identity of the port once it is open: the same for all of its names, see port_identity."""
         return self._opened.identity
 
     # ---- opening and closing ----
 
     def open(self) -> Self:
-        """Open the line and return it. Raises LineError if the port is absent or the line was closed."""
+        """Open the line and return it. Raises LineError if the port is absent, or if the line was closed."""
         self._open_first()
         return self
 
     @undisturbed
     def _open_first(self) -> None:
         with self._lock:
-            if self._is_over:  # an earlier, interrupted opening has closed the line
+            if self._is_over:  # an interrupted earlier call of `open` has closed the line
                 raise self._closed()
             self._reopen()
 
@@ -206,7 +206,7 @@ class Line:
 
     @undisturbed
     def close(self) -> None:
-        """Close the port; `regain` then raises LineError."""
+        """Close the port for good: `regain` then raises LineError."""
         with self._lock:
             if not self._is_over:
                 self._log.closed()
@@ -215,7 +215,7 @@ class Line:
         flush(LOGGING_S)
 
     def end(self) -> bool:
-        """Start no more queued exchanges; return True while one is in flight."""
+        """Start no more queued exchanges. Return True while a queued exchange is in flight."""
         with self._lock:  # without it, another thread could free the port meanwhile
             return self.queue is not None and self.queue.end()
 
@@ -226,7 +226,7 @@ class Line:
 
     @undisturbed
     def reopen(self) -> None:
-        """Close the port and open it again. Raises LineError if it is absent."""
+        """Close the port and open it again. Raises LineError if the port is absent."""
         self._reopen()
 
     def _reopen(self) -> None:
@@ -236,13 +236,13 @@ class Line:
 
     @property
     def is_lost(self) -> bool:
-        """True if the port failed, and was neither reopened nor closed since."""
+        """True if the port has failed, and was neither reopened nor closed since then."""
         core = self.queue
         return not self._is_over and (core is None or core.lost)
 
     @property
     def why_lost(self) -> str | None:
-        """Why a lost port could not be reopened, with its name; None if it is open or was not tried yet."""
+        """Why a lost port could not be reopened, with its name; None if it is open, or not tried yet."""
         return f"{self.port}: {self._why_lost}" if self.is_lost and self._why_lost else None
 
     @undisturbed
@@ -255,7 +255,7 @@ class Line:
                 return
             try:
                 self._reopen()
-            except Exception as failure:  # pyserial and its backends may raise any kind
+            except Exception as failure:  # pyserial and its backends may raise any exception
                 reason = failure.reason if isinstance(failure, LineError) else words_of(failure)
                 self._why_closed = self._why_lost = reason
                 self._log.unopened(reason)
@@ -271,7 +271,7 @@ class Line:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Prepare for these settings. Raises LineError if a bridged port has others or rejects them."""
+        """Set a bridged port's settings. Raises LineError if it already has others or rejects these."""
         with self._lock:
             self._opened.require(settings)
 
@@ -281,7 +281,7 @@ class Line:
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` inherit the late replies of `before`, an earlier peer at its address."""
+        """Let `peer` also expect the late replies to `before`, an earlier peer at its address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)
@@ -340,16 +340,16 @@ class Line:
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def counted_ns(self, now_ns: int) -> int:
-        """Return the time until which exchanges are counted: now, or the start of the one in flight."""
+        """Return the time up to which exchanges are counted: now, or the start of the one in flight."""
         return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:
-        """Return the driver's count of overruns since it was loaded; None if unknown."""
+        """Return the number of overruns since the driver was loaded; None if it is unknown."""
         return self._opened.overruns()
 
     @property
     def may_send(self) -> bool:
-        """False if this process is not the master of the line."""
+        """True if this process is the line's master, or if the line has no mastership."""
         return self.mastership is None or self.mastership.holds
 
     def note_foreign(self) -> None:
@@ -360,7 +360,7 @@ class Line:
 
     @property
     def foreign(self) -> int:
-        """Number of bytes that came while the line listened before a request."""
+        """Number of another master's bytes, received while the line listened before a request."""
         return self._log.foreign
 
     @property

@@ -1,6 +1,6 @@
 """Detect when Modbus TCP (tcp://) and RTU over TCP (socket://) were confused in a port's name.
 
-A gateway is set to one of the two. To requests of the other, it is silent or replies with nonsense.
+A gateway is set to one of these protocols. It is silent to requests of the other, or replies with junk.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from multidrop.core import crc16
 from multidrop.drive.line_settings import MODBUS_PORT
 
 _HEAD = 6  # bytes of Modbus TCP's header before the unit id
-_LEAST, _MOST_RTU = 5, 256  # bytes of an RTU frame: an exception is the shortest reply
+_LEAST, _MOST_RTU = 5, 256  # bytes of an RTU reply; the shortest one is an exception
 _OTHER = {"socket": "tcp", "tcp": "socket"}
 _SPOKEN = {"socket": "RTU over TCP", "tcp": "Modbus TCP"}
 
 
 def other_port(port: str) -> str:
-    """Return the port name for the other protocol at the same host and port; "" for other kinds of ports."""
+    """Return the URL for the other protocol at the same host and port; "" for other kinds of ports."""
     url = urlsplit(port)
     if url.scheme not in _OTHER:
         return ""
@@ -31,7 +31,7 @@ def spoken_on(port: str) -> str:
 
 
 def mixed_up(port: str, received: bytes) -> str:
-    """Return advice if bytes received on this port look like the other protocol, else ""."""
+    """Return a hint for the user if bytes received on this port look like the other protocol, else ""."""
     other = other_port(port)
     is_shaped = other and (_is_tcp(received) if other.startswith("tcp") else _is_rtu(received))
     if not is_shaped:
@@ -40,7 +40,7 @@ def mixed_up(port: str, received: bytes) -> str:
 
 
 def silence_hint(port: str) -> str:
-    """Return advice for a silent drive behind a tcp:// or socket:// port; "" for other ports."""
+    """Return a hint for the user of a silent tcp:// or socket:// port; "" for other kinds of ports."""
     other = other_port(port)
     if not other:
         return ""

@@ -1,8 +1,8 @@
 """RFC2217Port: pyserial's client for serial ports on a network (RFC 2217), with limits on memory and time.
 
 pyserial buffers received bytes without a limit, and waits for seconds until a stalled network takes a
-request. Here bytes that come too fast are lost, as on a serial line, and a request is sent immediately or
-never.
+request. This class drops bytes that come too fast, as a serial line does, and sends a request immediately
+or never.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class SocketPort(Serial):
     _socket: socket.socket | None = None
 
     def close(self) -> None:
-        """End the connection, so that the far end can immediately accept another one."""
+        """End the connection, so that the far end can immediately accept a new connection."""
         connection, self._socket, self.is_open = self._socket, None, False
         if connection:
             with suppress(OSError):  # the far end may have closed it already
@@ -42,9 +42,9 @@ class SocketPort(Serial):
 
 
 MOST_RECEIVED = 4096  # bytes read from the network in one call
-MOST_CHUNKS = 64  # limit of received chunks that are buffered
-MOST_SUBOPTION = 256  # bytes; RFC 2217's suboptions are short, except for its signature
-LOCK_TIME = 0.1  # s that a write waits while another thread answers an option
+MOST_CHUNKS = 64  # most received chunks that are buffered
+MOST_SUBOPTION = 256  # bytes; RFC 2217's suboptions are short, except the signature
+LOCK_TIME = 0.1  # s that a write waits while the reading thread answers a telnet option
 
 _IAC, _SB, _SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
 _NEGOTIATIONS = (rfc2217.DO, rfc2217.DONT, rfc2217.WILL, rfc2217.WONT)
@@ -54,11 +54,11 @@ class Telnet:
     """Parser that splits a telnet stream (RFC 854), received in any pieces, into data and commands."""
 
     def __init__(self) -> None:
-        self._command = b""  # incomplete command
+        self._command = b""  # the received part of an incomplete command
         self._suboption: bytearray | None = None
 
     def split(self, received: bytes) -> Iterator[tuple[bytes, bytes]]:
-        """Yield (b"", data), (command, option) and (SB, suboption), in the order of the stream."""
+        """Yield pairs in the order of the stream: (b"", data), (command, option) or (SB, suboption)."""
         at = 0
         while at < len(received):
             if self._command:
@@ -101,7 +101,7 @@ class Telnet:
 
 
 def _send_at_once(connection: socket.socket, data: bytes) -> int:
-    """Send without waiting; return the number of bytes sent. socket.send() would wait for its timeout."""
+    """Send without waiting, unlike socket.send(); return the number of bytes sent."""
     if sys.platform != "win32":
         return os.write(connection.fileno(), data)
     return connection.send(data) if select.select([], [connection], [], 0)[1] else 0
@@ -118,7 +118,7 @@ class RFC2217Port(rfc2217.Serial):
     _telnet_negotiate_option: Any
 
     def _telnet_read_loop(self) -> None:
-        """Read the socket until the connection ends; pyserial's own thread runs this."""
+        """Read the socket until the connection ends; pyserial runs this on its own thread."""
         self._read_buffer = queue.Queue(MOST_CHUNKS)
         telnet = Telnet()
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""OpenPort: open a port by its name, and give the core its descriptor."""
+"""Open a port by its name, and give its descriptor to the core."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 
 def overruns(fd: int) -> int:
-    """Return the number of overruns since the driver was loaded. Raises OSError if they are not counted."""
+    """Return the number of overruns since the driver was loaded. Raises OSError if it counts none."""
     if sys.platform != "linux":
         raise OSError("only Linux counts them")
-    import fcntl  # which Windows lacks
+    import fcntl  # Windows lacks this module
 
     counts = bytearray(_ICOUNTER.size)
     fcntl.ioctl(fd, _TIOCGICOUNT, counts)
@@ -63,13 +63,13 @@ _REASONS = {
 # pyserial keeps a Windows error only in its message: could not open port 'COM5': PermissionError(13, ...)
 _WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
 _WINDOWS_REASONS = {
-    errno.EACCES: _REASONS[errno.EBUSY],  # only one program can have a COM port
+    errno.EACCES: _REASONS[errno.EBUSY],  # a COM port is open in another program
     errno.EBADF: _REASONS[errno.ENOTTY],
 }
 
 
 def reason_of(failure: BaseException) -> str:
-    """Return the cause of a failure in words; pyserial hides the system's error in its own or its context."""
+    """Return the cause of a failure in words, from the system's error that pyserial's exception hides."""
     for error in (failure, failure.__context__):
         if isinstance(error, socket.gaierror):
             return error.strerror or str(error)
@@ -89,14 +89,14 @@ def is_lost_by(result: int, port: Port) -> bool:
 
 
 def why_lost(port: str, error: int, received: bytes) -> str:
-    """Return why a port was lost, from the errno of its descriptor; 0 means that the far end hung up."""
+    """Return why a port was lost, from the errno of its descriptor (0: the far end hung up)."""
     if error != errno.EPROTO:
         return os.strerror(error) if error else "hung up"
     shown = received[:16].hex(" ").upper() or "a damaged header"
     return f"the received bytes are not Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
-_FOR_PROGRAMS = ("loop", "spy")  # pyserial's; without options, as spy://DEVICE?file=PATH empties that file
+_FOR_PROGRAMS = ("loop", "spy")  # pyserial's; no options: spy://DEVICE?file=PATH would empty the file
 
 
 def _socket_url(url: SplitResult) -> str:
@@ -119,7 +119,7 @@ def unopened(port: str) -> serial.Serial:
     if url.scheme == "rfc2217":
         found = RFC2217Port()
         found.port = port
-        return cast(serial.Serial, found)  # the type that pyserial declares for all its ports
+        return cast(serial.Serial, found)  # pyserial declares this type for all its ports
     if url.scheme in ("socket", "tcp"):
         connection = SocketPort()
         connection.port = _socket_url(url) if url.scheme == "tcp" else port
@@ -155,7 +155,7 @@ def connection_of(port: serial.SerialBase | None) -> socket.socket | None:
 
 
 def descriptor_of(port: serial.SerialBase) -> int:
-    """Return the port's descriptor, or on Windows its handle."""
+    """Return the descriptor of the port; on Windows, its handle."""
     return int(getattr(port, "_port_handle", None) or port.fileno())
 
 
@@ -172,11 +172,11 @@ def identity_of(port: serial.SerialBase, name: str) -> str:
         return port_identity.of_connection(connection)
     try:
         return port_identity.of_device(device_of(port))
-    except (OSError, ValueError, AttributeError):  # the port has no device, such as loop://
+    except (OSError, ValueError, AttributeError):  # a port without a device, such as loop://
         return port_identity.of_name(name)
 
 
-BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, for whatever adapter is plugged in
+BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, into which any adapter may be plugged
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
     TransactionIds.MATCH: Transactions.MATCHED,
@@ -185,7 +185,7 @@ _TRANSACTIONS = {
 
 
 def _refusal(rs485: RS485, failure: OSError) -> str:
-    """Return a sentence that the driver cannot switch the transceiver as `rs485` needs."""
+    """Return the error text if the driver cannot switch the transceiver as `rs485` requires."""
     what = "has no RS-485 mode" if rs485 is RS485.KERNEL else "does not switch RTS"
     return f'the driver {what} ({os.strerror(failure.errno or 0)}), which rs485 = "{rs485}" needs'
 
@@ -205,7 +205,7 @@ class OpenPort:
         settle: float = 0.0,
     ) -> None:
         self.name = name
-        self.identity = name  # see port_identity; known once the port was opened
+        self.identity = name  # see port_identity; the given name until the port is opened
         self.bridge: Bridge | None = None
         self.settings: tuple[int, str] | None = None  # baud rate and format of a bridged port
         self._ids = ids
@@ -226,7 +226,7 @@ class OpenPort:
         port.timeout = 0
         if isinstance(port, serial.Serial):
             port.exclusive = True
-            port.rts = self._rs485 is not RS485.RTS_UP  # else opening would switch the transceiver to sending
+            port.rts = self._rs485 is not RS485.RTS_UP  # otherwise opening starts sending
         port.open()
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
             self._require_same_adapter(device_of(port))
@@ -241,9 +241,9 @@ class OpenPort:
         return core
 
     def _terminal_now(self) -> PseudoTerminal | None:
-        """Return the pseudo-terminal to open. Raises LineError for a later one of the same number.
+        """Return the pseudo-terminal to open. Raises LineError if a later one has got its number.
 
-        It may be anyone's, such as a shell's, and even opening it would change its settings.
+        The later terminal may belong to any program, such as a shell, and opening it changes its settings.
         """
         found = pseudo_terminal_of(self.name)
         if self._terminal and found and self._terminal.is_replaced_by(found):
@@ -251,7 +251,7 @@ class OpenPort:
         return found
 
     def _require_same_adapter(self, device: str) -> None:
-        """Raise LineError if another adapter has this name now, because its line has other motors."""
+        """Raise LineError if another adapter has this device name now: there are other motors on its line."""
         found = adapter_of(device)
         if self._adapter is None:
             self._adapter = found
@@ -281,7 +281,7 @@ class OpenPort:
         return Port(self.bridge.theirs.fileno(), _NO_SETTINGS)
 
     def _switched(self, core: Port, device: str) -> Port:
-        """Set who switches the transceiver, and return `core`; skip this for a pseudo-terminal.
+        """Set who switches the transceiver, except on a pseudo-terminal; return `core`.
 
         Raises LineError if the driver refuses.
         """
@@ -294,7 +294,7 @@ class OpenPort:
         return core
 
     def close(self) -> None:
-        """Close the port, even if it is only partly open."""
+        """Close the port, even if opening it failed halfway."""
         if self.bridge:
             self.bridge.close()
             self.bridge = None
@@ -302,11 +302,11 @@ class OpenPort:
             connection = connection_of(self._serial)
             with suppress(*PORT_FAILURES):
                 self._serial.close()
-            if connection:  # pyserial does not close a connection that the far end has closed
+            if connection:  # pyserial leaves a connection open that the far end has closed
                 connection.close()
 
     def forget(self) -> None:
-        """Close the child's descriptors after a fork: the parent still uses the port."""
+        """Close the descriptors in a forked child, but not the connection that the parent still uses."""
         if self.bridge:
             self.bridge.forget()
             self.bridge = None
@@ -317,11 +317,11 @@ class OpenPort:
                 port.close()
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Set the one baud rate and format of a bridged port.
+        """Set the baud rate and format of a bridged port, which cannot change later.
 
         Raises LineError if the port already has other settings, or rejects these.
         """
-        if self._serial is None or self.bridge is None:  # keep them: the port may be bridged once it is open
+        if self._serial is None or self.bridge is None:  # not open yet: it may be bridged
             self.settings = self.settings or settings
             return
         if self.settings == settings:
@@ -341,5 +341,5 @@ class OpenPort:
         """
         try:
             return None if self.bridge or not self._serial else overruns(self._serial.fileno())
-        except (*PORT_FAILURES, TypeError, AttributeError):  # another thread may close it
+        except (*PORT_FAILURES, TypeError, AttributeError):  # another thread may close the port meanwhile
             return None

@@ -1,4 +1,4 @@
-"""Peers: each drive's learnt timing and late replies, kept while a drive is off the line."""
+"""Keep each drive's learnt timing and late replies (its peer), even while the drive is off the line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
-KEPT_NS = 120_000_000_000  # late.c remembers requests for the same time
+KEPT_NS = 120_000_000_000  # late.c remembers outstanding requests for the same time
 
 
 class FormerPeers(NamedTuple):
@@ -25,11 +25,11 @@ class FormerPeers(NamedTuple):
     peers: tuple[tuple[int, Peer], ...]
 
 
-_former: dict[str, FormerPeers] = {}  # by port; changed only atomically, without a lock
+_former: dict[str, FormerPeers] = {}  # by port name; every change is atomic, so no lock is needed
 
 
 def identities_of(*names: str) -> set[str]:
-    """Return the identities that belong to these names of an open port.
+    """Return the identities of an open port that has these names.
 
     The number of a pseudo-terminal is soon reused, so its identity here includes its creation time.
     """
@@ -40,12 +40,12 @@ def identities_of(*names: str) -> set[str]:
 def _made_ns(device: str) -> int:
     try:
         return Path(device).stat().st_ctime_ns
-    except OSError:  # the device is gone for good: return a time that no other has
+    except OSError:  # the device is gone: return a unique time, so that no later device matches
         return clock.now_ns()
 
 
 def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """Remember the peers (with addresses) whose late replies are still due when their port is closed."""
+    """Remember, under these names of a closed port, its peers (with addresses) with late replies due."""
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
         if now_ns - former.closed_ns > KEPT_NS:
@@ -62,25 +62,25 @@ def former_at(names: Iterable[str], address: int) -> Iterator[Peer]:
         yield from (peer for at, peer in former.peers if at == address) if former else ()
 
 
-GONE_S = 0.001  # polling interval while a drive that left is still in an exchange
-LEAST_TIMEOUT = 0.02  # s; delay that a host and its adapter may add to the drive's own
+GONE_S = 0.001  # s between checks of whether a removed drive's exchange has ended
+LEAST_TIMEOUT = 0.02  # s; delay that computer and adapter may add to the drive's delay
 
 
 class Peers:
-    """The peers of the drives on one line. Threads may read it while one adds and removes drives."""
+    """The peers of the drives on one line. Threads may read them while one thread changes them."""
 
     def __init__(self, line: Line) -> None:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # peers of the drives that are on the line now
-        self._asked: dict[object, Peer] = {}  # peers in exchanges of threads, by a key for each exchange
-        # By address and description; includes drives that left.
+        self._asked: dict[object, Peer] = {}  # peers of threads' exchanges, by a key for each
+        # All peers by address and description of the drive, including removed drives.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
         """Add a drive; one that was on the line before keeps its learnt timing and late replies.
 
-        Wait until no exchange with an earlier drive at this address is in flight: only then are its late
-        replies known.
+        First wait until no exchange with an earlier drive at this address is in flight: only then it is known
+        which of its replies are late.
         """
         for other, known in self._known.items():
             while other[0] == drive.address and self._is_asked(known):
@@ -89,9 +89,9 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        if key not in self._known:  # else the core may still be asking for its proofs
+        if key not in self._known:  # otherwise keep it: the core may still use its proofs
             self._known[key] = self._new(drive, least)
-        # The late reply to a drive that left could be taken for a reply of the next drive at its address.
+        # A late reply of a removed drive could be mistaken for a reply of the next drive at its address.
         peer = self.present[drive] = self._known[key]
         for other, known in self._known.items():
             if other[0] == drive.address and known is not peer:
@@ -124,7 +124,7 @@ class Peers:
         self._known.update(before._known)
 
     def remove(self, drive: Drive) -> None:
-        """Take a drive off the line, but keep its peer."""
+        """Remove a drive from the line, but remember its peer."""
         del self.present[drive]
 
     def of(self, drive: Drive) -> Peer:

@@ -1,4 +1,4 @@
-"""Identities of ports: the same text for all names of one port."""
+"""Find the identity of a port, a text that is the same for all names of that port."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of t
 
 @dataclass(frozen=True)
 class USBAdapter:
-    """One port of a USB adapter: its place on the USB bus, and its serial number (or "")."""
+    """A port of a USB adapter: its place on the USB bus, and the adapter's serial number (or "")."""
 
     place: str
     serial: str
@@ -34,11 +34,11 @@ class USBAdapter:
 
 
 def adapter_of(device: str) -> USBAdapter | None:
-    """Return the USB adapter behind this device name; None if there is none or it is unknown."""
+    """Return the USB adapter behind this device name; None if there is no adapter, or it is unknown."""
     found = (TTYS / Path(device).name / "device").resolve()
     for part in (found, *found.parents):
         if interface := _INTERFACE.fullmatch(part.name):
-            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # which of the adapter's ports
+            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # the adapter's port
             serial = _text(part.parent / "serial")
             return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
     return None
@@ -53,11 +53,11 @@ def _text(file: Path) -> str:
 
 @dataclass(frozen=True)
 class PseudoTerminal:
-    """A pseudo-terminal, and the links that lead to it. The system gives its number to a later one."""
+    """A pseudo-terminal, and the links that lead to it. After its end, the system reuses its number."""
 
     device: str
-    changed_ns: int  # later for another terminal of the same number
-    links: tuple[tuple[int, int], ...]  # inode and time of each; different for a replaced link
+    changed_ns: int  # ns; later for another terminal with the same number
+    links: tuple[tuple[int, int], ...]  # inode and time of each link; a replaced link has others
 
     def is_replaced_by(self, other: PseudoTerminal) -> bool:
         """Return True if the same links now lead to another terminal."""
@@ -65,7 +65,7 @@ class PseudoTerminal:
 
 
 def pseudo_terminal_of(name: str) -> PseudoTerminal | None:
-    """Return the pseudo-terminal of this name; None if there is none."""
+    """Return the pseudo-terminal with this name; None if the name is not one's."""
     path = Path(name)
     links: list[tuple[int, int]] = []
     try:
@@ -122,7 +122,7 @@ def of_address(address: tuple[str | int, ...]) -> str:
 
 
 def of_name(name: str) -> str:
-    """Return the identity of a port that is given as a path, a URL, or an identity."""
+    """Return the identity of a port. `name` is a path, a URL, or already an identity."""
     if "://" in name:
         try:
             url = urlsplit(name)

@@ -19,7 +19,7 @@ MOST_EXACT = 1 << 53  # a float holds every whole number up to this one
 
 
 def _is_exact(register: Register[Any]) -> bool:
-    """Return True if the core's float arithmetic gives the same value as `Register.value_in`."""
+    """Return True if the core, which calculates with floats, gives the same value as `Register.value_in`."""
     coding = register.coding
     if register.scaled_by is not None:
         return False
@@ -36,7 +36,7 @@ class BlockDecoder:
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
         exact = [(register, at) for register, at in places if _is_exact(register)]
-        self.names = tuple(register.name for register, _ in exact)  # decoded by the core
+        self.names = tuple(register.name for register, _ in exact)  # of the registers that the core decodes
         self.layout = RowLayout(0, [row_field(register, at, 0) for register, at in exact])
         self.count = len(exact)
         self._named = [(one.name, one.decode) for one, _ in exact if one.values is not None or one.is_bit]
@@ -66,8 +66,8 @@ def decoder_of(block: Block) -> BlockDecoder:
     return _shared(block.registers, block.start)
 
 
-MOST_PREPARED = 256  # cache size per drive, for plans and for blocks
-NO_ROWS = core.RowLayout(0, [])  # for commands: the poll's summary counts only values that have rows
+MOST_PREPARED = 256  # most cached read plans of a drive, and most cached blocks
+NO_ROWS = core.RowLayout(0, [])  # for commands: values without rows are not in the poll's summary
 
 
 def make_exchange(
@@ -113,10 +113,10 @@ class PreparedRead:
         self.decode = decoder.decode
         self.names = decoder.names
         self.whole = decoder.count if decoder.is_plain else None  # number of values in a complete reply
-        self.spare: list[Completion] = []  # completions to reuse
+        self.spare: list[Completion] = []  # completions that later reads reuse
 
     def insisting(self, drive: Drive, timeout: float) -> Exchange:
-        """Return an exchange that reads the same block with `insists` and this timeout in s."""
+        """Return an exchange for the same block with `insists` and this timeout in s; see Exchange."""
         peer, values = self.exchange.peer, self.exchange.values
         return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
 
@@ -124,7 +124,7 @@ class PreparedRead:
 class ReadPlan:
     """The reads that return `wanted` (registers or their names), in reverse order.
 
-    If a single read returns them all in the order of `wanted`, it is also `only`; else that is None.
+    `only` is the read that alone returns all of `wanted` in its order; None if there is no such read.
     """
 
     __slots__ = ("names", "only", "reads", "wanted")
@@ -164,10 +164,10 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the last plan used, so that using it again hashes no registers
+        self.newest = NOTHING  # the last plan used: to use it again, no registers are hashed
         self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # parts of blocks not answered as a whole
-        self.answered: set[Block] = set()  # blocks of doubtful length that the drive has answered
+        self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks not answered as a whole
+        self.answered: set[Block] = set()  # maybe too long, but the drive answered them
 
     def ask_first(self, block: Block) -> None:
         """From now on read a refused block before the other parts of its larger block.

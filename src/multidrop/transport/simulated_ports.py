@@ -1,6 +1,6 @@
-"""Marks that show a client which ports have simulated drives, whose writes wear no EEPROM.
+"""Mark ports with simulated drives, so that clients do not count those drives' writes as EEPROM wear.
 
-On Linux, a simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)).
+On Linux, a simulator binds a name for each of its ports (an abstract Unix address, see unix(7)).
 The kernel removes the name when the process ends, even by SIGKILL. Other systems have no such names, so a
 simulated drive's writes are counted there like those of a real drive.
 """
@@ -22,12 +22,12 @@ def _name(identity: str) -> bytes:
 
 
 def ledger_of(identity: str, directory: Path) -> Path:
-    """Return the path of the ledger for a simulated port, which lasts while its simulator runs."""
+    """Return the path of a simulated port's EEPROM ledger, kept while its simulator runs."""
     return directory / "simulated" / f"{quote(identity, safe='')}.sqlite"
 
 
 class SimulatedPort:
-    """The mark of a simulated port, until it is closed. Opening and closing it delete the port's ledger."""
+    """The mark of a simulated port. Creating and closing the mark delete the port's EEPROM ledger."""
 
     def __init__(self, identity: str, directory: Path) -> None:
         self._ledger = ledger_of(identity, directory)
@@ -35,7 +35,7 @@ class SimulatedPort:
         self._forget_writes()
         if _HAS_NAMES:
             self._holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            with suppress(OSError):  # another simulator has a port of the same name
+            with suppress(OSError):  # another simulator has marked a port of the same name
                 self._holder.bind(_name(identity))
 
     def _forget_writes(self) -> None:
@@ -49,7 +49,7 @@ class SimulatedPort:
 
 
 def is_simulated(identity: str) -> bool:
-    """Return True while a simulator of this user has this port."""
+    """Return True while a simulator of this user has marked this port."""
     if not _HAS_NAMES:
         return False
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from multidrop.transport.exchange import Exchanges
 
 
-LOOKS = 3  # attempts to read counters without an exchange ending meanwhile
+LOOKS = 3  # attempts to read all counters before another exchange ends
 _EPOCHS = count(1)
 
 
-# Results if bytes came but no good frame.
+# Statuses of exchanges in which bytes came, but no good frame.
 _DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
 
 _NOTHING = Counters()
@@ -102,7 +102,7 @@ class Statistics:
 
     @property
     def exchanges(self) -> int:
-        """Number of requests sent, whatever their result."""
+        """Number of requests sent, with any result."""
         return self.counters.sent
 
     @property
@@ -115,7 +115,7 @@ class Statistics:
 
     @property
     def misses(self) -> Counter[str]:
-        """Number of missing values, by the reason in their rows."""
+        """Number of missing values, by reason: the status text of their rows."""
         found = Counter({STATUSES[status]: n for status, n in self.counters.missed.items()})
         found.update({STATUSES[EXCEPTION_STATUS + code]: n for code, n in self.counters.refused.items()})
         return found
@@ -127,7 +127,7 @@ class Statistics:
 
     @property
     def timeout(self) -> float:
-        """Current timeout in s; for a line, the longest of its drives.
+        """Present timeout in s; for a line, the longest timeout of its drives.
 
         It follows the drive's response delay, and grows if replies are late repeatedly.
         """
@@ -140,11 +140,11 @@ class Statistics:
 
     @property
     def utilisation(self) -> float:
-        """Fraction of the time that the answered exchanges needed on the line.
+        """Fraction of the line's time that the answered exchanges needed.
 
         An exchange needs silence, request, response delay and reply, at the line's settings. If the port is
-        faster than its settings (a network, a pseudo-terminal), its need is at most the time it took. An
-        exchange and its time count when it ends: see `counted_s`.
+        faster than its settings (a network, a pseudo-terminal), at most the time that the exchange took
+        counts. An exchange counts when it ends: see `counted_s`.
         """
         return self.used_s / (self.seconds if self.counted_s is None else self.counted_s)
 
@@ -161,9 +161,9 @@ class Statistics:
 
     @property
     def delay_counts(self) -> list[tuple[float, int]]:
-        """A histogram of the response delays: pairs of a bucket's least delay in s and its number of replies.
+        """A histogram of the response delays: pairs of a bucket's least delay in s and its count.
 
-        Empty buckets are omitted. The width of a bucket is an eighth of its delay.
+        Empty buckets are omitted. The width of a bucket is an eighth of its least delay.
         """
         return [(delay_edge(bucket) / 1e9, n) for bucket, n in sorted(self.counters.delays.items()) if n > 0]
 
@@ -189,9 +189,9 @@ class LineStatistics(Statistics):
     drives: Mapping[str, Statistics] = field(default_factory=dict)
 
     def since(self, earlier: LineStatistics) -> LineStatistics:
-        """Return the statistics of the time since `earlier`, a reading of the line of this name.
+        """Return the statistics of the time since `earlier`, an earlier reading of this line.
 
-        A line or drive whose epoch differs from that in `earlier` counts from zero.
+        A line or drive with another epoch than in `earlier` was reset or replaced: it counts from zero.
         """
         if self.epoch != earlier.epoch:
             return self
@@ -220,9 +220,9 @@ def line_statistics(
     counted_s: float | None = None,
     epochs: Mapping[str, int] = _UNNUMBERED,
 ) -> LineStatistics:
-    """Return the statistics of a line and its drives from the counters of `seconds` s, by drive name.
+    """Return the statistics of a line and its drives from counters over `seconds` s, given by drive name.
 
-    `epochs` has the drives' epochs, by name.
+    `epochs`: the drives' epochs, by drive name.
     """
     drives = {
         name: Statistics(seconds, counters, counted_s=counted_s, epoch=epochs.get(name, 0))
@@ -239,7 +239,7 @@ def _sum(counters_by_drive: Iterable[Counters]) -> Counters:
 
 
 def _total(column: Sequence[Any]) -> Any:
-    """Return the sum of numbers, or of counts by their keys."""
+    """Return the sum of a column: of numbers, or key by key of Counter objects."""
     if not isinstance(column[0], Counter):
         return sum(column)
     found: Counter[Any] = Counter()
@@ -253,18 +253,18 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
         return now
     found = Counters._make(map(_minus, now, earlier))
     longest = now.longest_ns
-    if longest == earlier.longest_ns:  # the longest delay may lie before the span
+    if longest == earlier.longest_ns:  # the longest delay may be older than the time span
         longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
     return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
 
 
 def _minus(now: Any, earlier: Any) -> Any:
-    """Return the difference of numbers, or of counts by their keys."""
+    """Return the difference of two numbers, or key by key of two Counter objects."""
     return now - earlier if earlier else now
 
 
 def _quantiles(counters: Counters, parts: Iterable[float]) -> list[float]:
-    """Return the middle of each quantile's bucket, in s; 0.0 without replies."""
+    """Return quantiles of the response delay: the middle of each one's bucket, in s; 0.0 without replies."""
     buckets = sorted(counters.delays)
     seen = list(accumulate(counters.delays[bucket] for bucket in buckets))
     if not seen:
@@ -278,7 +278,7 @@ def _middle(counters: Counters, bucket: int) -> float:
 
 
 class Count(NamedTuple):
-    """Statistics since a line was opened, and its peers by the names of their drives at that time."""
+    """Statistics since a line was opened, and the peers by the names that their drives had then."""
 
     statistics: LineStatistics
     peers: Mapping[str, Peer]
@@ -287,7 +287,7 @@ class Count(NamedTuple):
 class LineMeter:
     """Statistics of a line since it was opened or last reset; frozen when the line is closed.
 
-    The counts at the reset are kept by peer, because another drive may have the same name later.
+    The counts at the last reset are matched by peer, because another drive may have the same name later.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
@@ -309,7 +309,7 @@ class LineMeter:
         self._reset_at = _begins(self._now())
 
     def freeze(self, overruns: int | None) -> None:
-        """Stop counting, because the line is closed; `overruns` is its final count of lost characters."""
+        """Stop counting, because the line is closed; `overruns` is the final number of lost characters."""
         self._frozen = self._frozen or self._count(overruns)
 
     def _now(self) -> Count:
@@ -332,5 +332,5 @@ class LineMeter:
 
 
 def _begins(reading: Count) -> Count:
-    """Return a reading as the start of a new epoch."""
+    """Return the reading with a new epoch number, because a line was opened or reset."""
     return reading._replace(statistics=replace(reading.statistics, epoch=next(_EPOCHS)))

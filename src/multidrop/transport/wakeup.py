@@ -1,4 +1,4 @@
-"""WakeUp: a signal for select, poll or an asyncio loop."""
+"""Wake a thread that waits in select, poll or an asyncio loop."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import suppress
 
 
 class WakeUp:
-    """A descriptor that is readable from `set` to `clear`. It is a socket, because Windows needs one."""
+    """A descriptor that is readable from `set` to `clear`. It is a socket because of Windows."""
 
     def __init__(self) -> None:
         self._reader, self._writer = socket.socketpair()
