@@ -13,7 +13,7 @@ from examples import usually
 
 @pytest.fixture
 def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
-    """Build and run a test program; all workers share a folder of objects."""
+    """Return a function that builds and runs a C test program; all workers share the object files."""
     shared = tmp_path_factory.getbasetemp()
     shared = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "objects"
     shared.mkdir(exist_ok=True)
@@ -49,7 +49,9 @@ def test_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -
 @pytest.mark.parametrize(
     "sanitizers", usually([*SANITIZERS], ["-fsanitize=thread"]), ids=["memory", "threads"]
 )
-def test_threads_open_and_close_ports_concurrently(build: Callable[..., None], sanitizers: list[str]) -> None:
+def test_threads_can_open_and_close_ports_concurrently(
+    build: Callable[..., None], sanitizers: list[str]
+) -> None:
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
     build("test_engine", *core, sanitizers=sanitizers)
 
@@ -77,7 +79,7 @@ def test_the_thread_does_not_spin_for_a_waiting_client(build: Callable[..., None
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None:
+def test_an_exchange_of_a_steady_drive_reads_the_port_once(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "port")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
     build("test_looks", *core)
@@ -98,7 +100,7 @@ def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: 
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
-def test_the_deadline_is_checked_before_each_write(build: Callable[..., None]) -> None:
+def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "port", "rs485", "mastership")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
     build("test_mastership", *core)

@@ -1,4 +1,4 @@
-"""Sniffed bytes are cut into frames of both directions: frames from the documents, mixed and damaged."""
+"""Sniffed bytes are split into requests and replies: frames from the documents, mixed and damaged."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from multidrop.core import (
 
 Pair = tuple[Printed, Printed]
 REPLIES = [each for each in PRINTED if each.request is not None and isinstance(each.says, Message)]
-WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # confirmed by its own copy
+WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # its reply is a copy of it
 READ, ANSWER = bytes.fromhex("01 03 00 16 00 01 65 CE"), bytes.fromhex("01 03 02 18 00 B2 44")
 OTHER_READ = bytes.fromhex("01 03 01 F4 00 01 C4 04")
 ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # as long as ANSWER
 
 
 def split(*pieces: bytes) -> list[FrameSpan]:
-    """Spans of pieces that came one after another, piece i at time i."""
+    """Return the spans of these pieces of a stream; piece i is received at time i."""
     stream = Stream()
     for time, piece in enumerate(pieces):
         stream.put(piece, time)
@@ -58,7 +58,7 @@ def raw(spans: Iterable[FrameSpan]) -> list[tuple[Kind, bytes]]:
 
 
 @table("reply", REPLIES)
-def test_a_printed_exchange_is_a_request_and_its_reply(reply: Printed) -> None:
+def test_a_printed_exchange_is_split_into_a_request_and_its_reply(reply: Printed) -> None:
     asked, answered = split(reply.request_frame, reply.frame)
     assert (answered.kind, answered.framing) == (Kind.REPLY, reply.framing)
     assert asked.kind in (Kind.REQUEST, Kind.EITHER)
@@ -67,7 +67,9 @@ def test_a_printed_exchange_is_a_request_and_its_reply(reply: Printed) -> None:
 
 
 @given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
-def test_a_mixed_line_is_cut_alike_however_its_bytes_come(line: list[Printed], data: st.DataObject) -> None:
+def test_frames_are_found_alike_however_the_bytes_are_divided_into_pieces(
+    line: list[Printed], data: st.DataObject
+) -> None:
     bytes_ = READ + ANSWER + b"".join(each.request_frame + each.frame for each in line)
     stream, splitter, spans = Stream(), Splitter(), []
     at = 0
@@ -98,18 +100,18 @@ def test_a_frame_has_the_time_of_its_first_piece() -> None:
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
 
-def test_confirming_copies_differ_from_requests_by_their_order() -> None:
+def test_a_copy_right_after_its_request_is_a_reply() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
-def test_a_copy_without_a_known_order_is_neither_request_nor_reply() -> None:
+def test_a_copy_after_junk_is_neither_request_nor_reply() -> None:
     assert kinds(split(WRITE)) == [Kind.EITHER]
     assert kinds(split(READ, ANSWER, WRITE[:-1], WRITE, READ)) == [
         *(Kind.REQUEST, Kind.REPLY, Kind.JUNK, Kind.EITHER, Kind.REQUEST)
     ]
 
 
-def test_an_answered_delixi_query_is_not_a_request() -> None:
+def test_a_delixi_reply_is_not_mistaken_for_a_request() -> None:
     (query,) = {reply for reply in REPLIES if reply.request_frame.startswith(b":0107")}
     assert raw(split(query.request_frame[:-3], query.frame, query.request_frame, query.frame)) == [
         (Kind.JUNK, query.request_frame[:-3]),
@@ -119,7 +121,7 @@ def test_an_answered_delixi_query_is_not_a_request() -> None:
     ]
 
 
-def test_a_known_sender_separates_copies_from_requests() -> None:
+def test_the_senders_side_distinguishes_copies_from_requests() -> None:
     stream = Stream()
     stream.put(WRITE, 0, side=Side.ANSWERING)
     stream.put(WRITE, 1, side=Side.ASKING)
@@ -131,12 +133,12 @@ def test_a_known_sender_separates_copies_from_requests() -> None:
     assert b"".join(span.raw for span in spans) == 4 * WRITE
 
 
-def test_a_reply_is_not_given_to_an_earlier_request_than_its_own() -> None:
+def test_a_reply_after_a_damaged_request_is_not_assigned_to_the_request_before_it() -> None:
     damaged = bytes([OTHER_READ[0] ^ 1]) + OTHER_READ[1:]
     assert kinds(split(READ, damaged, ALSO_ANSWER)) == [Kind.REQUEST, Kind.JUNK, Kind.STRAY]
 
 
-def test_a_stray_reply_does_not_hide_a_lost_request() -> None:
+def test_a_reply_after_a_damaged_request_is_stray() -> None:
     lost = OTHER_READ[:-1]
     assert kinds(split(READ, ANSWER, WRITE, lost, ALSO_ANSWER, WRITE, WRITE)) == [
         *(Kind.REQUEST, Kind.REPLY, Kind.REQUEST, Kind.JUNK, Kind.STRAY, Kind.REQUEST, Kind.REPLY)
@@ -148,11 +150,11 @@ def test_a_stray_reply_does_not_end_an_exchange() -> None:
     assert kinds(split(READ, other, ANSWER)) == [Kind.REQUEST, Kind.STRAY, Kind.REPLY]
 
 
-def test_a_request_that_is_repeated_is_answered_once() -> None:
+def test_of_two_equal_requests_only_the_last_gets_the_reply() -> None:
     assert kinds(split(READ, READ, ANSWER, ANSWER)) == [*(Kind.REQUEST, Kind.REQUEST, Kind.REPLY, Kind.STRAY)]
 
 
-def test_noise_between_a_request_and_its_reply_does_no_harm() -> None:
+def test_a_reply_is_found_after_noise() -> None:
     assert raw(split(READ, b"\xff\x00", ANSWER)) == [
         (Kind.REQUEST, READ),
         (Kind.JUNK, b"\xff\x00"),
@@ -162,7 +164,7 @@ def test_noise_between_a_request_and_its_reply_does_no_harm() -> None:
 
 @pytest.mark.parametrize("first", ["", "FF"])
 def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
-    """The junk looks like the start of a long write, which the next frames would complete."""
+    """The junk looks like the start of a long write, and the next frames like its rest."""
     junk = bytes.fromhex(first + "01 10 00 00 00 7B F6")
     stream, splitter = Stream(), Splitter()
     stream.put(READ + ANSWER[:2], 0)
@@ -174,7 +176,7 @@ def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
     assert b"".join(span.raw for span in spans if span.kind is Kind.JUNK) == ANSWER[:2] + junk
 
 
-def test_without_pauses_it_waits_until_the_long_frame_could_be_whole() -> None:
+def test_without_pauses_the_splitter_waits_until_a_long_frame_could_be_whole() -> None:
     stream, splitter = Stream(), Splitter()
     stream.put(bytes.fromhex("01 10 00 00 00 7B F6") + OTHER_READ, 0)
     assert list(splitter.spans(stream)) == []
@@ -182,7 +184,7 @@ def test_without_pauses_it_waits_until_the_long_frame_could_be_whole() -> None:
     assert kinds(splitter.spans(stream)) == [Kind.JUNK, Kind.REQUEST]
 
 
-def test_bytes_that_cannot_be_a_frame_are_junk_at_once() -> None:
+def test_bytes_that_cannot_be_a_frame_are_reported_as_junk_immediately() -> None:
     stream, splitter = Stream(), Splitter()
     stream.put(b"\xff" * 1000, 0)
     assert sum(len(span.raw) for span in splitter.spans(stream)) > 990
@@ -196,7 +198,7 @@ def test_a_full_stream_raises() -> None:
 
 
 def damaged(frame: bytes, chance: random.Random) -> bytes:
-    """One byte in a hundred is changed, lost or doubled."""
+    """Return the frame with one byte in a hundred changed, removed or doubled."""
     found = bytearray()
     for byte in frame:
         kind = chance.choice(["changed", "lost", "doubled"]) if chance.random() < 0.01 else ""
@@ -209,7 +211,7 @@ def damaged(frame: bytes, chance: random.Random) -> bytes:
 
 @pytest.mark.long
 @table("seed", range(5))
-def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
+def test_every_exchange_that_is_not_next_to_damage_is_found(seed: int) -> None:
     chance = random.Random(seed)
     line = chance.choices(REPLIES, k=2000)
     sent = [frame for each in line for frame in (each.request_frame, each.frame)]
@@ -224,14 +226,14 @@ def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
         assert (Kind.REQUEST, i, sent[i]) in spans
         assert (Kind.REPLY, i + 1, sent[i + 1]) in spans
     frames = [span for span in found if span.kind is not Kind.JUNK]
-    for asked, answered in pairwise(frames):  # and no reply is given to a request that is not its own
+    for asked, answered in pairwise(frames):  # and no reply is assigned to another request
         if answered.kind is Kind.REPLY:
             assert answered.time_ns == asked.time_ns + 1 or answered.raw == asked.raw
 
 
-def test_framings_may_change_from_frame_to_frame() -> None:
+def test_the_framing_of_each_frame_is_detected() -> None:
     by_framing = {reply.framing: reply for reply in REPLIES}
-    assert set(by_framing) == {*Framing} - {Framing.TCP}  # which has ports of its own
+    assert set(by_framing) == {*Framing} - {Framing.TCP}  # Modbus TCP streams never mix with other framings
     frames = [each.request_frame + each.frame for each in by_framing.values()]
     assert [span.framing for span in split(*frames, *frames)] == [
         framing for framing in (*by_framing, *by_framing) for _ in range(2)
@@ -241,8 +243,8 @@ def test_framings_may_change_from_frame_to_frame() -> None:
 # ---- interruptions ----
 
 
-def test_a_sniffer_that_is_interrupted_reads_no_memory_that_was_freed() -> None:
-    """It goes on with the requests that it knew, and with the next bytes of a file, under a sanitizer."""
+def test_an_interrupted_decoder_reads_no_freed_memory() -> None:
+    """It continues with the known requests, and with the file's next bytes, under a memory sanitizer."""
 
     def act(nth: int) -> bool:
         decoder, stream, columns = Decoder(), Stream(), Columns(16)

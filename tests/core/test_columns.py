@@ -1,4 +1,4 @@
-"""Completions become columns: numbers of every format, scales, misses, and the columns' capacity."""
+"""Columns from completions: numbers of every format, scales, missing values, and the columns' capacity."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from multidrop.core import (
 )
 from multidrop.core.columns import CodeTable, find_codes, greatest_code, narrow_up, wide_codes, widen
 
-UTC = 1_700_000_000_000_000_000  # what monotonic time lies behind
+UTC = 1_700_000_000_000_000_000  # ns; UTC minus CLOCK_MONOTONIC
 
 
 NUMBERS = [
@@ -76,7 +76,7 @@ NUMBERS = [
 
 
 @table(("wire", "data", "value"), NUMBERS)
-def test_number(wire: int, data: str, value: float) -> None:
+def test_raw_value_reads_each_number_format(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
 
@@ -99,14 +99,14 @@ def test_coils_count_from_the_least_significant_bit_of_the_first_byte() -> None:
 
 
 @table("wire", list(NumberFormat))
-def test_a_number_beyond_the_data_is_nan(wire: NumberFormat) -> None:
+def test_a_number_beyond_the_end_of_the_data_is_nan(wire: NumberFormat) -> None:
     for at in (8, 9, 2**15, sys.maxsize, sys.maxsize + 1, 2 * sys.maxsize + 1):
         assert math.isnan(raw_value(b"\xff", at, wire))
     assert math.isnan(raw_value(b"", 0, wire))
 
 
 def completed(request: Message, received: bytes) -> Any:
-    """The row of an exchange that starts at 1000 ms; its reply starts 30 ms later."""
+    """Return the completion of an exchange sent at 1000 ms, whose reply starts 30 ms later."""
     line = LineDriver()
     line.begin(
         Exchange(
@@ -131,7 +131,7 @@ def reply(*values: int) -> Any:
     return completed(request, build_reply(Framing.RTU, Message(1, 0x03, data=words(*values))))
 
 
-def test_rows_of_a_block() -> None:
+def test_a_block_makes_one_row_for_each_field() -> None:
     block = RowLayout(
         5,
         [
@@ -187,14 +187,14 @@ def test_missing_value_has_a_row_with_its_status(received: bytes, status: int, t
     assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
 
 
-def test_value_that_was_due_but_not_asked_for_has_a_row() -> None:
+def test_a_value_that_was_due_but_not_requested_has_a_row() -> None:
     columns = Columns(2)
     assert add_miss(columns, ONE, Status.NOT_ASKED, 77 * MS, UTC)
     assert (columns.array("status")[0], columns.array("sent")[0]) == (Status.NOT_ASKED, 77 * MS)
     assert columns.array("valid")[0] & 1 == 0
 
 
-def test_request_that_never_left_has_the_time_of_its_turn() -> None:
+def test_a_row_of_an_unsent_request_has_the_time_of_its_turn() -> None:
     line = LineDriver()
     line.now = 5000 * MS
     line.begin(
@@ -214,7 +214,7 @@ def test_request_that_never_left_has_the_time_of_its_turn() -> None:
     assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, Status.LINE_LOST)
 
 
-def test_field_beyond_the_reply_is_a_miss() -> None:
+def test_a_field_beyond_the_end_of_the_reply_has_a_row_without_value() -> None:
     columns = Columns(2)
     block = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     assert add_rows(columns, block, reply(9), 0)
@@ -222,7 +222,7 @@ def test_field_beyond_the_reply_is_a_miss() -> None:
     assert list(columns.array("value")) == [9, 0]
 
 
-def test_bitmap_of_values_and_misses() -> None:
+def test_the_bitmap_marks_rows_with_a_value() -> None:
     columns = Columns(20)
     good, bad = reply(1), completed(Message(1, 0x03, 0, 1), b"")
     pattern = [1, 0, 0, 1, 1, 1, 0, 1, 0, 0, 1, 1, 0, 1, 0, 1, 1, 0, 0, 1]
@@ -232,7 +232,7 @@ def test_bitmap_of_values_and_misses() -> None:
     assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
 
 
-def test_block_that_does_not_fit_adds_no_row() -> None:
+def test_a_block_that_does_not_fit_into_the_columns_adds_no_row() -> None:
     columns = Columns(3)
     two = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     answer = reply(1, 2)
@@ -252,7 +252,7 @@ def test_codes_become_names() -> None:
     assert found == ["вентилятор", "pump-1", "", "вентилятор"]
 
 
-def test_names_added_later_are_included() -> None:
+def test_codes_of_names_added_later_are_spelled_too() -> None:
     names = Names()
     numbers = [names.number(name) for name in ("pump", "fan", "pump")]
     spell(memoryview(array("H", numbers)), names)
@@ -275,13 +275,13 @@ def test_a_block_without_fields_adds_no_row() -> None:
     assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)
 
 
-def test_a_block_that_no_chunk_can_hold_is_counted() -> None:
+def test_rows_of_a_block_larger_than_a_chunk_are_counted_as_dropped() -> None:
     row_queue = RowQueue(chunk_rows=2)
     row_queue.add_miss(BLOCK, Status.NOT_ASKED, 5)
     assert row_queue.dropped == 3
 
 
-def test_chunks_that_were_taken_can_all_be_given_back() -> None:
+def test_more_chunks_than_the_queue_keeps_can_be_given_back() -> None:
     """There are more chunks than the queue keeps for later."""
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
@@ -310,7 +310,7 @@ def as_float32(bits: int) -> Fraction:
 
 @given(st.lists(st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from(EDGES)), max_size=9))
 def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
-    """Neighbours of a float are those of its bits (IEEE 754)."""
+    """The next float is the one whose bits, as an integer, are the next (IEEE 754)."""
     narrow = bytes(narrow_up(memoryview(array("q", numbers))))
     for number, bits in zip(numbers, struct.unpack(f"<{len(numbers)}I", narrow), strict=True):
         found = as_float32(bits)
@@ -324,7 +324,7 @@ def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
         assert number <= found <= number + abs(number) // 2**23
 
 
-def test_only_valid_numbers_are_read() -> None:
+def test_widening_reads_only_valid_numbers() -> None:
     floats = struct.pack("<4f", 7.0, float("nan"), float("inf"), 1e30)
     assert list(widen(memoryview(floats), memoryview(b"\x01"), 4).cast("q")) == [7, 0, 0, 0]
     for bit in (2, 4, 8):
@@ -337,18 +337,18 @@ def test_only_valid_numbers_are_read() -> None:
         widen(memoryview(floats), memoryview(b""), 4)
 
 
-def test_codes_are_given_in_the_order_of_their_use() -> None:
+def test_one_byte_codes_are_assigned_in_the_order_of_use() -> None:
     table = CodeTable([f"name {number}" for number in range(400)])
     assert bytes(table.narrow(memoryview(array("H", [9, 0, 9, 399]))) or b"") == bytes([0, 1, 0, 2])
     assert table.used == ("name 9", "name 0", "name 399")
-    assert table.narrow(memoryview(array("H", range(256)))) is None  # 257 with the one before
+    assert table.narrow(memoryview(array("H", range(256)))) is None  # 257 codes with the one above
     table.forget()
     assert bytes(table.narrow(memoryview(array("H", range(256)))) or b"") == bytes(range(256))
     with pytest.raises(ValueError, match="a status 400 without a name"):
         table.narrow(memoryview(array("H", [400])))
 
 
-def test_codes_are_widened() -> None:
+def test_one_byte_codes_are_widened_to_two_bytes() -> None:
     assert list(wide_codes(memoryview(bytes([0, 255, 7])), 3, 1)) == [0, 255, 7]
     assert list(wide_codes(memoryview(b"x" + struct.pack("=2H", 1, 65535))[1:], 2, 2)) == [1, 65535]
     with pytest.raises(ValueError, match="lengths do not fit"):

@@ -66,7 +66,7 @@ def read(
     echo_probe: Exchange | None = None,
     values: RowLayout | None = None,
 ) -> Exchange:
-    """A read of one register; without a reply it takes `timeout`, which no passing test waits for."""
+    """Return a read of one register. Its `timeout` in s is so long that no passing test waits for it."""
     return Exchange(
         Framing.RTU,
         Message(1, 0x03, start, 1),
@@ -84,7 +84,7 @@ def read(
     )
 
 
-MINUTE_NS = 60_000_000_000  # how much later a reply may still come, on a busy machine
+MINUTE_NS = 60_000_000_000  # how late a reply may be on a busy computer
 
 
 def wait_until(look: Callable[[], bool]) -> None:
@@ -93,7 +93,7 @@ def wait_until(look: Callable[[], bool]) -> None:
 
 
 class Rows:
-    """Return the results of a port's exchanges, in the order in which they were carried out."""
+    """The rows of a port's exchanges, in the order in which these were carried out."""
 
     def __init__(self, port: Port) -> None:
         self.row_queue = RowQueue()
@@ -101,7 +101,7 @@ class Rows:
         port.report_to(self.row_queue, 0)
 
     def of(self, name: str, rows: int) -> list[int]:
-        """A column, when there are so many rows."""
+        """Wait until there are `rows` rows; return their column of this name."""
         wait_until(lambda: self._taken() >= rows)
         return [each for columns in self._columns for each in columns.array(name)]
 
@@ -112,7 +112,7 @@ class Rows:
 
 
 def echo_start(request: Message) -> bytes:
-    """A drive whose registers hold their own addresses."""
+    """Return the reply of a drive whose registers hold their own addresses."""
     data = words(request.start)
     return build_reply(Framing.RTU, Message(request.address, request.function, data=data))
 
@@ -151,7 +151,7 @@ class Far:
 
 @pytest.fixture
 def drive() -> Iterator[Callable[[Callable[[Message], bytes]], int]]:
-    """Makes a line with a drive at its far end; the near end's descriptor."""
+    """Yield a function that makes a line with a drive at its far end, and returns the near descriptor."""
     lines: list[tuple[socket.socket, Far]] = []
 
     def make(answer: Callable[[Message], bytes]) -> int:
@@ -169,7 +169,7 @@ def drive() -> Iterator[Callable[[Callable[[Message], bytes]], int]]:
 Drive = Callable[[Callable[[Message], bytes]], int]
 
 
-def test_queued_exchanges_are_carried_out_in_turn(drive: Drive) -> None:
+def test_queued_exchanges_are_carried_out_in_order(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS, room=128)) as port:
         rows = Rows(port)
         queued = [read(start) for start in range(100)]
@@ -181,7 +181,7 @@ def test_queued_exchanges_are_carried_out_in_turn(drive: Drive) -> None:
     assert queued[0].peer.counters().values == 1
 
 
-def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
+def test_a_full_queue_takes_no_further_exchanges(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS, room=4)) as port:
         later = [now_ns() + 60_000_000_000] * 6
         queued = [read(start) for start in range(6)]
@@ -190,7 +190,7 @@ def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
         assert pending(port) == 4
 
 
-def test_no_queued_request_leaves_before_its_time(drive: Drive) -> None:
+def test_no_queued_request_is_sent_before_its_time(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
         rows = Rows(port)
@@ -200,8 +200,8 @@ def test_no_queued_request_leaves_before_its_time(drive: Drive) -> None:
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
 
 
-def test_missed_slots_are_not_made_up(drive: Drive) -> None:
-    """The last one of each exchange that is due is sent, how late it may be."""
+def test_missed_slots_are_skipped_except_the_last(drive: Drive) -> None:
+    """The last due slot of each exchange is carried out, however late it is."""
     second = 1_000_000_000
     fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
@@ -236,13 +236,13 @@ def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
         assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_replacing_a_round_returns_its_next_index(drive: Drive) -> None:
+def test_repeat_returns_the_index_of_the_exchange_that_was_next(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.repeat([read(0), read(1), read(2)])
         rows.of("value", 20)
         following = port.repeat([])
-        port.carry_out(read(9))  # after what was under way
+        port.carry_out(read(9))  # after the exchange in flight
         assert following == (rows.of("value", 20)[-1] + 1) % 3
 
 
@@ -255,7 +255,7 @@ def test_queued_exchanges_interrupt_the_repeated_round(drive: Drive) -> None:
         wait_until(lambda: not pending(port))
         port.stop()
         values, sent = rows.of("value", 3), rows.of("sent", 3)
-    assert values[0] == 0  # nobody waited for what was not due
+    assert values[0] == 0  # the round did not wait for the exchange that was not due
     at = values.index(1)
     assert values[at + 1] == 2
     assert sent[at] >= due_ns
@@ -272,7 +272,7 @@ def test_repeating_stops_when_a_request_cannot_be_sent(drive: Drive) -> None:
         assert rows.of("status", 1) == [Status.LATE_ANSWER_DUE]
 
 
-def test_the_client_is_called_when_a_drive_fails_and_when_it_is_back(drive: Drive) -> None:
+def test_the_client_is_called_when_a_drive_fails_and_when_it_answers_again(drive: Drive) -> None:
     silent = threading.Event()
     silent.set()
     peer = Peer(least_timeout=0.01, most_timeout=0.3)
@@ -287,7 +287,7 @@ def test_the_client_is_called_when_a_drive_fails_and_when_it_is_back(drive: Driv
         silent.clear()
         wait_until(lambda: now_ns() > peer.late_until_ns)
         port.repeat(asked)
-        while peer.failures:  # the queue's end was told of too
+        while peer.failures:  # the client is also called at the end of the queue
             assert row_queue.await_calls(60) == [17]
 
 
@@ -344,7 +344,7 @@ def test_rows_outlive_their_queue(drive: Drive) -> None:
         wait_until(lambda: not pending(port))
         columns = row_queue.take()
     assert columns is not None
-    ffi.release(row_queue.c)  # as a collector of garbage does that finds both at once
+    ffi.release(row_queue.c)  # as a garbage collector does that finds both together
     assert list(columns.array("value")) == [7]
     del columns
 
@@ -363,7 +363,9 @@ def test_an_unreferenced_port_is_closed() -> None:
 
 
 @pytest.mark.parametrize("way", ["queued", "repeated", "urgent"])
-def test_an_echo_probe_is_sent_first_on_an_unknown_adapter(drive: Drive, way: str) -> None:
+def test_an_echo_probe_is_sent_first_if_it_is_unknown_whether_the_adapter_echoes(
+    drive: Drive, way: str
+) -> None:
     requested: list[int] = []
 
     def answer(request: Message) -> bytes:
@@ -376,7 +378,7 @@ def test_an_echo_probe_is_sent_first_on_an_unknown_adapter(drive: Drive, way: st
             assert [port.carry_out(asked[0]).reply.data for _ in range(2)] == [words(7)] * 2
         else:
             port.submit(asked * 2, [0, 0]) if way == "queued" else port.repeat(asked)
-            assert rows.of("value", 2)[:2] == [7, 7]  # and no row of the echo_probe's
+            assert rows.of("value", 2)[:2] == [7, 7]  # and the echo probe has no row
         assert requested[:3] == [99, 7, 7]
 
 
@@ -393,7 +395,7 @@ def test_an_inconclusive_echo_probe_is_repeated(drive: Drive) -> None:
         asked.c.insists = asked.echo_probe.c.insists = 1
         for _ in range(2):
             assert port.carry_out(asked).result == Failure.NO_REPLY
-        until(lambda: requested == [99, 7, 99, 7])  # which the far end may do later
+        until(lambda: requested == [99, 7, 99, 7])  # the far end may see the last request later
 
 
 @pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
@@ -419,7 +421,7 @@ def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
         assert pending(port) == 1
 
 
-def test_a_caller_gets_the_values_of_its_exchange(drive: Drive) -> None:
+def test_carry_out_returns_the_values_of_its_exchange(drive: Drive) -> None:
     lacking = Extra(invalid=((0xFFFF, 8),))
     tenths, eight = (Field(0, NumberFormat.U16, 0, 1, 10, extra) for extra in (None, lacking))
     values = RowLayout(0, [tenths, eight])
@@ -433,7 +435,7 @@ def test_a_caller_gets_the_values_of_its_exchange(drive: Drive) -> None:
         assert again.numbers[1] != again.numbers[1]
 
 
-def test_a_completion_without_room_for_the_values_is_left_alone(drive: Drive) -> None:
+def test_a_completion_without_room_for_the_values_is_not_reused(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         short = Completion()
         found = port.carry_out(read(7, values=ONE_VALUE), into=short)
@@ -478,7 +480,7 @@ def written(
     )
 
 
-def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: Drive) -> None:
+def test_an_urgent_exchange_that_expires_while_it_waits_is_not_sent(drive: Drive) -> None:
     fd = drive(lambda request: echo_start(request) if request.address else b"")
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert port.carry_out(written(0, 1, turnaround=0.3)).result == 0
@@ -487,7 +489,7 @@ def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: 
 
 
 def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(drive: Drive) -> None:
-    """Sent after it, a start would undo it; sent before it, it would move the motor first."""
+    """A start sent after the stop would undo it; a start sent before it would move the motor first."""
     latch, other = Latch(), Latch()
     requested: list[int] = []
     found: dict[int, Completion] = {}
@@ -509,7 +511,7 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
         threads = [threading.Thread(target=carry_out, args=[each]) for each in wanted]
         for thread in threads:
             thread.start()
-            time.sleep(0.05)  # those that wait come in this order
+            time.sleep(0.05)  # so that the waiting requests arrive in this order
         latch.rise("a stop was called")
         late = [written(2, 52, permit=latch.permit()), written(2, 99, insists=True)]
         for exchange in late:
@@ -523,7 +525,7 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_permit_is_good_until_its_latch_rises_and_never_during_a_hold() -> None:
+def test_a_permit_is_valid_until_its_latch_rises_and_never_during_a_hold() -> None:
     latch = Latch()
     before = latch.permit()
     assert before.is_good
@@ -538,7 +540,7 @@ def test_a_permit_is_good_until_its_latch_rises_and_never_during_a_hold() -> Non
     assert not latch.permit().is_good
 
 
-def test_no_permit_is_good_until_the_last_of_several_stops_is_over() -> None:
+def test_no_new_permit_is_valid_until_the_last_of_several_stops_is_over() -> None:
     latch = Latch()
     latch.hold(1, "a stop")
     latch.hold(2, "another stop")
@@ -548,7 +550,7 @@ def test_no_permit_is_good_until_the_last_of_several_stops_is_over() -> None:
     assert latch.permit().is_good
 
 
-def test_a_permit_of_a_call_before_a_stop_is_not_good() -> None:
+def test_a_permit_of_a_call_that_began_before_a_stop_is_invalid() -> None:
     latch = Latch()
     seen = latch.c[0]
     assert latch.permit(seen).is_good
@@ -557,8 +559,8 @@ def test_a_permit_of_a_call_before_a_stop_is_not_good() -> None:
     assert latch.permit().is_good
 
 
-def test_closing_a_port_reports_whether_the_request_in_flight_had_left(drive: Drive) -> None:
-    """And what had not begun is never sent."""
+def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Drive) -> None:
+    """A request that was still waiting is never sent."""
     came = threading.Event()
 
     def answer(request: Message) -> bytes:
@@ -577,7 +579,7 @@ def test_closing_a_port_reports_whether_the_request_in_flight_had_left(drive: Dr
     threads[0].start()
     assert came.wait(120)
     threads[1].start()
-    time.sleep(0.05)  # it waits behind the other
+    time.sleep(0.05)  # the second request now waits behind the first
     port.stop()
     for thread in threads:
         thread.join(120)
@@ -587,7 +589,7 @@ def test_closing_a_port_reports_whether_the_request_in_flight_had_left(drive: Dr
 
 
 def test_exchanges_counted_before_closing_have_rows() -> None:
-    """Close it in the moment in which a reply comes."""
+    """The port is closed at the moment at which a reply comes."""
     values = 0
     for _ in range(60):
         near, far = socket.socketpair()
@@ -618,10 +620,10 @@ def wait_until_it_sleeps(thread: threading.Thread) -> None:
 
 
 @pytest.mark.parametrize("insists", [False, True], ids=["reads", "stops"])
-def test_polling_keeps_a_share_beside_urgent_exchanges_but_none_of_a_stop(
+def test_polling_keeps_a_share_beside_urgent_exchanges_but_not_beside_stops(
     drive: Drive, insists: bool
 ) -> None:
-    """One exchange at a time, and never two in a row."""
+    """Polling gets one exchange at a time, and never two in a row."""
     asked: list[str] = []
     go_on = threading.Event()
 
@@ -648,7 +650,7 @@ def test_polling_keeps_a_share_beside_urgent_exchanges_but_none_of_a_stop(
     assert ("polled", "polled") not in pairwise(beside)
 
 
-def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:
+def test_a_port_is_served_on_time_after_another_port_was_closed(drive: Drive) -> None:
     first = Port(drive(echo_start), NO_SETTINGS)
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         first.close()
@@ -664,13 +666,13 @@ def test_queued_exchanges_are_kept_alive_until_they_end(drive: Drive) -> None:
         assert rows.of("value", 2) == [1, 2]
 
 
-def test_exception_is_a_completion_like_any_other(drive: Drive) -> None:
+def test_a_drives_exception_is_a_completion_with_its_code(drive: Drive) -> None:
     fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert status_of(port.carry_out(read(0))) == EXCEPTION_STATUS + 2
 
 
-def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
+def test_queued_exchanges_continue_after_a_silent_drive(drive: Drive) -> None:
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
     with closing(Port(fd, NO_SETTINGS)) as port:
         rows = Rows(port)
@@ -695,7 +697,7 @@ def test_a_request_that_a_late_reply_could_answer_is_not_sent(drive: Drive) -> N
         assert port.carry_out(queued).result == 7
 
 
-def test_a_broadcast_waits_for_no_reply(drive: Drive) -> None:
+def test_a_broadcast_waits_only_for_the_turnaround_delay(drive: Drive) -> None:
     requested: list[int] = []
 
     def answer(request: Message) -> bytes:
@@ -719,8 +721,8 @@ def test_a_broadcast_waits_for_no_reply(drive: Drive) -> None:
     assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
 
 
-def test_the_queue_of_a_lost_port_stays_queued() -> None:
-    """Its client has it sent on the port that is opened next."""
+def test_exchanges_queued_on_a_lost_port_stay_queued() -> None:
+    """The client will queue them on the port that it opens next."""
     near, far = socket.socketpair()
     near.setblocking(False)
     with closing(Port(near.fileno(), NO_SETTINGS)) as port:
@@ -734,7 +736,7 @@ def test_the_queue_of_a_lost_port_stays_queued() -> None:
 
 @pytest.mark.parametrize("way", ["queued", "repeated"])
 @pytest.mark.parametrize("answered", [0, 1])
-def test_cut_off_is_set_unless_the_first_exchange_was_lost(answered: int, way: str) -> None:
+def test_cut_off_is_set_if_the_port_is_lost_after_a_reply(answered: int, way: str) -> None:
     near, far = socket.socketpair()
     near.setblocking(False)
     with closing(Port(near.fileno(), NO_SETTINGS)) as port:
@@ -751,11 +753,11 @@ def test_cut_off_is_set_unless_the_first_exchange_was_lost(answered: int, way: s
         if way == "queued":
             until(lambda: port.done == answered + 1)
         else:
-            assert port.repeat([]) == 1  # the one that was cut off, or the one after the first
+            assert port.repeat([]) == 1  # the second exchange was next, or was cut off
     near.close()
 
 
-def test_pty_whose_far_end_hangs_up() -> None:
+def test_a_pty_whose_far_end_hangs_up_is_lost() -> None:
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     with closing(Port(slave, ANY_SETTINGS)) as port:
@@ -763,13 +765,13 @@ def test_pty_whose_far_end_hangs_up() -> None:
         found = port.carry_out(read(0))
         assert (found.result, found.error) in (
             (Failure.LINE_LOST, errno.EIO),
-            (Failure.LINE_LOST, 0),  # the end of the file
+            (Failure.LINE_LOST, 0),  # end of file
         )
     os.close(slave)
 
 
-def test_refused_settings_that_must_be_taken() -> None:
-    """A request with wrong parity must not leave. A pty has no parity."""
+def test_no_request_is_sent_if_the_port_refuses_its_settings() -> None:
+    """A request with wrong parity must not be sent. A pty has no parity."""
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     os.set_blocking(master, False)
@@ -797,7 +799,7 @@ def test_the_time_of_a_settings_change_is_measured() -> None:
     os.close(master)
 
 
-def test_port_that_should_have_settings_and_has_none(drive: Drive) -> None:
+def test_a_descriptor_without_settings_is_lost_if_settings_are_required(drive: Drive) -> None:
     with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
         found = port.carry_out(read(0))
         assert (found.result, found.error) == (Failure.LINE_LOST, errno.ENOTTY)
@@ -825,8 +827,8 @@ def test_closing_a_port_ends_the_wait_of_its_clients(drive: Drive) -> None:
     assert found == [Failure.LINE_LOST]
 
 
-def test_a_port_reports_the_drives_that_it_asks() -> None:
-    """Queued, repeated, urgent and under way; and nothing of another peer."""
+def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -> None:
+    """It is true for exchanges that wait or are in flight, but not for another peer."""
     near, far = socket.socketpair()
     with near, far:
         near.setblocking(False)
@@ -837,7 +839,7 @@ def test_a_port_reports_the_drives_that_it_asks() -> None:
             assert port.is_asking(queued.peer)
             assert not port.is_asking(other.peer)
             port.repeat([repeated])
-            assert far.recv(100)  # it is under way
+            assert far.recv(100)  # its request is in flight
             port.repeat([])
             assert port.is_asking(repeated.peer)
             until(lambda: not port.is_asking(repeated.peer))
@@ -851,8 +853,8 @@ def test_a_port_reports_the_drives_that_it_asks() -> None:
 
 
 @pytest.mark.slow
-def test_ports_come_and_go(drive: Drive) -> None:
-    """Opened and closed a thousand times, under way or not, on one engine."""
+def test_opening_and_closing_a_thousand_ports_leaks_no_descriptor(drive: Drive) -> None:
+    """They are opened and closed on one engine, with an exchange in flight or not."""
 
     def come_and_go(start: int) -> int:
         near, far = socket.socketpair()
@@ -864,7 +866,7 @@ def test_ports_come_and_go(drive: Drive) -> None:
             port.close()
         return len(list(Path("/dev/fd").iterdir()))
 
-    before = come_and_go(0)  # the engine has come by now, and stays
+    before = come_and_go(0)  # the engine's own descriptors exist from now on
     assert {come_and_go(start) for start in range(1, 1000)} == {before}
 
 
@@ -878,8 +880,8 @@ def descriptors() -> Iterator[int]:
 
 
 @pytest.mark.long
-def test_a_thousand_ports_come_and_go_at_once(descriptors: int) -> None:
-    """Twice over; each is closed while the others are still under way."""
+def test_a_thousand_ports_can_be_open_together(descriptors: int) -> None:
+    """This is done twice. Each port is closed while the others still have exchanges in flight."""
     if descriptors < 2500:
         pytest.skip(f"a process may have no more than {descriptors} descriptors here")
 
@@ -905,12 +907,12 @@ def test_a_thousand_ports_come_and_go_at_once(descriptors: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("exchanges", [10_000, pytest.param(50_000, marks=pytest.mark.long)])
-def test_memory_is_flat_over_many_exchanges(drive: Drive, exchanges: int) -> None:
+def test_memory_does_not_grow_over_many_exchanges(drive: Drive, exchanges: int) -> None:
     asked, row_queue = read(0), RowQueue(chunk_rows=1000, most_chunks=4)
     asked.c.silence_ns = 1000
 
     def resident_after(exchanges: int) -> int:
-        """Bytes."""
+        """Return the resident memory in bytes after so many exchanges."""
         while exchanges > 0:
             time.sleep(0.01)
             while columns := row_queue.take():
@@ -922,10 +924,10 @@ def test_memory_is_flat_over_many_exchanges(drive: Drive, exchanges: int) -> Non
         port.report_to(row_queue, 0)
         port.repeat([asked])
         before = resident_after(5_000)
-        assert resident_after(exchanges) - before < 1_000_000  # that is 20 bytes each, or 100
+        assert resident_after(exchanges) - before < 1_000_000  # less than 20 or 100 bytes for each exchange
 
 
 @table("status", list(Status))
-def test_every_status_has_its_words(status: Status) -> None:
+def test_every_status_has_a_text(status: Status) -> None:
     assert str(status)
     assert STATUSES[status] == str(status)

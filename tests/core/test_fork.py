@@ -30,14 +30,14 @@ from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*fork:DeprecationWarning",  # that a lock may be held there is what is tested
+    "ignore:.*fork:DeprecationWarning",  # it warns of held locks, which are tested here
     "ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning",
 )
 
 
 @contextmanager
 def child(act: Callable[[], object]) -> Iterator[Any]:
-    """Yield the result of this in a child, which lives until the block is left."""
+    """Yield the result of `act` in a forked child, which lives until the end of the block."""
     ours, theirs = multiprocessing.Pipe()
 
     def run() -> None:
@@ -71,7 +71,7 @@ def in_child(act: Callable[[], object]) -> Any:
 
 @contextmanager
 def held(*locks: Any) -> Iterator[None]:
-    """Another thread has them meanwhile."""
+    """Let another thread hold these locks during the block."""
     are_held, done = threading.Event(), threading.Event()
 
     def hold() -> None:
@@ -103,7 +103,7 @@ def current(bus: Bus) -> float:
 
 
 def is_polled(poller: Poller) -> bool:
-    """A value of `wire` has come."""
+    """Return True once the poller has a value of the drive of `wire`."""
     return any(row.value == 3.25 for row in rows_of(poller))
 
 
@@ -115,7 +115,7 @@ def port() -> Iterator[str]:
 
 @pytest.fixture(params=["pty", "socket", "rfc2217"])
 def any_port(request: pytest.FixtureRequest) -> Iterator[str]:
-    """A port of each kind, with a simulated drive behind it."""
+    """Yield a port of each kind, with a simulated drive behind it."""
     with Simulator([wire("pty" if request.param == "pty" else "socket://127.0.0.1:0")]) as simulator:
         if request.param != "rfc2217":
             yield simulator.wires[0].path
@@ -139,7 +139,7 @@ def test_a_child_opens_lines_of_its_own(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_child_of_a_child_too(port: str) -> None:
+def test_a_child_of_a_child_opens_lines_of_its_own(port: str) -> None:
     def open_it() -> float:
         with Bus(port) as bus:
             return current(bus)
@@ -155,7 +155,7 @@ def test_a_child_of_a_child_too(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
+def test_an_inherited_bus_raises_that_it_was_opened_before_the_fork(any_port: str) -> None:
     def use() -> list[str]:
         with bus:
             stopped = [each.why for each in bus.stop_all().values()]
@@ -173,7 +173,7 @@ def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_child_neither_hangs_nor_harms_when_it_lets_go_of_a_bus(any_port: str) -> None:
+def test_a_child_that_discards_an_inherited_bus_does_not_disturb_the_parent(any_port: str) -> None:
     buses = [Bus(any_port)]
 
     def let_go() -> None:
@@ -189,7 +189,7 @@ def test_a_child_neither_hangs_nor_harms_when_it_lets_go_of_a_bus(any_port: str)
 
 
 @pytest.mark.slow
-def test_a_bridge_is_not_hung_up_by_a_child() -> None:
+def test_a_child_that_closes_a_bridged_bus_does_not_hang_up_the_parents_port() -> None:
     with Bus("loop://") as bus:
         assert in_child(bus.close) is None
         with pytest.raises(NoReply):
@@ -204,7 +204,7 @@ def test_a_port_is_free_when_its_parent_closed_it_while_the_child_lives(port: st
             assert current(again) == 3.25
 
 
-def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
+def test_a_child_does_not_wait_for_a_bus_lock_held_in_the_parent(port: str) -> None:
     def use() -> None:
         bus.detach(bus.drives[0])
         bus.line.require((9600, "8N1"))
@@ -212,7 +212,7 @@ def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        # A stop of another thread, for which the child would wait.
+        # A stop of another thread, whose end the child must not await.
         stop = threading.Thread(target=bus._latches.begin, args=["stop", bus.drives])
         stop.start()
         stop.join()
@@ -242,7 +242,7 @@ def test_an_inherited_poller_is_closed_and_has_no_rows(port: str) -> None:
         until(lambda: is_polled(poller))
 
 
-def test_locks_of_a_poller_do_not_hold_a_child_up(port: str) -> None:
+def test_a_child_does_not_wait_for_a_poller_lock_held_in_the_parent(port: str) -> None:
     toy = polled(Toy(1), [Toy.output_current])
 
     def use() -> None:
@@ -256,7 +256,7 @@ def test_locks_of_a_poller_do_not_hold_a_child_up(port: str) -> None:
         until(lambda: is_polled(poller))
 
 
-def test_memory_that_a_thread_may_hold_is_not_given_back_in_a_child() -> None:
+def test_only_here_does_nothing_in_a_child() -> None:
     given: list[str] = []
     give_back = only_here(given.append)
 
@@ -268,7 +268,7 @@ def test_memory_that_a_thread_may_hold_is_not_given_back_in_a_child() -> None:
     assert in_child(act) == ["here"]
 
 
-def test_rows_that_wait_are_the_parent_s_to_take() -> None:
+def test_pending_rows_are_taken_only_in_the_parent() -> None:
     row_queue, block = RowQueue(), RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
     row_queue.add_miss(block, Status.NO_REPLY, 0)
     assert in_child(row_queue.take) is None
@@ -295,7 +295,7 @@ with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
 
 
 @pytest.mark.long
-def test_a_child_ends_no_simulator() -> None:
+def test_the_end_of_a_child_does_not_end_the_parents_simulator() -> None:
     words = [sys.executable, "-W", "ignore", "-c", LEFT.format(support=str(Path(toy.__file__).parent))]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.stdout, done.stderr, done.returncode) == ("0\n", "", 0)
@@ -326,8 +326,8 @@ ENDS = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("end", ENDS)
-def test_a_child_stops_no_motor(end: str) -> None:
-    """However it ends; its parent still does, when it leaves."""
+def test_the_end_of_a_child_does_not_stop_the_parents_motor(end: str) -> None:
+    """This holds however the child ends. The parent still stops the motor when it leaves the bus."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.deceleration_time = 0.2
@@ -341,7 +341,7 @@ def test_a_child_stops_no_motor(end: str) -> None:
             parent.communicate()
         assert parent.returncode == 0
         start, *stops = (write.raw for write in sim.counters.writes if write.name == "control")
-        # A busy machine may have the stop repeated, or followed by that of a jog.
+        # On a busy computer the stop may be repeated, or followed by the stop of a jog.
         assert (start, stops[0], set(stops) - {5, 8}) == (1, 5, set())
 
 
@@ -372,7 +372,7 @@ print("and here it works:", Bus.__name__)
 
 
 @pytest.mark.slow
-def test_a_sub_interpreter_is_refused_and_the_main_one_is_served() -> None:
+def test_importing_in_a_sub_interpreter_fails_and_in_the_main_interpreter_works() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     refused = (
         "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "

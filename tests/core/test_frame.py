@@ -1,4 +1,4 @@
-"""Frames: all that the documents print, and replies that other libraries accept."""
+"""Frames: all frames printed in the documents, and wrong replies that other libraries accept."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
 GOOD_REQUESTS = [each for each in PRINTED if each.direction == "request" and each.verdict != "bad checksum"]
 GOOD_REPLIES = [each for each in PRINTED if each.direction == "reply" and isinstance(each.says, Message)]
 REFUSED = [each for each in PRINTED if isinstance(each.says, FrameFault)]
-MISPRINTED = "01 89 01 86 50"  # E13: what a drive may say, but our simulators never do
+MISPRINTED = "01 89 01 86 50"  # E13: a drive may send this, but our simulators never do
 
 
 def parse(printed: Printed, received: bytes) -> tuple[int, Message | None]:
@@ -61,7 +61,7 @@ def exchange(framing: Framing, request: Message) -> Exchange:
 
 
 def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 4096) -> Completion:
-    """Return the result of a request when these bytes are all that comes back, of an adapter without echo."""
+    """Return the result of a request to which these bytes come back, through an adapter without echo."""
     line = LineDriver()
     line.echo = lib.MD_NO_ECHO
     line.begin(exchange(framing, request))
@@ -74,10 +74,10 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
 # ---- the documents' frames ----
 
 
-def test_all_printed_frames_have_a_meaning() -> None:
+def test_every_printed_frame_is_parsed() -> None:
     assert (
         len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
-    )  # 19 have a copy of themselves as the reply
+    )  # 19 of them have a copy as their reply
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
@@ -98,16 +98,16 @@ def test_reply_is_built_as_printed() -> None:
         assert build_reply(printed.framing, printed.says) == printed.frame
 
 
-def test_89h_is_accepted_for_88h_but_never_said() -> None:
+def test_function_89h_is_accepted_for_88h_but_never_sent() -> None:
     refusal = Message(1, 0x08, exception=1)
     request = Message(1, 0x08, 0, data=words(0xA537))
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), request) == (5, refusal)
     assert build_reply(RTU, refusal) == bytes.fromhex("01 88 01 87 C0")
-    # it is an exception to 08 and to nothing else
+    # it is an exception only to function 08
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == FrameFault.BAD_FUNCTION
 
 
-def test_misprinted_frame_is_refused() -> None:
+def test_a_misprinted_frame_has_the_expected_fault() -> None:
     for printed in REFUSED:
         assert parse(printed, printed.frame) == (printed.says, None)
 
@@ -124,8 +124,8 @@ def test_bytes_after_a_frame_are_ignored() -> None:
             assert parse(printed, printed.frame + after) == (len(printed.frame), printed.says)
 
 
-def test_reply_is_found_behind_junk() -> None:
-    """The reply is whole or comes byte by byte."""
+def test_a_reply_is_found_after_junk() -> None:
+    """The reply comes whole, or byte by byte."""
     for printed in GOOD_REPLIES:
         assert printed.request is not None
         for before, piece in product((b"", b"\x00", b"\x01", b":01", b"\xff\x00" * 40), (4096, 1)):
@@ -134,12 +134,12 @@ def test_reply_is_found_behind_junk() -> None:
             assert (found.raw, found.reply) == (printed.frame, printed.says)
 
 
-def test_text_frame_that_breaks_off_does_not_hide_the_next() -> None:
+def test_a_reply_is_found_after_an_incomplete_text_frame() -> None:
     found = carry_out(ASCII, WRITE_ONE, b":010600" + b":010600101234A3\r\n")
     assert (found.result, found.skipped) == (17, 7)
 
 
-def test_length_of_a_good_reply_is_known_beforehand() -> None:
+def test_reply_length_returns_the_length_of_a_good_reply() -> None:
     for printed in GOOD_REPLIES:
         assert printed.request is not None
         assert isinstance(printed.says, Message)
@@ -156,7 +156,7 @@ def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], byt
     assert parse_reply(framing, frame[:-1], Message(1, 0x03, 0, 125)) == (FrameFault.INCOMPLETE, None)
 
 
-# ---- never wrong data: what others were seen to take for an answer ----
+# ---- wrong replies that other libraries accept as data ----
 
 
 def rtu(text: str) -> bytes:
@@ -176,7 +176,7 @@ ASK_FREQUENCY = Message(1, 7, 500, data=words(0, 0))
 ASK_STATE = Message(1, 3, 0, data=words(0, 0))
 
 WRONG = [
-    # pymodbus, modbus-tk and uModbus take a reply of another function for data
+    # pymodbus, modbus-tk and uModbus accept a reply with another function
     (
         "input registers for holding registers",
         RTU,
@@ -194,13 +194,13 @@ WRONG = [
     ("coils for registers", RTU, READ_TWO, rtu("01 01 04 11 11 22 22"), FrameFault.BAD_FUNCTION),
     ("exception to another function", RTU, READ_TWO, rtu("01 84 02"), FrameFault.BAD_FUNCTION),
     ("exception without a code", RTU, READ_TWO, rtu("01 83 00"), FrameFault.BAD_FUNCTION),
-    # pymodbus takes another number of registers
+    # pymodbus accepts another number of registers
     ("one register for two", RTU, READ_TWO, rtu("01 03 02 11 11"), FrameFault.BAD_LENGTH),
     ("three registers for two", RTU, READ_TWO, rtu("01 03 06 11 11 22 22 33 33"), FrameFault.BAD_LENGTH),
     ("half a register more", RTU, READ_TWO, rtu("01 03 05 11 11 22 22 33"), FrameFault.BAD_LENGTH),
     ("no register", RTU, READ_TWO, rtu("01 03 00"), FrameFault.BAD_LENGTH),
     ("16 coils for 8", RTU, Message(1, 0x01, 0, 8), rtu("01 01 02 FF FF"), FrameFault.BAD_LENGTH),
-    # pymodbus takes another value, libmodbus another address or value of 05, 06 and 10H
+    # pymodbus accepts another value, libmodbus another address or value of 05, 06 and 10H
     ("coil confirmed off that was set on", RTU, WRITE_COIL, rtu("01 05 00 03 00 00"), FrameFault.BAD_ECHO),
     ("another coil confirmed", RTU, WRITE_COIL, rtu("01 05 00 04 FF 00"), FrameFault.BAD_ECHO),
     ("another value confirmed", RTU, WRITE_ONE, rtu("01 06 00 10 12 35"), FrameFault.BAD_ECHO),
@@ -208,7 +208,7 @@ WRONG = [
     ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), FrameFault.BAD_ECHO),
     ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), FrameFault.BAD_ECHO),
     ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), FrameFault.BAD_ECHO),
-    # everybody takes a late reply, if only it has the right shape; what can be told apart is
+    # all of them accept a late reply of the right shape; these differ in function, address or length
     (
         "late reply to a longer read",
         RTU,
@@ -246,7 +246,7 @@ WRONG = [
     ("framing", "request_", "received", "reason"),
     [each[1:] for each in WRONG],
 )
-def test_wrong_reply_is_never_data(
+def test_a_wrong_reply_ends_with_its_fault_and_without_data(
     framing: Framing, request_: Message, received: bytes, reason: FrameFault
 ) -> None:
     assert parse_reply(framing, received, request_) == (reason, None)
@@ -256,7 +256,7 @@ def test_wrong_reply_is_never_data(
         assert found.reply == Message(0, 0)
 
 
-def test_stray_zero_before_every_reply_loses_nothing() -> None:
+def test_a_stray_zero_before_each_reply_loses_no_value() -> None:
     line = LineDriver()
     for value in range(30):
         line.begin(exchange(RTU, READ_TWO))
@@ -268,18 +268,18 @@ def test_stray_zero_before_every_reply_loses_nothing() -> None:
 
 
 @table("code", [0xF0, 0xFC, 0xFD, 0xFE, 0xFF])
-def test_delixi_s_refusals(code: int) -> None:
+def test_delixis_refusal_codes_are_exceptions(code: int) -> None:
     frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
     assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
-    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # note 2: the master never says so
+    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # note 2: a master never sends it
 
 
-def test_delixi_s_state_is_the_reply_s_parameter_number() -> None:
+def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:
     used, reply = parse_reply(DELIXI, b":010300020000000006\r\n", ASK_STATE)
     assert (used, reply) == (21, Message(1, 3, 2, data=words(0, 2)))
 
 
-# ---- what cannot be said ----
+# ---- messages that no frame can carry ----
 
 
 @table(
@@ -296,14 +296,14 @@ def test_delixi_s_state_is_the_reply_s_parameter_number() -> None:
         Message(1, 0x2B, 0, 1),
     ],
 )
-def test_request_out_of_bounds(message: Message) -> None:
+def test_a_request_with_a_field_out_of_bounds_raises(message: Message) -> None:
     with pytest.raises(ValueError, match=re.escape(f"out of bounds for a rtu frame: {message}")):
         build_request(RTU, message)
     with pytest.raises(ValueError, match="out of bounds for a rtu frame"):
         exchange(RTU, message)
 
 
-def test_the_last_address_and_the_one_behind_it() -> None:
+def test_address_247_is_accepted_and_248_raises() -> None:
     reply = Message(247, 0x03, data=words(7))
     assert build_reply(RTU, reply) == checksums.rtu("F7 03 02 00 07")
     with pytest.raises(ValueError, match="out of bounds for a rtu frame"):
@@ -311,34 +311,34 @@ def test_the_last_address_and_the_one_behind_it() -> None:
 
 
 @table("function", [0x00, 0x07, 0x2B, 0xFF])
-def test_a_reply_to_an_unknown_function_is_a_fault(function: int) -> None:
+def test_building_a_reply_with_an_unknown_function_raises(function: int) -> None:
     reply = Message(1, function, data=words(7))
     with pytest.raises(ValueError, match=re.escape(f"out of bounds for a rtu frame: {reply}")):
         build_reply(RTU, reply)
 
 
-def test_request_with_too_much_data() -> None:
+def test_a_request_with_251_data_bytes_raises() -> None:
     with pytest.raises(ValueError, match="251 data bytes do not fit a frame: 250 at most"):
         build_request(RTU, Message(1, 0x10, 0, 123, bytes(251)))
 
 
 @table("count", [0, 126, 127, 128, 0xFFFF])
-def test_impossible_count_may_be_refused_but_never_answered(count: int) -> None:
-    """An sniffed master may ask for anything; exceptions are replies to that too."""
+def test_only_an_exception_is_a_reply_to_an_impossible_count(count: int) -> None:
+    """A sniffed master may request any count, and an exception is a reply to that request too."""
     request = Message(1, 0x03, 0, count)
     data_len = 2 * count & 0xFF
     assert parse_reply(RTU, bytes([1, 3, data_len]) + bytes(300), request) == (FrameFault.BAD_LENGTH, None)
     assert parse_reply(RTU, rtu("01 83 03"), request) == (5, Message(1, 3, exception=3))
 
 
-def test_drive_s_side_hears_of_a_count_that_it_cannot_answer() -> None:
+def test_a_request_with_an_impossible_count_is_parsed() -> None:
     frame = rtu("01 03 00 00 00 7E")
     assert parse_request(RTU, frame) == (8, Message(1, 0x03, 0, 126))
 
 
 @table("function", [0x83, 0xFF, 0x2B])
 @table("framing", [RTU, ASCII])
-def test_no_reply_fits_an_unknown_function(framing: Framing, function: int) -> None:
+def test_a_reply_to_an_unknown_function_has_the_fault_bad_function(framing: Framing, function: int) -> None:
     body = bytes([1, function, 1])
     frames = {
         RTU: rtu(body.hex()),
@@ -351,13 +351,13 @@ def test_no_reply_fits_an_unknown_function(framing: Framing, function: int) -> N
 
 
 @table("odd", [{"start": 10**400}, {"start": -1}, {"count": 1 << 16}, {"function": 300}])
-def test_a_number_that_no_frame_has_room_for_is_a_mistake(odd: dict[str, int]) -> None:
+def test_a_number_too_large_for_its_field_raises(odd: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="a field is out of bounds"):
         build_request(Framing.RTU, Message(**({"address": 1, "function": 3, "start": 0, "count": 1} | odd)))
 
 
 @pytest.mark.parametrize("framing", [RTU, ASCII])
-def test_a_broadcast_s_reply_has_no_length(framing: Framing) -> None:
+def test_the_reply_length_of_a_broadcast_is_0(framing: Framing) -> None:
     assert reply_length(framing, Message(0, 6, 0x2000, 1, data=b"\0\1")) == 0
 
 
@@ -383,7 +383,7 @@ def crc(data: bytes) -> int:
         (bytes.fromhex("02 07"), 0x1241),  # serial-line guide V1.02, 6.2.2
     ],
 )
-def test_crc16(data: bytes, checksum: int) -> None:
+def test_crc16_equals_published_checksums(data: bytes, checksum: int) -> None:
     assert crc(data) == checksum
 
 
@@ -396,7 +396,7 @@ def test_crc16(data: bytes, checksum: int) -> None:
         (bytes.fromhex("01 03 02 13 88"), 0x5F),
     ],
 )
-def test_lrc(data: bytes, checksum: int) -> None:
+def test_lrc_equals_published_checksums(data: bytes, checksum: int) -> None:
     assert lrc(data, len(data)) == checksum
 
 
@@ -410,14 +410,14 @@ def test_lrc(data: bytes, checksum: int) -> None:
         (bytes.fromhex("01 07 01 F4 00 00 13 88"), 0x98),
     ],
 )
-def test_delixi_s_sum(data: bytes, checksum: int) -> None:
+def test_delixis_checksum_equals_printed_checksums(data: bytes, checksum: int) -> None:
     assert sum8(data, len(data)) == checksum
 
 
 @table("at", range(4))
 @table("more", range(4))
 def test_crc16_equals_its_bitwise_definition(at: int, more: int) -> None:
-    """Every byte value at every place among the four that are taken at once, and single ones behind."""
+    """Test every byte value at each place of the four bytes processed together, and in the rest."""
     for byte in range(256):
         data = bytes(at) + bytes([byte]) + bytes(3 - at) + bytes([byte] * more)
         assert data + crc(data).to_bytes(2, "little") == checksums.rtu(data)

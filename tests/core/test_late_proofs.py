@@ -1,4 +1,4 @@
-"""After the window of late replies: requests with ambiguous replies wait for the answer to a proof."""
+"""After the window of late replies, requests with ambiguous replies wait for the reply to a proof."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """A read of another length as the drive's proof, after READ was not answered and its window is over."""
+    """Return the drive's proof, a longer read, after READ got no reply and its window is over."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -43,17 +43,17 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
 @pytest.mark.usefixtures("proof")
 def test_a_read_of_the_same_length_waits_for_a_proof(line: LineDriver, drive: Peer) -> None:
     assert is_barred(line, drive, OTHER)
-    ask(line, drive, Message(1, 4, 50, 1))  # no reply to READ is one to this
+    ask(line, drive, Message(1, 4, 50, 1))  # a late reply to READ does not fit this request
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_write_waits_for_the_answer_of_an_earlier_one(line: LineDriver, drive: Peer) -> None:
-    """A late refusal of the first would count as the second's, whose motor has started."""
+def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive: Peer) -> None:
+    """A late exception to the first write would be taken for the second's, whose motor has started."""
     time_out(line, drive, WRITE)
     assert is_barred(line, drive, AGAIN)
 
 
-def test_an_answered_proof_says_that_the_earlier_answer_never_comes(
+def test_after_the_reply_to_a_proof_earlier_replies_are_no_longer_expected(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     send(line, proof)
@@ -64,7 +64,9 @@ def test_an_answered_proof_says_that_the_earlier_answer_never_comes(
     assert (line.want, line.completion.reply.data) == ("done", words(2222))
 
 
-def test_a_late_reply_before_the_proof_s_is_skipped(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_a_late_reply_before_the_proofs_reply_is_skipped(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     send(line, proof)
     line.receive(reply(1111))
     assert line.listens
@@ -76,7 +78,9 @@ def test_a_late_reply_before_the_proof_s_is_skipped(line: LineDriver, drive: Pee
     assert (line.want, line.completion.reply.data) == ("done", words(2222))
 
 
-def test_an_unanswered_proof_proves_nothing(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_after_an_unanswered_proof_the_late_reply_is_still_expected(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     send(line, proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -85,7 +89,7 @@ def test_an_unanswered_proof_proves_nothing(line: LineDriver, drive: Peer, proof
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """The drive answers something else, and then neither READ nor the proof in time."""
+    """Let the drive answer another request, and then neither READ nor the proof in time."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -96,7 +100,7 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_a_proof_that_is_never_answered_is_given_up(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_a_proof_that_was_never_answered_is_dropped(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     """A device may be silent to registers that it lacks."""
     ask_in_vain(line, drive, proof)
     assert is_barred(line, drive, OTHER)
@@ -105,7 +109,7 @@ def test_a_proof_that_is_never_answered_is_given_up(line: LineDriver, drive: Pee
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_a_proof_that_was_answered_once_is_never_given_up(
+def test_a_proof_that_was_answered_once_is_never_dropped(
     line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
 ) -> None:
     if is_late:
@@ -127,7 +131,7 @@ def test_a_silent_drive_keeps_its_proofs(line: LineDriver, drive: Peer, proof: E
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_stop_waits_for_no_proof(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_is_sent_without_a_proof(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
@@ -135,8 +139,8 @@ def test_a_stop_waits_for_no_proof(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_late_answer_is_known_on_a_port_that_was_opened_again(line: LineDriver, drive: Peer) -> None:
-    """The value may be that of the first question: by hand it is asked for again."""
+def test_a_late_reply_is_recognised_after_the_port_is_reopened(line: LineDriver, drive: Peer) -> None:
+    """The value may be the reply to the first request: outside of a poll it is read again."""
     line.lose(0)
     again = LineDriver()
     again.now = line.now
@@ -147,8 +151,8 @@ def test_a_late_answer_is_known_on_a_port_that_was_opened_again(line: LineDriver
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_late_answer_is_counted_once(line: LineDriver, drive: Peer) -> None:
-    """More comes behind it before the next request leaves: another drive's late answer, or noise."""
+def test_a_late_reply_is_counted_once(line: LineDriver, drive: Peer) -> None:
+    """Noise comes after it, before the next request is sent."""
     time_out(line, drive, LONGER)
     time_out(line, drive, LONGER)
     line.receive(PROOF_REPLY)
@@ -158,8 +162,10 @@ def test_a_late_answer_is_counted_once(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_found_after_a_late_one_that_interrupts_its_request(line: LineDriver, drive: Peer) -> None:
-    """The port took the request in two parts, and the late answer came between them."""
+def test_a_reply_is_found_after_a_late_reply_that_came_during_its_request(
+    line: LineDriver, drive: Peer
+) -> None:
+    """The port took the request in two parts, and the late reply came between them."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
         line.now += MS
@@ -173,7 +179,7 @@ def test_a_reply_is_found_after_a_late_one_that_interrupts_its_request(line: Lin
 
 @pytest.mark.usefixtures("proof")
 def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive: Peer) -> None:
-    """A late reply was among the received bytes."""
+    """The noise contained a late reply."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
         line.receive(b"\x07")
@@ -187,7 +193,7 @@ def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """The proof of a drive that may owe another process a reply of READ's length."""
+    """Return the proof of a drive whose first reply, as long as READ's, may be to another process."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()
@@ -198,21 +204,25 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_the_first_reply_may_answer_another_process(line: LineDriver, drive: Peer, first: Exchange) -> None:
+def test_the_first_reply_is_in_doubt_until_a_proof_is_answered(
+    line: LineDriver, drive: Peer, first: Exchange
+) -> None:
     ask(line, drive, READ)
-    line.receive(reply(7777))  # of the other's register
+    line.receive(reply(7777))  # the reply to the other process
     assert is_in_doubt(line)
     send(line, first)
-    line.receive(reply(1111))  # of READ
+    line.receive(reply(1111))  # the reply to READ
     assert line.listens
     line.receive(PROOF_REPLY)
     ask(line, drive, READ)
     line.receive(reply(1112))
     assert (line.want, line.completion.reply.data) == ("done", words(1112))
-    assert drive.counters().late == 0  # it was always in time
+    assert drive.counters().late == 0  # the drive itself was always in time
 
 
-def test_a_refusal_proves_nothing(line: LineDriver, drive: Peer, first: Exchange) -> None:
+def test_after_an_exception_the_first_reply_is_still_in_doubt(
+    line: LineDriver, drive: Peer, first: Exchange
+) -> None:
     ask(line, drive, READ)
     line.receive(build_reply(Framing.RTU, Message(1, 3, exception=2)))
     assert (line.want, line.completion.reply.exception) == ("done", 2)
@@ -222,7 +232,7 @@ def test_a_refusal_proves_nothing(line: LineDriver, drive: Peer, first: Exchange
 
 
 @pytest.mark.usefixtures("first")
-def test_the_first_write_waits_for_a_reply_to_a_read(line: LineDriver, drive: Peer) -> None:
+def test_the_first_write_is_sent_only_after_a_reply_to_a_read(line: LineDriver, drive: Peer) -> None:
     assert is_barred(line, drive, WRITE)
     ask(line, drive, READ)
     line.receive(reply(7777))
@@ -249,7 +259,7 @@ def test_without_proofs_the_first_reply_is_accepted(line: LineDriver, drive: Pee
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
 def test_a_known_value_of_any_size_identifies_a_reply(line: LineDriver, drive: Peer, least: int) -> None:
-    """Delixi's P04.28 is 0 at 1200 baud: taken for "any count", it would bar all of the drive's reads."""
+    """Delixi's P04.28 is 0 at 1200 baud. Mistaken for "any value", it would block all reads."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
     time_out(line, drive, Message(1, 3, 90, 1))

@@ -41,7 +41,7 @@ from multidrop.core import (
 __all__ = ["drive", "line"]  # fixtures
 
 
-def test_the_response_delay_is_learnt(line: LineDriver, drive: Peer) -> None:
+def test_the_response_delay_is_learnt_from_replies(line: LineDriver, drive: Peer) -> None:
     assert drive.response_delay == 0
     for _ in range(40):
         answer(line, drive, 15 * MS)
@@ -58,7 +58,7 @@ def test_the_port_is_not_read_before_a_reply_can_be_whole(line: LineDriver, driv
 
 
 def attend(line: LineDriver, drive: Peer, delay: int) -> int:
-    """An exchange as the engine does it: how long the reply was whole when it was seen so."""
+    """Carry out an exchange as the engine does; return the ns from the reply's end to its last read."""
     left = ask(line, drive)
     times = [left + delay + (at + 1) * CHARACTER for at in range(len(reply()))]
     seen = 0
@@ -72,7 +72,7 @@ def attend(line: LineDriver, drive: Peer, delay: int) -> int:
     return line.now - times[-1]
 
 
-def test_the_first_read_comes_shortly_before_the_reply_s_end(line: LineDriver, drive: Peer) -> None:
+def test_the_port_is_first_read_shortly_before_the_replys_end(line: LineDriver, drive: Peer) -> None:
     for _ in range(20):
         assert attend(line, drive, 15 * MS) == attend(line, drive, 16 * MS) == 0
 
@@ -81,7 +81,10 @@ def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver
     ask(line, drive)
     line.now += 60 * MS
     line.receive(reply()[:3])
-    assert (line.want, line.wake) == ("wait", line.now + 3 * CHARACTER)  # four are missing: look at the last
+    assert (line.want, line.wake) == (
+        "wait",
+        line.now + 3 * CHARACTER,
+    )  # four missing: read before the end
     line.now = line.wake
     line.receive(reply()[3:6])
     assert line.want == "read"
@@ -89,7 +92,7 @@ def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver
     assert line.want == "done"
 
 
-def test_an_exception_is_not_waited_past(line: LineDriver, drive: Peer) -> None:
+def test_an_exception_ends_the_wait_for_a_longer_reply(line: LineDriver, drive: Peer) -> None:
     refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
     ask(line, drive, Message(1, 3, 0, 100))
     line.receive(refusal[:2])
@@ -98,8 +101,8 @@ def test_an_exception_is_not_waited_past(line: LineDriver, drive: Peer) -> None:
     assert line.want == "done"
 
 
-def test_a_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Peer) -> None:
-    """Its reply is complete long before the port is read; each read comes a little earlier."""
+def test_the_port_is_read_earlier_when_a_drive_becomes_quicker(line: LineDriver, drive: Peer) -> None:
+    """At first its reply is complete long before the port is read. Then each read comes a little earlier."""
     for _ in range(40):
         answer(line, drive, 40 * MS)
     for _ in range(120):
@@ -116,23 +119,23 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
 
 
 def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """The same without its reply's own time, for which a line waits that knows nothing of its adapter."""
+    """Return the same time, but without the reply's length, which is awaited on an unknown adapter."""
     return given_up(line, drive, request) - 7 * CHARACTER
 
 
-def test_a_time_out_follows_the_drive_s_own_delay(line: LineDriver, drive: Peer) -> None:
+def test_the_timeout_follows_the_drives_response_delay(line: LineDriver, drive: Peer) -> None:
     for number in range(200):
         answer(line, drive, (40 + number % 3) * MS)
     assert 45 * MS < given_up(line, drive) - AWAITED < 60 * MS
 
 
-def test_a_time_out_is_never_under_its_floor(line: LineDriver, drive: Peer) -> None:
+def test_the_timeout_is_never_shorter_than_least_timeout(line: LineDriver, drive: Peer) -> None:
     for _ in range(100):
         answer(line, drive, MS // 10)
     assert given_up(line, drive) == LEAST + AWAITED
 
 
-def test_a_silent_drive_has_all_its_time_once_and_then_rarely(line: LineDriver, drive: Peer) -> None:
+def test_a_silent_drive_gets_the_longest_timeout_once_and_then_rarely(line: LineDriver, drive: Peer) -> None:
     found, reckoned = [], []
     for _ in range(20):
         line.now = max(line.now, drive.late_until_ns)
@@ -145,8 +148,8 @@ def test_a_silent_drive_has_all_its_time_once_and_then_rarely(line: LineDriver, 
     assert drive.failures == 0
 
 
-def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: Peer) -> None:
-    """Even if reads are quick: a write wrongly reported as unconfirmed costs more than the wait."""
+def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, drive: Peer) -> None:
+    """This holds even if reads are quick: a write wrongly reported as unconfirmed costs more than waiting."""
     for _ in range(12):
         answer(line, drive, 2 * MS)
     assert given_up(line, drive) < 100 * MS
@@ -159,12 +162,12 @@ def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: P
 
 # ---- no byte within the timeout ----
 
-AWAITED = 3 * CHARACTER  # where characters come one by one: that one, and two
+AWAITED = 3 * CHARACTER  # wait for the first character, plus two more
 LONG = Message(1, 3, 0, 100)  # with a reply of 205 characters
 
 
 def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
-    """A whole exchange, whose reply comes when it is whole."""
+    """Carry out an exchange whose adapter delivers the reply only once it is whole."""
     left = ask(line, drive, request)
     text = build_reply(Framing.RTU, Message(1, 3, data=bytes(2 * request.count)))
     while line.now < left + 15 * MS + len(text) * CHARACTER:
@@ -175,14 +178,14 @@ def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_a_reply_that_has_not_begun_is_not_waited_for_to_its_end(
+def test_without_a_first_byte_the_wait_does_not_include_the_replys_length(
     line: LineDriver, drive: Peer, asked: Message
 ) -> None:
     answer(line, drive, 2 * MS)
     assert given_up(line, drive, asked) == LEAST + AWAITED
 
 
-def test_a_reply_that_has_begun_is_waited_for(line: LineDriver, drive: Peer) -> None:
+def test_a_reply_that_has_started_is_awaited_to_its_end(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     left = ask(line, drive, LONG)
     text = build_reply(Framing.RTU, Message(1, 3, data=bytes(200)))
@@ -195,7 +198,7 @@ def test_a_reply_that_has_begun_is_waited_for(line: LineDriver, drive: Peer) -> 
     assert line.completion.result == len(text)
 
 
-def test_a_drive_that_has_just_failed_is_given_all_its_time(line: LineDriver, drive: Peer) -> None:
+def test_after_a_failure_the_next_request_gets_the_longest_timeout(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     given_up(line, drive)
     line.now = drive.late_until_ns
@@ -211,14 +214,16 @@ def test_an_echo_does_not_count_as_the_start_of_a_reply(line: LineDriver, drive:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_an_adapter_that_gathers_replies_is_waited_for(line: LineDriver, drive: Peer, asked: Message) -> None:
+def test_the_wait_includes_the_replys_length_if_the_adapter_delivers_whole_replies(
+    line: LineDriver, drive: Peer, asked: Message
+) -> None:
     """No byte of a reply is visible before its end."""
     for _ in range(20):
         gathered(line, drive, asked)
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
-def test_noise_teaches_nothing_about_the_adapter(line: LineDriver, drive: Peer) -> None:
+def test_noise_does_not_count_as_a_burst_of_the_adapter(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.receive(b"\x01")
     line.receive(b"\x03\x07")
@@ -228,7 +233,7 @@ def test_noise_teaches_nothing_about_the_adapter(line: LineDriver, drive: Peer) 
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
-def test_an_answer_that_was_not_waited_for_is_late(line: LineDriver, drive: Peer) -> None:
+def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     given_up(line, drive)
     line.begin(exchange(OTHER, drive))
@@ -237,18 +242,18 @@ def test_an_answer_that_was_not_waited_for_is_late(line: LineDriver, drive: Peer
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
 
 
-# ---- answers that come late ----
+# ---- late replies ----
 
 
-def test_no_request_leaves_that_a_late_reply_could_answer(line: LineDriver, drive: Peer) -> None:
+def test_no_request_is_sent_to_which_a_late_reply_could_belong(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
     assert (line.completion.result, line.completion.sent_ns) == (Failure.LATE_ANSWER_DUE, 0)
-    assert drive.failures == 1  # nothing was asked, so nothing failed
+    assert drive.failures == 1  # no request was sent, so none failed
 
 
-def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.lose(0)
     again = LineDriver()
@@ -260,10 +265,10 @@ def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(line: Line
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "by hand"])
-def test_a_value_that_may_answer_an_earlier_question_has_its_time(
+def test_a_row_with_a_value_in_doubt_has_the_time_of_the_earlier_request(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
-    """A read outside of a poll gets no value: a proof must show first that no late reply is on its way."""
+    """A read outside of a poll gets no value: first a proof must show that no late reply can come."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
     asked = exchange(READ, drive, block=rows)
@@ -287,8 +292,10 @@ def test_a_value_that_may_answer_an_earlier_question_has_its_time(
 
 
 @pytest.mark.parametrize(("asked", "times"), [(READ, 2), (WRITE, 1)], ids=["a read", "a write"])
-def test_only_reads_are_repeated(drive: Peer, asked: Message, times: int) -> None:
-    """Its reply may have been an earlier one; but a write may have started a motor."""
+def test_a_read_is_repeated_after_a_doubtful_reply_and_a_write_is_not(
+    drive: Peer, asked: Message, times: int
+) -> None:
+    """The doubtful reply may be to an earlier request. A write may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
     made = exchange(asked, drive)
@@ -305,43 +312,45 @@ def test_only_reads_are_repeated(drive: Peer, asked: Message, times: int) -> Non
     assert drive.exchanges == times
 
 
-def test_a_request_that_never_left_has_no_late_answer(line: LineDriver, drive: Peer) -> None:
+def test_no_late_reply_is_expected_to_an_unsent_request(line: LineDriver, drive: Peer) -> None:
     line.begin(exchange(READ, drive))
     line.lose(0)
     assert drive.late_until_ns == 0
 
 
-def test_a_request_that_no_late_reply_could_answer_is_sent(line: LineDriver, drive: Peer) -> None:
-    """A stop is a write: it never waits."""
+def test_a_request_is_sent_if_no_late_reply_could_be_mistaken_for_its_own(
+    line: LineDriver, drive: Peer
+) -> None:
+    """A stop is a write to which the late reply to a read does not fit."""
     time_out(line, drive)
     ask(line, drive, WRITE)
 
 
-def test_a_refusal_does_not_say_of_which_read_it_is(line: LineDriver, drive: Peer) -> None:
+def test_a_read_waits_for_a_late_exception_to_another_read(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.begin(exchange(LONGER, drive))
     assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_answers_to_several_requests_may_be_late(line: LineDriver, drive: Peer) -> None:
+def test_late_replies_to_several_requests_are_expected(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     first_until = drive.late_until_ns
-    time_out(line, drive, WRITE)  # no answer to the first could be taken for its reply
+    time_out(line, drive, WRITE)  # a late reply to the first request does not fit this write
     assert drive.late_until_ns > first_until
     line.begin(exchange(OTHER, drive))
     assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
-    line.receive(build_request(Framing.RTU, WRITE))  # as its confirmation is
+    line.receive(build_request(Framing.RTU, WRITE))  # the write's confirmation
     assert drive.counters().late == 1
-    line.begin(exchange(OTHER, drive))  # the answer to the first is still to come
+    line.begin(exchange(OTHER, drive))  # the reply to the first request may still come
     assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_a_refusal_does_not_say_of_which_write_it_is(line: LineDriver, drive: Peer) -> None:
-    """Told that it was refused one would take a motor for standing that the second write has started."""
+def test_a_write_waits_for_a_late_exception_to_another_write(line: LineDriver, drive: Peer) -> None:
+    """Otherwise the second write, which has started a motor, would be reported as refused."""
     time_out(line, drive, WRITE)
     line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
     assert line.completion.result == Failure.LATE_ANSWER_DUE
-    ask(line, drive, READ)  # no refusal of a write is one of a read
+    ask(line, drive, READ)  # an exception to a write does not fit a read
 
 
 def delixi(function: int, start: int, value: int = 0) -> Message:
@@ -351,7 +360,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        (delixi(7, 500), delixi(7, 501)),  # a reply names its parameter, a refusal nothing
+        (delixi(7, 500), delixi(7, 501)),  # a reply names its parameter, a refusal does not
         (delixi(7, 500), delixi(7, 500)),
         (delixi(3, 0), delixi(3, 0)),
         (delixi(3, 0), delixi(7, 0)),
@@ -360,7 +369,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
     ],
     ids=["another parameter", "the same one", "a state", "a state and a parameter", "a write", "a command"],
 )
-def test_which_requests_a_late_delixi_reply_could_answer(
+def test_a_delixi_request_waits_for_a_late_reply_that_could_be_its_own(
     line: LineDriver, drive: Peer, first: Message, second: Message
 ) -> None:
     line.begin(exchange(first, drive, Framing.DELIXI))
@@ -371,8 +380,8 @@ def test_which_requests_a_late_delixi_reply_could_answer(
     assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_a_late_answer_of_a_write_is_expected_beyond_its_own_time_out(line: LineDriver, drive: Peer) -> None:
-    """Its late refusal would count as the next write's, whose motor has started."""
+def test_a_late_reply_to_a_write_is_expected_after_the_writes_timeout(line: LineDriver, drive: Peer) -> None:
+    """Its late exception would be taken for the next write's, whose motor has started."""
     line.begin(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
     line.wait_until_write()
     line.wait_until_done()
@@ -383,7 +392,7 @@ def test_a_late_answer_of_a_write_is_expected_beyond_its_own_time_out(line: Line
     ask(line, drive, WRITE)
 
 
-def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_does_not_wait_for_late_replies(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(WRITE, drive)
     stop.c.insists = 1
@@ -391,10 +400,12 @@ def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Peer) -> None:
     assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
 
 
-def test_a_stop_is_given_longer_step_by_step(line: LineDriver, drive: Peer) -> None:
-    """It must not wait all the time that the document allows before it is repeated.
+def test_the_timeout_of_a_stop_doubles_after_each_failure_but_the_first(
+    line: LineDriver, drive: Peer
+) -> None:
+    """Before it is repeated, a stop must not wait for the longest documented timeout.
 
-    A look before it that is not answered, the first failure, makes it none longer: other drives wait.
+    The first failure, of the read before the stop, does not double the timeout, because other drives wait.
     """
     found = []
     for _ in range(5):
@@ -410,7 +421,7 @@ def test_a_stop_is_given_longer_step_by_step(line: LineDriver, drive: Peer) -> N
 
 def test_a_damaged_reply_inside_another_frame_does_not_count(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
-    inside = bytes([1, 3, 2, 0, 0, 0, 0])  # a reply with a wrong checksum
+    inside = bytes([1, 3, 2, 0, 0, 0, 0])  # looks like a reply with a wrong checksum
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
     line.wait_until_done()
     assert line.completion.result == FrameFault.BAD_CHECKSUM
@@ -418,13 +429,13 @@ def test_a_damaged_reply_inside_another_frame_does_not_count(line: LineDriver, d
     assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_other_drives_are_not_concerned(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_of_a_drive_does_not_delay_other_drives(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     other = Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
     ask(line, other, Message(2, 3, 0, 1))
 
 
-def test_the_documented_longest_delay_ends_the_wait(line: LineDriver, drive: Peer) -> None:
+def test_no_late_reply_is_expected_after_the_longest_documented_delay(line: LineDriver, drive: Peer) -> None:
     left = line.now + SILENCE + 8 * CHARACTER
     time_out(line, drive)
     assert drive.late_until_ns >= left + MOST
@@ -433,7 +444,9 @@ def test_the_documented_longest_delay_ends_the_wait(line: LineDriver, drive: Pee
 
 
 @pytest.mark.parametrize("piece", [7, 1], ids=["whole", "byte by byte"])
-def test_a_late_answer_is_recognised_and_ends_the_waiting(line: LineDriver, drive: Peer, piece: int) -> None:
+def test_a_late_reply_is_recognised_and_ends_the_wait_for_it(
+    line: LineDriver, drive: Peer, piece: int
+) -> None:
     time_out(line, drive)
     line.receive(reply(1111), piece)
     assert drive.late_until_ns == 0
@@ -457,7 +470,7 @@ def answer_of(address: int, *values: int) -> bytes:
 @pytest.mark.parametrize(
     "junk", [b"", b"\x00", b"\x02", b"\x01"], ids=["", "00", "our address", "its address"]
 )
-def test_a_late_answer_within_another_drive_s_exchange_is_recognised(
+def test_a_late_reply_is_recognised_during_another_drives_exchange(
     line: LineDriver, drive: Peer, junk: bytes, piece: int
 ) -> None:
     time_out(line, drive)
@@ -468,7 +481,7 @@ def test_a_late_answer_within_another_drive_s_exchange_is_recognised(
     line.receive(answer_of(2, 5), piece)
     assert line.want == "done"
     assert (line.completion.reply.data, line.completion.skipped) == (words(5), len(junk) + 7)
-    ask(line, drive, OTHER)  # it need not be waited for any more
+    ask(line, drive, OTHER)  # its late reply is no longer expected
 
 
 def test_late_replies_of_several_drives_are_recognised(line: LineDriver) -> None:
@@ -484,17 +497,19 @@ def test_late_replies_of_several_drives_are_recognised(line: LineDriver) -> None
     assert drives[2].counters().late == 1
 
 
-def test_a_late_answer_of_the_drive_that_is_asked_something_else(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_is_recognised_during_another_exchange_of_the_same_drive(
+    line: LineDriver, drive: Peer
+) -> None:
     time_out(line, drive)
     ask(line, drive, WRITE)
     line.receive(reply(1111))
     assert line.listens
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
-    line.receive(build_request(Framing.RTU, WRITE) * 2)  # and its echo
+    line.receive(build_request(Framing.RTU, WRITE) * 2)  # the confirmation, and before it its echo
     assert line.completion.result == 8
 
 
-def test_a_late_reply_is_not_reported_as_another_address(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_is_not_reported_as_a_reply_from_another_address(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     ask(line, other := peer(), Message(2, 3, 0, 1))
     line.receive(reply(1111))
@@ -523,7 +538,7 @@ def test_a_frame_of_a_drive_without_outstanding_requests_is_stray(line: LineDriv
     assert (line.completion.result, drive.counters().late) == (FrameFault.BAD_ADDRESS, 0)
 
 
-def test_damage_is_not_silence(line: LineDriver, drive: Peer) -> None:
+def test_damaged_replies_are_not_counted_as_failures_of_the_drive(line: LineDriver, drive: Peer) -> None:
     for _ in range(5):
         ask(line, drive)
         line.receive(reply(1)[:-1] + b"\x00")
@@ -532,7 +547,7 @@ def test_damage_is_not_silence(line: LineDriver, drive: Peer) -> None:
     assert drive.failures == 0
 
 
-def test_everything_is_counted(line: LineDriver, drive: Peer) -> None:
+def test_counters_include_every_exchange(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 5 * MS)
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
@@ -545,7 +560,7 @@ def test_everything_is_counted(line: LineDriver, drive: Peer) -> None:
     assert (counters.stray_bytes, counters.late) == (1, 0)
 
 
-# ---- reads for a client that waits: one wake-up, when the reply is whole ----
+# ---- reads for a waiting client: one wake-up, when the reply is whole ----
 
 
 FIELDS = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])
@@ -554,7 +569,7 @@ STEADY = 60 * [15 * MS]
 
 
 def looks(line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayout]) -> tuple[int, int]:
-    """Carry out an exchange as the engine does; return the reads, and the last one's lateness."""
+    """Carry out an exchange as the engine does; return the number of reads, and the last one's delay (ns)."""
     line.begin(exchange(READ, drive, **details))
     line.wait_until_write()
     left = line.now + 8 * CHARACTER
@@ -562,7 +577,7 @@ def looks(line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayou
     seen = found = 0
     while line.want != "done":
         line.wait_for_look()
-        if found and line.now < times[seen]:  # it waits for the next character
+        if found and line.now < times[seen]:  # wait for the next character
             line.now = times[seen]
         come = sum(time <= line.now for time in times)
         line.receive(reply()[seen:come])
@@ -593,18 +608,22 @@ def test_polled_replies_are_always_read_early(line: LineDriver, drive: Peer) -> 
     assert {late for _, late in found} == {0}
 
 
-def test_an_unsteady_drive_is_read_early(line: LineDriver, drive: Peer) -> None:
+def test_replies_of_an_unsteady_drive_are_read_early(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, 20 * [15 * MS, 19 * MS], BY_HAND)
     assert {late for _, late in all_looks(line, drive, 20 * [15 * MS, 19 * MS], BY_HAND)} == {0}
 
 
-def test_a_steady_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Peer) -> None:
+def test_reads_for_a_client_come_earlier_when_a_steady_drive_becomes_quicker(
+    line: LineDriver, drive: Peer
+) -> None:
     all_looks(line, drive, [*STEADY, *(120 * [5 * MS])], BY_HAND)
     assert looks(line, drive, 5 * MS, BY_HAND)[1] <= CHARACTER
     assert drive.response_delay < 6e-3
 
 
-def test_a_steady_drive_that_becomes_slower_is_followed(line: LineDriver, drive: Peer) -> None:
+def test_reads_for_a_client_come_later_when_a_steady_drive_becomes_slower(
+    line: LineDriver, drive: Peer
+) -> None:
     found = all_looks(line, drive, [*STEADY, *(120 * [18 * MS])], BY_HAND)
     assert max(late for _, late in found) <= CHARACTER
     assert drive.response_delay > 17.5e-3

@@ -1,4 +1,4 @@
-"""One line's state machine, on a clock that the test sets: silence, request, reply or time-out."""
+"""One line's state machine, on a clock that the test sets: silence, request, reply or timeout."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CHARACTER = 1 * MS  # a round number: requests of 8 characters take 8 ms
 SILENCE = 4 * MS
 TIMEOUT = 100 * MS
 TURNAROUND = 200 * MS
-ETIMEDOUT = 138 if sys.platform == "win32" else errno.ETIMEDOUT  # C's number; Python has Winsock's there
+ETIMEDOUT = 138 if sys.platform == "win32" else errno.ETIMEDOUT  # C's number, not Winsock's
 
 READ = Message(1, 0x03, 0, 1)
 READ_TWO = Message(1, 0x03, 0, 2)
@@ -65,7 +65,7 @@ def line() -> LineDriver:
 
 
 def ask(line: LineDriver, request: Message = READ) -> None:
-    """Send the request; the clock is then at its first bit."""
+    """Send the request. Afterwards the clock is at the request's first bit."""
     line.begin(exchange(request))
     line.wait_until_write()
 
@@ -79,21 +79,21 @@ def answer(line: LineDriver, received: bytes, piece: int = 4096) -> None:
 
 
 def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
-    """The port held the thread up when it took the request, which may have left long before."""
+    """The port blocked the thread while it took the request, which may have been sent long before."""
     line.begin(exchange(READ))
     while line.want != "write":
         line.now = max(line.now, line.wake)
     begun = line.now
     line.take(held_up=10 * MS)
-    line.receive(reply_of(7))  # it was there when the thread went on
+    line.receive(reply_of(7))  # it had come when the thread continued
     assert line.want == "done"
     assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
 
 
-def test_a_port_faster_than_its_settings_does_not_date_first_characters(
+def test_on_a_port_faster_than_its_settings_the_first_byte_has_its_read_time(
     line: LineDriver,
 ) -> None:
-    """A pseudo-terminal's replies come at once: its drive may have made the value just before."""
+    """A pseudo-terminal's replies come whole: its drive may have read the value just before."""
     ask(line)
     line.now += 1 * MS
     answer(line, reply_of(7))
@@ -105,7 +105,7 @@ def test_a_port_faster_than_its_settings_does_not_date_first_characters(
     assert (line.completion.first_ns, line.completion.last_ns) == (came, came)
 
 
-def test_a_request_that_may_have_left_late_has_its_whole_time_out(line: LineDriver) -> None:
+def test_the_timeout_starts_after_a_write_that_was_held_up(line: LineDriver) -> None:
     line.begin(exchange(READ))
     while line.want != "write":
         line.now = max(line.now, line.wake)
@@ -115,7 +115,7 @@ def test_a_request_that_may_have_left_late_has_its_whole_time_out(line: LineDriv
     assert line.now == left + TIMEOUT + 7 * CHARACTER
 
 
-def test_no_request_before_the_silence_is_over(line: LineDriver) -> None:
+def test_no_request_is_sent_before_the_silence_is_over(line: LineDriver) -> None:
     opened = line.now
     line.begin(exchange(READ))
     for now in (opened, opened + SILENCE // 2, opened + SILENCE - 1):
@@ -123,11 +123,11 @@ def test_no_request_before_the_silence_is_over(line: LineDriver) -> None:
         assert line.listens
         assert line.wake == opened + SILENCE
     line.now = opened + SILENCE
-    assert [line.want, line.want] == ["read", "write"]  # one look for bytes that came meanwhile
+    assert [line.want, line.want] == ["read", "write"]  # one read, in case bytes came meanwhile
 
 
 @pytest.mark.parametrize(("before", "after"), [(4, 10), (10, 4), (7, 7)])
-def test_silence_is_the_longer_of_after_one_and_before_the_next(
+def test_silence_is_the_longer_one_of_the_previous_and_the_next_exchange(
     line: LineDriver, before: int, after: int
 ) -> None:
     line.begin(exchange(READ, silence=before * MS))
@@ -161,8 +161,8 @@ def test_bytes_found_in_the_last_read_restart_the_silence(line: LineDriver) -> N
     assert line.wake == line.now + SILENCE
 
 
-def test_babbling_line_does_not_hold_a_request_up_for_ever(line: LineDriver) -> None:
-    """After a time-out's length it is sent all the same: it may be a stop, and the noise only ours."""
+def test_a_request_is_sent_after_a_timeout_even_if_the_line_is_never_silent(line: LineDriver) -> None:
+    """The request may be a stop, and maybe the noise is only in this computer's adapter."""
     opened = line.now
     line.begin(exchange(READ))
     reads = 0
@@ -177,7 +177,7 @@ def test_babbling_line_does_not_hold_a_request_up_for_ever(line: LineDriver) -> 
     assert (line.completion.reply.data, line.completion.stale) == (words(7), reads)
 
 
-def test_flooded_line_is_given_up_even_if_the_clock_stops(line: LineDriver) -> None:
+def test_a_request_is_sent_after_the_timeout_even_if_the_flood_continues(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE + TIMEOUT
     for _ in range(3):
@@ -188,7 +188,7 @@ def test_flooded_line_is_given_up_even_if_the_clock_stops(line: LineDriver) -> N
 
 
 def test_a_flood_on_an_idle_line_belongs_to_no_exchange(line: LineDriver) -> None:
-    """Also before the first exchange."""
+    """This also holds before the first exchange."""
     for value in range(3):
         line.receive(b"\xff" * 4000)
         ask(line)
@@ -196,8 +196,8 @@ def test_a_flood_on_an_idle_line_belongs_to_no_exchange(line: LineDriver) -> Non
         assert (line.completion.reply.data, line.completion.skipped) == (words(value), 0)
 
 
-def test_request_counts_to_its_last_bit(line: LineDriver) -> None:
-    """A reply that a fast peer gives at once does not shorten the silence after the request's own time."""
+def test_silence_starts_after_the_requests_last_bit(line: LineDriver) -> None:
+    """A reply that comes before the request's own time is over does not shorten the silence."""
     ask(line)
     sent = line.now
     answer(line, reply_of(1))
@@ -209,7 +209,7 @@ def test_request_counts_to_its_last_bit(line: LineDriver) -> None:
 # ---- sending ----
 
 
-def test_port_that_takes_a_few_bytes_at_a_time(line: LineDriver) -> None:
+def test_a_request_is_sent_in_parts_if_the_port_takes_a_few_bytes_at_a_time(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -225,7 +225,7 @@ def test_port_that_takes_a_few_bytes_at_a_time(line: LineDriver) -> None:
     assert line.completion.sent_ns == sent
 
 
-def test_port_that_takes_no_bytes_is_lost(line: LineDriver) -> None:
+def test_a_port_that_takes_no_bytes_is_lost(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -238,7 +238,7 @@ def test_port_that_takes_no_bytes_is_lost(line: LineDriver) -> None:
     assert (found.result, found.error, found.sent_ns) == (Failure.LINE_LOST, ETIMEDOUT, 0)
 
 
-def test_noise_before_the_first_byte_leaves_restarts_the_silence(line: LineDriver) -> None:
+def test_noise_before_the_requests_first_byte_restarts_the_silence(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -250,9 +250,9 @@ def test_noise_before_the_first_byte_leaves_restarts_the_silence(line: LineDrive
 
 
 @pytest.mark.parametrize("taken", [0, 3])
-def test_bytes_before_the_request_has_left_are_not_its_reply(line: LineDriver, taken: int) -> None:
+def test_bytes_received_before_the_request_is_sent_are_not_its_reply(line: LineDriver, taken: int) -> None:
     line.begin(exchange(READ))
-    line.now += SILENCE + TIMEOUT  # a babbling line is written to all the same
+    line.now += SILENCE + TIMEOUT  # the request is sent although the line was never silent
     assert [line.want, line.want] == ["read", "write"]
     line.take(taken)
     line.receive(reply_of(1111))
@@ -263,7 +263,7 @@ def test_bytes_before_the_request_has_left_are_not_its_reply(line: LineDriver, t
 
 
 @pytest.mark.parametrize("step", ["silent", "listening"])
-def test_port_that_fails(line: LineDriver, step: str) -> None:
+def test_a_failed_port_ends_the_exchange_as_line_lost(line: LineDriver, step: str) -> None:
     line.begin(exchange(READ))
     if step == "listening":
         line.wait_until_write()
@@ -273,7 +273,7 @@ def test_port_that_fails(line: LineDriver, step: str) -> None:
     found = line.completion
     assert (found.result, found.error) == (Failure.LINE_LOST, errno.EIO)
     assert found.raw == (b"\x01\x03" if step == "listening" else b"")
-    line.lose(errno.ENODEV)  # nothing is under way: nothing to end
+    line.lose(errno.ENODEV)  # no exchange is in flight, so none ends
     assert line.completion.error == errno.EIO
 
 
@@ -281,7 +281,7 @@ def test_port_that_fails(line: LineDriver, step: str) -> None:
 
 
 @pytest.mark.parametrize("piece", [7, 3, 1])
-def test_reply_in_pieces(line: LineDriver, piece: int) -> None:
+def test_a_reply_is_found_if_it_comes_in_pieces(line: LineDriver, piece: int) -> None:
     ask(line)
     sent = line.now
     frame = reply_of(5000)
@@ -294,13 +294,13 @@ def test_reply_in_pieces(line: LineDriver, piece: int) -> None:
     found = line.completion
     assert (found.result, found.raw, found.reply.data) == (7, frame, words(5000))
     last = sent + 15 * MS + (len(frame) - 1) // piece * MS
-    # What comes in one piece took its characters' time all the same.
+    # Bytes that come in one piece took the time of their characters too.
     assert found.first_ns == min(sent + 15 * MS, last - (len(frame) - 1) * CHARACTER)
     assert (found.sent_ns, found.last_ns) == (sent, last)
     assert (found.stale, found.skipped) == (0, 0)
 
 
-def test_exception_ends_the_exchange_at_once(line: LineDriver) -> None:
+def test_an_exception_ends_the_exchange_immediately(line: LineDriver) -> None:
     ask(line)
     line.receive(rtu("01 83 02"))
     assert line.want == "done"
@@ -313,7 +313,10 @@ def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_repl
     assert line.listens
     assert line.wake == sent + 8 * CHARACTER + TIMEOUT + 7 * CHARACTER
     line.now = line.wake
-    assert [line.want, line.want] == ["read", "done"]  # a last look: the host may be late, not the drive
+    assert [line.want, line.want] == [
+        "read",
+        "done",
+    ]  # a last read: the host may be late
     found = line.completion
     assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 
@@ -347,7 +350,7 @@ def test_frame_from_another_address_does_not_end_the_exchange(line: LineDriver) 
     assert (line.completion.reply.data, line.completion.skipped) == (words(8), 7)
 
 
-def test_damaged_reply_and_then_the_right_one(line: LineDriver) -> None:
+def test_a_good_reply_is_found_after_a_damaged_one(line: LineDriver) -> None:
     ask(line)
     line.receive(reply_of(9)[:-1] + b"\x00")
     assert line.listens
@@ -380,7 +383,7 @@ def test_the_result_at_the_timeout_gives_the_reason(
     ask(line, READ_TWO)
     sent = line.now
     answer(line, received, piece)
-    assert line.now == sent + (8 + 9) * CHARACTER + TIMEOUT  # never before the time-out
+    assert line.now == sent + (8 + 9) * CHARACTER + TIMEOUT  # never before the timeout
     found = line.completion
     assert (found.result, found.raw, found.skipped) == (reason, received, len(received))
     assert found.reply == Message(0, 0)
@@ -405,7 +408,7 @@ def test_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None
     assert (found.reply.data, found.stale, found.skipped) == (words(2222), 7, 0)
 
 
-def test_doubled_reply_is_not_the_next_ones(line: LineDriver) -> None:
+def test_a_second_copy_of_a_reply_is_not_the_next_exchanges_reply(line: LineDriver) -> None:
     ask(line)
     answer(line, reply_of(1111))
     line.begin(exchange(READ))
@@ -416,7 +419,7 @@ def test_doubled_reply_is_not_the_next_ones(line: LineDriver) -> None:
     assert (line.completion.reply.data, line.completion.stale) == (words(2222), 7)
 
 
-def test_bytes_behind_the_reply_are_counted(line: LineDriver) -> None:
+def test_bytes_after_the_reply_are_counted(line: LineDriver) -> None:
     ask(line)
     answer(line, reply_of(1) + reply_of(1) + bytes(2000))
     assert (line.completion.raw, line.completion.skipped) == (reply_of(1), 2007)
@@ -424,7 +427,7 @@ def test_bytes_behind_the_reply_are_counted(line: LineDriver) -> None:
 
 @pytest.mark.parametrize("piece", [4096, 100, 1])
 @pytest.mark.parametrize("seed", range(3))
-def test_reply_behind_4096_bytes_of_noise(line: LineDriver, seed: int, piece: int) -> None:
+def test_a_reply_is_found_after_4096_bytes_of_noise(line: LineDriver, seed: int, piece: int) -> None:
     noise = random.Random(seed).randbytes(4096)
     ask(line)
     answer(line, noise + reply_of(77), piece)
@@ -433,7 +436,7 @@ def test_reply_behind_4096_bytes_of_noise(line: LineDriver, seed: int, piece: in
 
 
 @pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
-def test_endless_garbage_is_searched_again_within_a_frame_s_length(line: LineDriver, received: bytes) -> None:
+def test_in_endless_garbage_less_than_a_frame_is_searched_again(line: LineDriver, received: bytes) -> None:
     ask(line, Message(1, 0x03, 0, 125))
     garbage = received * 20_000
     for at in range(0, len(garbage), 64):
@@ -461,13 +464,13 @@ def test_noise_does_not_shorten_the_turnaround_delay(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
     line.now += MS
-    line.receive(b"\xff")  # while the broadcast is still leaving
+    line.receive(b"\xff")  # while the broadcast is still being sent
     line.begin(exchange(READ))
     line.wait_until_write()
     assert line.now == sent + 8 * CHARACTER + TURNAROUND
 
 
-def test_exchange_that_fails_unsent_does_not_cancel_the_turnaround_delay(line: LineDriver) -> None:
+def test_a_failed_unsent_exchange_does_not_cancel_the_turnaround_delay(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
     line.begin(exchange(READ))
@@ -487,8 +490,8 @@ def teach_echo(line: LineDriver) -> None:
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
-def test_the_reply_behind_another_masters_read_is_not_ours(line: LineDriver, piece: int) -> None:
-    """Both ask the same drive: its first reply then probably answers the other master."""
+def test_a_reply_after_another_masters_read_is_not_accepted(line: LineDriver, piece: int) -> None:
+    """Both masters read the same drive: its first reply is probably to the other master."""
     ask(line)
     line.receive(rtu("01 03 00 40 00 01") + reply_of(0x1234), piece)
     assert line.listens
@@ -501,7 +504,9 @@ def test_the_reply_behind_another_masters_read_is_not_ours(line: LineDriver, pie
 
 
 @pytest.mark.parametrize("before", ["02 03 00 40 00 01", "01 04 00 40 00 01", "01 06 00 40 00 01"])
-def test_the_reply_behind_another_masters_other_request_is_ours(line: LineDriver, before: str) -> None:
+def test_a_reply_after_another_masters_write_or_other_request_is_accepted(
+    line: LineDriver, before: str
+) -> None:
     ask(line)
     answer(line, rtu(before) + reply_of(7))
     assert line.completion.reply.data == words(7)
@@ -523,21 +528,21 @@ def test_echo_of_a_write_is_not_its_confirmation(line: LineDriver, piece: int) -
     assert (line.completion.result, line.completion.skipped) == (8, 8)
 
 
-def test_dead_drive_behind_an_echo_confirms_nothing(line: LineDriver) -> None:
+def test_an_echo_without_a_reply_does_not_confirm_a_write(line: LineDriver) -> None:
     teach_echo(line)
     ask(line, WRITE)
     answer(line, confirmation())
     assert (line.completion.result, line.completion.reply) == (Failure.NO_REPLY, Message(0, 0))
 
 
-def test_refusal_behind_the_echo_of_a_write(line: LineDriver) -> None:
+def test_an_exception_is_found_after_the_echo_of_a_write(line: LineDriver) -> None:
     teach_echo(line)
     ask(line, WRITE)
     answer(line, confirmation() + rtu("01 86 02"))
     assert (line.completion.result, line.completion.reply) == (5, Message(1, 0x06, exception=2))
 
 
-def test_echo_that_comes_while_the_port_still_takes_the_request(line: LineDriver) -> None:
+def test_an_echo_that_starts_before_the_request_is_sent_is_recognised(line: LineDriver) -> None:
     teach_echo(line)
     line.begin(exchange(WRITE))
     while line.want != "write":
@@ -549,7 +554,7 @@ def test_echo_that_comes_while_the_port_still_takes_the_request(line: LineDriver
     assert (line.completion.result, line.completion.stale, line.completion.skipped) == (8, 0, 8)
 
 
-def test_echo_behind_a_stray_byte(line: LineDriver) -> None:
+def test_an_echo_is_recognised_after_a_stray_byte(line: LineDriver) -> None:
     teach_echo(line)
     ask(line, WRITE)
     line.receive(b"\x00" + confirmation())
@@ -569,7 +574,7 @@ DAMAGED_ECHOES = {
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("echo", DAMAGED_ECHOES)
 def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str, piece: int) -> None:
-    """Nor does what comes then: it may be the echo, and what came before it noise. It can be read back."""
+    """Nor does a copy after it: that may be the echo, after noise. The register can be read back."""
     teach_echo(line)
     ask(line, WRITE)
     line.receive(DAMAGED_ECHOES[echo] + confirmation(), piece)
@@ -583,7 +588,7 @@ def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str,
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("cut", [(0, 5), (3, 8), (0, 1), (7, 8)])
-def test_a_reply_behind_a_damaged_echo_is_read(line: LineDriver, cut: tuple[int, int], piece: int) -> None:
+def test_a_reply_is_found_after_a_damaged_echo(line: LineDriver, cut: tuple[int, int], piece: int) -> None:
     teach_echo(line)
     ask(line)
     echo = rtu("01 03 00 00 00 01")[slice(*cut)]
@@ -594,8 +599,8 @@ def test_a_reply_behind_a_damaged_echo_is_read(line: LineDriver, cut: tuple[int,
     assert line.completion.result == Failure.NO_REPLY
 
 
-def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
-    """Not at once: one echo may have been lost."""
+def test_after_two_replies_without_echo_a_confirmation_is_accepted_again(line: LineDriver) -> None:
+    """One reply without echo is not enough: the echo may have been lost."""
     teach_echo(line)
     ask(line)
     answer(line, reply_of(1))
@@ -612,7 +617,7 @@ def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> None:
-    """Seven of its eight bytes are a good reply with one register."""
+    """The first seven of the echo's eight bytes are a good reply with one register."""
     echo = rtu("06 03 02 11 00 01")
     assert echo[:7] == rtu("06 03 02 11 00")
     ask(line, Message(6, 3, 0x0211, 1))
@@ -620,7 +625,7 @@ def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> No
     assert (line.completion.reply.data, line.completion.skipped) == (words(7), 8)
 
 
-def test_the_first_confirmation_is_believed_until_an_echo_shows(
+def test_confirmations_are_accepted_until_an_echo_is_found(
     line: LineDriver,
 ) -> None:
     line.set_echo(lib.MD_NO_ECHO)
@@ -628,7 +633,7 @@ def test_the_first_confirmation_is_believed_until_an_echo_shows(
         ask(line, WRITE)
         answer(line, confirmation())
         assert (line.completion.result, line.completion.skipped) == (8, 0)
-    teach_echo(line)  # who said that there is none was mistaken
+    teach_echo(line)  # an echo is found although "no echo" was configured
     ask(line, WRITE)
     answer(line, confirmation())
     assert line.completion.result == Failure.NO_REPLY
@@ -638,7 +643,7 @@ def test_a_configured_echo_is_never_unlearnt(line: LineDriver) -> None:
     line.set_echo(lib.MD_ECHO)
     for _ in range(3):
         ask(line)
-        answer(line, reply_of(1))  # its echo was lost
+        answer(line, reply_of(1))  # the request's echo was lost
         assert line.completion.result == 7
     ask(line, WRITE)
     answer(line, confirmation())
@@ -655,12 +660,12 @@ def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: 
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
-def test_a_possible_echo_of_an_unknown_adapter_is_rejected(line: LineDriver) -> None:
+def test_a_lone_copy_is_rejected_while_it_is_unknown_whether_the_adapter_echoes(line: LineDriver) -> None:
     ask(line, WRITE)
     answer(line, confirmation())
     assert (line.completion.result, line.completion.raw) == (Failure.MAYBE_ECHO, confirmation())
     ask(line, WRITE)
-    answer(line, confirmation() + confirmation())  # it was
+    answer(line, confirmation() + confirmation())  # an echo before a confirmation: it was an echo
     assert (line.completion.result, line.completion.skipped) == (8, 8)
     ask(line, WRITE)
     answer(line, confirmation())
@@ -677,7 +682,7 @@ def test_a_reply_without_an_echo_shows_that_the_adapter_does_not_echo(line: Line
 
 @pytest.mark.parametrize(("stray", "told"), [(1, True), (3, True), (4, False), (8, False)])
 def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: int, told: bool) -> None:
-    """A drive's driver that brings a zero before every reply costs no confirmation."""
+    """A stray zero before every reply, from a line driver, loses no confirmation."""
     ask(line)
     answer(line, bytes(stray) + reply_of(1))
     assert line.completion.reply.data == words(1)
@@ -687,7 +692,7 @@ def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: i
 
 
 def test_an_echo_without_a_reply_shows_the_echo(line: LineDriver) -> None:
-    """No reply to a read is a copy of its request: the drive is dead."""
+    """A reply to a read is never a copy of its request, so the drive is dead."""
     ask(line)
     answer(line, rtu("01 03 00 00 00 01"))
     ask(line, WRITE)
@@ -695,8 +700,8 @@ def test_an_echo_without_a_reply_shows_the_echo(line: LineDriver) -> None:
     assert line.completion.result == Failure.NO_REPLY
 
 
-def test_delixi_s_query_of_a_zero_behind_its_echo(line: LineDriver) -> None:
-    """Its echo is a reply that says 0; the state query, which has no such answer, tells of the echo."""
+def test_a_delixi_value_of_0_is_found_after_the_echo_of_its_query(line: LineDriver) -> None:
+    """A query's echo looks like a reply of 0. The state query has no such reply, so it shows the echo."""
     state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"
     value, ask_value = b":010701F40000138898\r\n", b":010701F400000000FD\r\n"
     line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
@@ -711,11 +716,11 @@ def test_delixi_s_query_of_a_zero_behind_its_echo(line: LineDriver) -> None:
 
 
 QUERY = Message(1, 0x07, 500, data=bytes(4))
-ECHO = build_request(Framing.DELIXI, QUERY)  # as a reply it says 0
+ECHO = build_request(Framing.DELIXI, QUERY)  # as a reply it means the value 0
 
 
 def query(line: LineDriver) -> None:
-    """Ask a Delixi drive for a parameter; first for its state, whose reply shows that there is no echo."""
+    """Query a Delixi drive's state, whose reply shows that there is no echo, and then a parameter."""
     line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
     line.wait_until_write()
     answer(line, b":010300030000000007\r\n")
@@ -737,7 +742,7 @@ def test_the_first_echo_of_a_line_without_echo_is_not_a_value_of_0(
     assert line.echo == lib.MD_ECHO
 
 
-def test_a_value_of_0_is_taken_when_no_reply_comes_behind_it(line: LineDriver) -> None:
+def test_a_value_of_0_is_accepted_when_no_other_reply_follows(line: LineDriver) -> None:
     query(line)
     line.now += 40 * MS
     line.receive(ECHO)
@@ -759,7 +764,7 @@ def steady() -> Peer:
 
 
 def send_query(line: LineDriver, peer: Peer, *, insists: bool = False) -> int:
-    """Ask a Delixi drive for a parameter; return when the request's last character has left."""
+    """Query a parameter of a Delixi drive; return the time at which the request's last character is sent."""
     line.begin(
         Exchange(
             Framing.DELIXI,
@@ -777,13 +782,13 @@ def send_query(line: LineDriver, peer: Peer, *, insists: bool = False) -> int:
 
 
 def make_steady(line: LineDriver, peer: Peer) -> None:
-    """Let a drive answer often enough for its response delay to be well known."""
+    """Let a drive answer so often that its response delay is well known."""
     for _ in range(10):
         receive_at_pace(line, send_query(line, peer) + DELAY, VALUE)
 
 
 def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
-    """Give the line the characters that have arrived at each read, until the exchange is over."""
+    """Pass to the line the characters that have arrived by each read, until the exchange ends."""
     came = 0
     while (want := line.want) != "done":
         there = min(max(0, (line.now - begin) // CHARACTER), len(frame))
@@ -799,7 +804,7 @@ def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
 
 
 def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver, steady: Peer) -> None:
-    """An echo would have been whole before the last character of the reply came."""
+    """An echo would have been whole before the reply's last character came."""
     make_steady(line, steady)
     for _ in range(5):
         end = send_query(line, steady)
@@ -812,7 +817,7 @@ def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver
 def test_a_copy_that_may_be_an_echo_waits_for_the_whole_time_out(
     line: LineDriver, steady: Peer, insists: bool
 ) -> None:
-    """It was whole before a paced reply can be; and a stop's read believes no times."""
+    """The copy was whole earlier than a reply can be, or it is the read of a stop, which ignores times."""
     make_steady(line, steady)
     end = send_query(line, steady, insists=insists)
     if insists:
@@ -836,7 +841,7 @@ def test_the_first_echo_on_a_steady_drive_s_line_is_not_a_value_of_0(
     assert line.echo == lib.MD_ECHO
 
 
-def test_a_value_of_0_that_comes_twice_leaves_the_echo_open(line: LineDriver) -> None:
+def test_after_two_copies_of_a_value_of_0_it_is_unknown_whether_the_adapter_echoes(line: LineDriver) -> None:
     query(line)
     answer(line, ECHO + ECHO)
     assert line.completion.reply.data == bytes(4)

@@ -1,4 +1,4 @@
-"""The table of a line's states: its content, the line's use of it, and its picture."""
+"""The transition table of a line: its content, its use by random exchanges, and its diagram in the docs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from multidrop.core import Exchange, Framing, Message, Peer, build_reply
 
 DRAWING = Path(__file__).parents[2] / "docs" / "diagrams" / "line_states.py"
 READ, WRITE, BROADCAST = Message(1, 3, 0, 2), Message(1, 6, 2, data=words(7)), Message(0, 6, 2, data=words(7))
-MOST_EVENTS = 2  # of one call: the last bit of a broadcast leaves, and it is over
+MOST_EVENTS = 2  # most events of one call: a broadcast is sent, and it ends
 
 
 def numbers(kind: str) -> dict[str, int]:
-    """Return an enum of the core, without the one that counts the others."""
+    """Return the members of a C enum by name, without the last one, which is their number."""
     elements = ffi.typeof(f"enum {kind}").relements
     return {name: number for name, number in elements.items() if number < len(elements) - 1}
 
@@ -47,17 +47,17 @@ def reachable(begin: int) -> set[int]:
     return found
 
 
-def test_every_state_leads_to_every_other() -> None:
+def test_every_state_can_be_reached_from_every_state() -> None:
     for state in STATES.values():
         assert reachable(state) == set(STATES.values())
 
 
-def test_every_event_happens_somewhere_and_none_leads_out_of_the_table() -> None:
+def test_every_event_is_in_the_table_and_leads_to_a_known_state() -> None:
     assert {event for _, event in TABLE} == set(EVENTS.values())
     assert set(TABLE.values()) <= set(STATES.values())
 
 
-def test_an_exchange_can_end_in_every_state_that_has_one() -> None:
+def test_an_exchange_can_end_in_every_state_except_idle() -> None:
     ending = {state for state, event in TABLE if event == EVENTS["MD_ENDED"]}
     assert ending == set(STATES.values()) - {STATES["MD_IDLE"]}
     assert all(TABLE[state, EVENTS["MD_ENDED"]] == STATES["MD_IDLE"] for state in ending)
@@ -71,15 +71,19 @@ def test_the_request_is_written_only_after_a_check_for_silence() -> None:
 
 
 class Walk:
-    """A real line on which anything happens in any order."""
+    """A line of the core on which random events happen in random order."""
 
     def __init__(self, seed: int) -> None:
         self.chance = random.Random(seed)
         self.line = LineDriver()
         self.peer = Peer(least_timeout=0.02, most_timeout=0.3)
-        self.rest = b""  # of the reply
+        self.rest = b""  # the rest of the reply
         often = [self.begin, self.want, self.want, self.take, self.answer, self.wait]
-        self.steps = [*often * (1 + seed % 2 * 9), self.noise, self.abandon]  # every other line is a calm one
+        self.steps = [
+            *often * (1 + seed % 2 * 9),
+            self.noise,
+            self.abandon,
+        ]  # every second line is calm
 
     def run(self, steps: int) -> Iterator[tuple[int, int]]:
         """Yield the state before and after each step."""
@@ -110,7 +114,7 @@ class Walk:
         self.line.receive(bytes(self.chance.choices(range(256), k=self.chance.choice([1, 9, 600]))))
 
     def answer(self) -> None:
-        """Answer in one piece or in two; the second piece may come late or never."""
+        """Reply in one piece or in two. The second piece may come late or never."""
         self.rest = self.rest or build_reply(Framing.RTU, Message(1, 3, data=words(1, 2)))
         piece = self.chance.choice([3, len(self.rest)])
         self.line.receive(self.rest[:piece])
@@ -127,7 +131,7 @@ class Walk:
 
 @pytest.mark.slow
 @table("seed", range(5))
-def test_no_walk_leaves_the_table(seed: int) -> None:
+def test_random_events_cause_only_transitions_of_the_table(seed: int) -> None:
     ways = {state: {state} | after({state}) for state in STATES.values()}
     for _ in range(MOST_EVENTS - 1):
         ways = {state: reach | after(reach) for state, reach in ways.items()}
@@ -136,11 +140,11 @@ def test_no_walk_leaves_the_table(seed: int) -> None:
 
 
 @pytest.mark.long
-def test_walks_take_every_way_in_the_table() -> None:
+def test_random_events_cause_every_transition_of_the_table() -> None:
     seen = {pair for seed in range(10) for pair in Walk(seed).run(4000)}
     assert {(state, following) for (state, _), following in TABLE.items()} <= seen
 
 
-def test_the_picture_is_that_of_the_table() -> None:
+def test_the_documented_state_diagram_equals_the_table() -> None:
     drawing = runpy.run_path(str(DRAWING))
     assert drawing["PICTURE"].read_text() == drawing["picture"]()

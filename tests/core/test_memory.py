@@ -60,7 +60,7 @@ def test_a_struct_lives_as_long_as_its_owner() -> None:
 
 
 @pytest.mark.slow
-def test_threads_get_memory_of_their_own() -> None:
+def test_threads_get_separate_memory() -> None:
     with ThreadPoolExecutor(8) as threads:
         made = list(threads.map(new_drive, range(4000)))
     places = sorted(map(place, made))
@@ -69,7 +69,7 @@ def test_threads_get_memory_of_their_own() -> None:
 
 
 def test_a_signal_handler_gets_separate_memory() -> None:
-    """A signal's handler may stop a motor, in the midst of this."""
+    """The handler may stop a motor while the interrupted code allocates memory."""
     before = new_drive(1)
     with memory._chunks._lock:
         made = new_drive(2)
@@ -91,8 +91,8 @@ def last_line(struct: str, *fields: str) -> int:
     return -(-end // CACHE_LINE)
 
 
-def test_the_fields_of_every_exchange_are_in_few_cache_lines() -> None:
-    """Two of its drive and two of itself; one of a drive that is to be asked next."""
+def test_the_fields_that_every_exchange_uses_are_in_few_cache_lines() -> None:
+    """Two of the drive and two of the exchange; one of the drive whose exchange is next."""
     assert last_line("md_drive", "most_timeout_ns", "ready_ns", "failures", "owed_count", "is_doubted") == 1
     assert last_line("md_drive", "counters", "answered_ns") == 2
     assert last_line("md_exchange", "values", "period_ns", "insists", "frame") == 2
@@ -100,7 +100,7 @@ def test_the_fields_of_every_exchange_are_in_few_cache_lines() -> None:
 
 
 def test_polled_exchanges_of_a_drive_are_adjacent() -> None:
-    """Proofs, and reads outside of a poll, are elsewhere."""
+    """Proofs, and reads outside of a poll, are in other memory."""
     peer = Peer(least_timeout=0.02, most_timeout=1.0)
     peer.prove_by([read_of(peer, None), read_of(peer, None)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])

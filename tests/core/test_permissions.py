@@ -38,7 +38,7 @@ def now_ns() -> int:
 
 @contextmanager
 def keeper(guard_s: float, seconds: float, then: str = "pass") -> Iterator[subprocess.Popen[str]]:
-    """A process with a mastership of so many seconds; its first line is the deadline."""
+    """Yield a process with a mastership of `seconds` s. It prints the deadline as its first line."""
     words = [sys.executable, "-c", KEEPER, str(guard_s), str(seconds), then]
     pipe = subprocess.PIPE
     with BoundProcess(words, stdin=pipe, stdout=pipe, text=True) as process:
@@ -53,13 +53,13 @@ def until_of(process: subprocess.Popen[str]) -> int:
     return int(process.stdout.readline())
 
 
-def test_a_new_permission_does_not_hold() -> None:
+def test_a_new_mastership_does_not_hold() -> None:
     mastership = Mastership()
     assert (mastership.until_ns, mastership.holds, mastership.guard_s) == (0, False, 0.7)
     assert repr(mastership) == "<Mastership not held, guard 0.7 s>"
 
 
-def test_a_permission_holds_until_its_deadline() -> None:
+def test_a_mastership_holds_until_its_deadline() -> None:
     mastership = Mastership(guard_s=100)
     until_ns = now_ns() + S // 20
     mastership.extend(until_ns)
@@ -73,7 +73,7 @@ def test_a_permission_holds_until_its_deadline() -> None:
     assert (mastership.until_ns, mastership.holds) == (0, False)
 
 
-def test_a_deadline_never_goes_backwards() -> None:
+def test_extending_to_an_earlier_time_keeps_the_deadline() -> None:
     mastership = Mastership()
     later = now_ns() + 200 * S
     mastership.extend(later)
@@ -84,7 +84,7 @@ def test_a_deadline_never_goes_backwards() -> None:
     mastership.end()
 
 
-def test_an_ended_permission_can_be_extended() -> None:
+def test_an_ended_mastership_can_be_extended() -> None:
     mastership = Mastership()
     mastership.extend(now_ns() + 200 * S)
     mastership.end()
@@ -94,7 +94,7 @@ def test_an_ended_permission_can_be_extended() -> None:
     mastership.end()
 
 
-def test_threads_that_extend_at_once_leave_the_latest_deadline() -> None:
+def test_concurrent_extensions_keep_the_latest_deadline() -> None:
     mastership = Mastership()
     first = now_ns() + 200 * S
     offers = [[first + 8 * n + thread for n in range(500)] for thread in range(8)]
@@ -110,7 +110,7 @@ def test_threads_that_extend_at_once_leave_the_latest_deadline() -> None:
 
 
 def test_a_past_deadline_raises_and_arms_no_timer() -> None:
-    """A timer that is set to the past kills at once."""
+    """A kernel timer that is set to a past time would kill the process immediately."""
     mastership = Mastership(guard_s=1e-6)
     with pytest.raises(ValueError, match=r"^until_ns = \d+ is past by 1\.\d+ s of CLOCK_BOOTTIME: "):
         mastership.extend(now_ns() - S)
@@ -122,23 +122,23 @@ def test_a_past_deadline_raises_and_arms_no_timer() -> None:
 
 
 @table("wrong", [1.5, "now", None, True])
-def test_a_deadline_is_a_whole_number(wrong: object) -> None:
+def test_a_deadline_that_is_not_a_whole_number_raises(wrong: object) -> None:
     with pytest.raises(TypeError, match=r"^until_ns is a whole number of ns of CLOCK_BOOTTIME, not "):
         Mastership().extend(wrong)  # type: ignore[arg-type]
 
 
-def test_a_deadline_beyond_all_time_is_refused() -> None:
+def test_a_deadline_beyond_the_range_of_the_clock_raises() -> None:
     with pytest.raises(ValueError, match="is beyond"):
         Mastership().extend(1 << 63)
 
 
 @table("wrong", [0, -1, float("nan"), float("inf"), 3601])
-def test_a_guard_is_a_time(wrong: float) -> None:
+def test_a_guard_out_of_range_raises(wrong: float) -> None:
     with pytest.raises(ValueError, match=r"^guard_s = .* must be above 0 and at most 3600, in s$"):
         Mastership(wrong)
 
 
-def test_a_guard_is_a_number() -> None:
+def test_a_guard_that_is_not_a_number_raises() -> None:
     with pytest.raises(TypeError, match=r"^guard_s is a number of seconds, not '1'$"):
         Mastership("1")  # type: ignore[arg-type]
 
@@ -157,7 +157,7 @@ def test_a_process_that_extends_in_time_lives() -> None:
     then = (
         "for n in range(40):\n"
         " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"
-        "time.sleep(1.5)"  # the first deadline and its guard are over
+        "time.sleep(1.5)"  # longer than the first deadline plus guard time
     )
     with keeper(1.0, 0.3, then) as process:
         assert until_of(process)
@@ -168,7 +168,7 @@ def test_a_process_that_extends_in_time_lives() -> None:
 @pytest.mark.parametrize(
     "end", ["mastership.end()", "del mastership; import gc; gc.collect(); mastership = Mastership()"]
 )
-def test_a_process_that_ended_it_is_not_killed(end: str) -> None:
+def test_a_process_that_ended_its_mastership_is_not_killed(end: str) -> None:
     with keeper(1.0, 0.2, f"{end}; time.sleep(1.5)") as process:
         assert until_of(process) == 0
         assert process.poll() is None
@@ -180,7 +180,7 @@ def test_a_forked_child_is_not_master() -> None:
     if (child := os.fork()) == 0:
         found = 1
         try:
-            mastership.end()  # it does not call the parent's timer off
+            mastership.end()  # this does not disarm the parent's timer
             mastership.extend(now_ns() + 200 * S)
         except ValueError as refusal:
             held = mastership.holds or mastership.until_ns

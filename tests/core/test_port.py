@@ -32,7 +32,7 @@ def refused(fd: int, baudrate: int, format: str) -> set[str]:
 
 
 @pytest.mark.parametrize("baudrate", [50, 1200, 9600, 38400, 115200, 12345, 250_000, 3_000_000])
-def test_any_baud_rate(pty: int, baudrate: int) -> None:
+def test_a_port_takes_any_baud_rate(pty: int, baudrate: int) -> None:
     assert refused(pty, baudrate, "8N1") == set()
     assert get_settings(pty) == (baudrate, "8N1")
 
@@ -56,8 +56,8 @@ def test_settings_refused_by_a_pty_are_reported(
 
 
 @pytest.mark.parametrize("format", ["8E1", "7E1"])
-def test_port_is_set_again_and_again_at_the_same_settings(pty: int, format: str) -> None:
-    """tcsetattr() would fail from the second time on, because nothing of what it asks for takes effect."""
+def test_the_same_settings_can_be_set_repeatedly(pty: int, format: str) -> None:
+    """tcsetattr() would fail from the second time on, because no requested change takes effect."""
     name = os.ttyname(pty)
     first = refused(pty, 9600, format)
     for _ in range(20):
@@ -68,7 +68,7 @@ def test_port_is_set_again_and_again_at_the_same_settings(pty: int, format: str)
             os.close(again)
 
 
-def test_port_is_raw(pty: int) -> None:
+def test_a_port_is_set_to_raw_mode(pty: int) -> None:
     """No echo, no line editing, no flow control, no signals."""
     set_settings(pty, 9600, "8N1")
     iflag, oflag, cflag, lflag, *_ = termios.tcgetattr(pty)
@@ -77,7 +77,7 @@ def test_port_is_raw(pty: int) -> None:
     assert not cflag & termios.CRTSCTS
 
 
-def test_every_byte_passes() -> None:
+def test_every_byte_value_passes_unchanged() -> None:
     master, slave = os.openpty()
     try:
         set_settings(slave, 9600, "8N1")
@@ -114,7 +114,7 @@ def test_a_descriptor_without_settings_raises() -> None:
 
 @pytest.mark.slow
 def test_ports_opened_concurrently_share_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While one port starts the thread the others wait; otherwise there would be several threads."""
+    """While one port starts the thread, the other ports wait; otherwise there would be several threads."""
     started: list[str] = []
     is_second = threading.Event()
 
@@ -122,7 +122,7 @@ def test_ports_opened_concurrently_share_one_thread(monkeypatch: pytest.MonkeyPa
         started.append(f"engine {len(started)}")
         if len(started) > 1:
             is_second.set()
-        is_second.wait(0.5)  # where nothing keeps the others from starting it, one does so at once
+        is_second.wait(0.5)  # without the lock, a second port would start a thread now
         return started[0]
 
     monkeypatch.setattr(port_module, "lib", SimpleNamespace(md_engine_start=start))

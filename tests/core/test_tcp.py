@@ -1,4 +1,4 @@
-"""Modbus TCP: frames that others print and build, and exchanges on a clock that the test sets."""
+"""Modbus TCP: frames from documents and pymodbus, and exchanges on a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from multidrop.core import (
 
 TCP = Framing.TCP
 NUMBER = 400  # random frames
-EXCEPTION = 9  # bytes of one, whatever its header says
+EXCEPTION = 9  # bytes of an exception, with any length in its header
 
 # As printed: in the messaging guide for TCP/IP V1.0b, 4.4.2 (read one register of unit FF), and in a panel
 # meter's manual (write one register, and its reply).
@@ -46,14 +46,14 @@ METER = "01 00 00 00 00 09 01 10 05 15 00 01 02 00 08", "01 00 00 00 00 06 01 10
 
 
 def tcp(transaction: int, body: bytes) -> bytes:
-    """A frame, made by hand."""
+    """Return a Modbus TCP frame, built without the library."""
     return transaction.to_bytes(2) + b"\0\0" + len(body).to_bytes(2) + body
 
 
 # ---- frames ----
 
 
-def test_printed_frames_are_built_and_understood() -> None:
+def test_printed_tcp_frames_are_built_and_parsed() -> None:
     read = Message(0xFF, 3, 4, 1, transaction=0x1501)
     assert build_request(TCP, read) == bytes.fromhex(GUIDE)
     assert parse_request(TCP, bytes.fromhex(GUIDE)) == (12, read)
@@ -65,8 +65,8 @@ def test_printed_frames_are_built_and_understood() -> None:
 
 
 @pytest.mark.parametrize("replies", [False, True])
-def test_bodies_are_the_same_as_over_rtu(replies: bool) -> None:
-    """Whole ones and damaged ones; only a wrong length shows sooner, because the header has it."""
+def test_a_tcp_frame_is_parsed_like_the_rtu_frame_with_the_same_body(replies: bool) -> None:
+    """This holds for whole and damaged frames. Only a wrong length is found sooner, from the header."""
     seen = set()
     for number, said in enumerate(frames(11, Framing.RTU, NUMBER, replies=replies)):
         if said.damage in ("flipped on the line", "cut off", "followed") or len(said.frame) < 4:
@@ -95,7 +95,7 @@ def test_bodies_are_the_same_as_over_rtu(replies: bool) -> None:
 
 
 @pytest.mark.parametrize("replies", [False, True])
-def test_frames_are_pymodbus_s_byte_by_byte(replies: bool) -> None:
+def test_tcp_frames_equal_pymodbus_frames(replies: bool) -> None:
     pymodbus, chance, count = Pymodbus(TCP), Random(12), 0
     for said in frames(13, Framing.RTU, NUMBER, replies=replies):
         request = replace(said.request, transaction=chance.randrange(1 << 16))
@@ -112,7 +112,7 @@ def test_frames_are_pymodbus_s_byte_by_byte(replies: bool) -> None:
 
 
 @table("unit", [0, 1, 247, 248, 255])
-def test_every_unit_id_is_asked_and_answers(unit: int) -> None:
+def test_requests_and_replies_may_have_any_unit_id(unit: int) -> None:
     for request in (Message(unit, 3, 0, 2), Message(unit, 6, 1, data=words(2))):
         assert parse_request(TCP, build_request(TCP, request)) == (12, request)
         reply = replace(request, data=request.data or words(3, 4))
@@ -120,7 +120,7 @@ def test_every_unit_id_is_asked_and_answers(unit: int) -> None:
         assert reply_length(TCP, request) == len(build_reply(TCP, reply))
 
 
-def test_the_longest_frame_has_its_place() -> None:
+def test_the_longest_tcp_frame_is_built_and_parsed() -> None:
     request = Message(1, 3, 0, 125)
     reply = build_reply(TCP, replace(request, data=bytes(250)))
     assert len(reply) == 259
@@ -142,7 +142,7 @@ def test_the_longest_frame_has_its_place() -> None:
         ("00 00 00", FrameFault.INCOMPLETE),
     ],
 )
-def test_a_damaged_reply_is_none(damaged: str, fault: FrameFault) -> None:
+def test_a_damaged_tcp_reply_has_the_expected_fault(damaged: str, fault: FrameFault) -> None:
     assert parse_reply(TCP, bytes.fromhex(damaged), READ) == (fault, None)
 
 
@@ -164,7 +164,7 @@ def exchange(request: Message, drive: Peer) -> Exchange:
 
 
 def ask(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Send a request; its transaction id."""
+    """Send a request; return its transaction id."""
     line.begin(exchange(request, drive))
     sent = line.wait_until_write()
     assert parse_request(TCP, sent)[1] == replace(request, transaction=int.from_bytes(sent[:2]))
@@ -182,7 +182,7 @@ def miss(line: LineDriver, drive: Peer) -> int:
     return transaction
 
 
-def test_each_request_has_a_transaction_of_its_own(line: LineDriver, drive: Peer) -> None:
+def test_each_request_has_a_new_transaction_id(line: LineDriver, drive: Peer) -> None:
     seen = set()
     for raw in range(300):
         transaction = ask(line, drive)
@@ -193,7 +193,7 @@ def test_each_request_has_a_transaction_of_its_own(line: LineDriver, drive: Peer
     assert len(seen) == 300
 
 
-def test_no_silence_is_kept_and_no_wire_time_waited_for(line: LineDriver, drive: Peer) -> None:
+def test_modbus_tcp_keeps_no_silence(line: LineDriver, drive: Peer) -> None:
     for _ in range(3):
         began = line.now
         line.receive(value(ask(line, drive), 7))
@@ -209,7 +209,7 @@ def test_a_reply_may_come_in_pieces(line: LineDriver, drive: Peer, piece: int) -
 
 
 @pytest.mark.parametrize("cut", range(1, 11))
-def test_a_late_reply_that_is_cut_by_its_time_out_disturbs_nothing(
+def test_a_reply_whose_rest_comes_after_the_timeout_does_not_disturb_later_exchanges(
     line: LineDriver, drive: Peer, cut: int
 ) -> None:
     late = value(ask(line, drive), 1)
@@ -221,7 +221,7 @@ def test_a_late_reply_that_is_cut_by_its_time_out_disturbs_nothing(
     assert line.completion.reply.data == words(2)
 
 
-def test_late_doubled_and_foreign_replies_are_never_the_present_one(line: LineDriver, drive: Peer) -> None:
+def test_late_doubled_and_foreign_replies_are_never_accepted(line: LineDriver, drive: Peer) -> None:
     late = miss(line, drive)
     own = ask(line, drive)
     line.receive(value(late, 1) + value(late, 1) + value((own + 1) & 0xFFFF, 2))
@@ -236,7 +236,7 @@ def test_late_doubled_and_foreign_replies_are_never_the_present_one(line: LineDr
     assert line.completion.reply.data == words(5)
 
 
-def test_replies_in_any_order_are_their_requests_own(drive: Peer) -> None:
+def test_each_request_gets_its_own_reply_in_any_order(drive: Peer) -> None:
     for seed in range(200):
         chance, line = Random(seed), LineDriver(Transactions.MATCHED)
         missed = [miss(line, drive) for _ in range(chance.randrange(5))]
@@ -248,7 +248,7 @@ def test_replies_in_any_order_are_their_requests_own(drive: Peer) -> None:
         assert line.completion.reply.data == words(7)
 
 
-def test_a_request_leaves_at_once_though_an_answer_may_be_late(line: LineDriver, drive: Peer) -> None:
+def test_a_request_is_sent_immediately_although_a_late_reply_is_due(line: LineDriver, drive: Peer) -> None:
     for request in (READ, WRITE, WRITE):
         ask(line, drive, request)
         line.wait_until_done()
@@ -257,9 +257,9 @@ def test_a_request_leaves_at_once_though_an_answer_may_be_late(line: LineDriver,
     assert drive.late_until_ns == 0
 
 
-def test_how_late_a_reply_is_is_learnt_to_the_nanosecond(line: LineDriver, drive: Peer) -> None:
+def test_the_lateness_of_a_reply_is_learnt_to_the_nanosecond(line: LineDriver, drive: Peer) -> None:
     late = miss(line, drive)
-    sent = line.completion.sent_ns + 8 * CHARACTER  # as long as on a wire behind the gateway
+    sent = line.completion.sent_ns + 8 * CHARACTER  # the duration on the serial wire behind the gateway
     for _ in range(30):
         miss(line, drive)
     line.now = sent + 2000 * MS
@@ -270,7 +270,9 @@ def test_how_late_a_reply_is_is_learnt_to_the_nanosecond(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateway_s_exception_is_not_a_reply(line: LineDriver, drive: Peer, code: int) -> None:
+def test_a_gateways_exception_for_a_silent_drive_is_no_reply(
+    line: LineDriver, drive: Peer, code: int
+) -> None:
     for number in (1, 2):
         line.receive(tcp(ask(line, drive), bytes([1, 0x83, code])))
         assert line.want == "done"
@@ -283,9 +285,7 @@ def test_a_gateway_s_exception_is_not_a_reply(line: LineDriver, drive: Peer, cod
     assert drive.failures == 0
 
 
-def test_a_late_exception_of_a_gateway_does_not_show_that_the_drive_lives(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_a_gateways_late_exception_is_not_counted_as_a_late_reply(line: LineDriver, drive: Peer) -> None:
     late = miss(line, drive)
     line.receive(tcp(late, bytes([1, 0x83, 0x0B])))
     assert drive.failures == 1
@@ -312,11 +312,11 @@ def test_a_wrong_reply_with_the_right_id_ends_at_the_timeout(
     assert line.completion.raw == tcp(transaction, body)
 
 
-# ---- devices whose headers lie ----
+# ---- devices with wrong lengths in their headers ----
 
 
 def odd(transaction: int, body: bytes, length: int) -> bytes:
-    """A frame whose header announces another length."""
+    """Return a frame whose header states another length."""
     return transaction.to_bytes(2) + b"\0\0" + length.to_bytes(2) + body
 
 
@@ -328,7 +328,7 @@ def is_read(line: LineDriver, drive: Peer, raw: int, piece: int = 4096) -> bool:
 @pytest.mark.parametrize("piece", [1, 4096])
 @pytest.mark.parametrize("more", [b"", b"\0", b"\1\2\3"], ids=["short", "a byte more", "three bytes more"])
 @pytest.mark.parametrize("length", [0, 1, 2, 4, 6, 9, 254, 255, 0xFFFF])
-def test_an_exception_has_two_bytes_even_if_its_header_differs(
+def test_an_exception_has_two_bytes_even_if_its_header_states_another_length(
     line: LineDriver, drive: Peer, length: int, more: bytes, piece: int
 ) -> None:
     assert is_read(line, drive, 1)
@@ -340,7 +340,7 @@ def test_an_exception_has_two_bytes_even_if_its_header_differs(
 
 @pytest.mark.parametrize("piece", [1, 6, 4096])
 @pytest.mark.parametrize("length", [0, 2, 4, 6, 12, 255])
-def test_a_reply_of_another_length_than_its_header_s_ends_one_exchange(
+def test_a_reply_with_a_wrong_length_in_its_header_fails_only_its_exchange(
     line: LineDriver, drive: Peer, length: int, piece: int
 ) -> None:
     assert is_read(line, drive, 1)
@@ -354,7 +354,7 @@ def test_a_reply_of_another_length_than_its_header_s_ends_one_exchange(
 
 @pytest.mark.parametrize("missing", range(1, 10))
 @pytest.mark.parametrize("transactions", [Transactions.MATCHED, Transactions.IGNORED])
-def test_a_reply_whose_end_never_comes_ends_one_exchange(
+def test_an_incomplete_reply_fails_only_its_exchange(
     drive: Peer, missing: int, transactions: Transactions
 ) -> None:
     line = LineDriver(transactions)
@@ -368,7 +368,7 @@ def test_a_reply_whose_end_never_comes_ends_one_exchange(
     assert not line.is_out_of_step
 
 
-def test_a_frame_that_started_before_a_request_is_not_its_reply(line: LineDriver, drive: Peer) -> None:
+def test_a_frame_that_started_before_the_request_is_not_its_reply(line: LineDriver, drive: Peer) -> None:
     following = ask(line, drive) + 1
     line.receive(value(following - 1, 1))
     assert line.want == "done"
@@ -380,7 +380,9 @@ def test_a_frame_that_started_before_a_request_is_not_its_reply(line: LineDriver
     assert (line.want, line.completion.reply.data) == ("done", words(9))
 
 
-def test_a_reply_whose_end_never_comes_ends_two_exchanges_byte_by_byte(line: LineDriver, drive: Peer) -> None:
+def test_an_incomplete_reply_fails_two_exchanges_if_bytes_come_one_by_one(
+    line: LineDriver, drive: Peer
+) -> None:
     assert is_read(line, drive, 1)
     line.receive(value(ask(line, drive), 7)[:-1])
     line.wait_until_done()
@@ -391,7 +393,7 @@ def test_a_reply_whose_end_never_comes_ends_two_exchanges_byte_by_byte(line: Lin
 
 @pytest.mark.parametrize("piece", [1, 4096])
 @pytest.mark.parametrize("noise", [b"\0", b"\xff\xff", bytes(30), b"\1\3\2\0\7\xf9\x86"])
-def test_bytes_behind_good_replies_lose_neither_a_reply_nor_the_connection(
+def test_noise_after_good_replies_loses_neither_a_reply_nor_the_connection(
     line: LineDriver, drive: Peer, noise: bytes, piece: int
 ) -> None:
     for raw in range(5):
@@ -400,7 +402,7 @@ def test_bytes_behind_good_replies_lose_neither_a_reply_nor_the_connection(
     assert not line.is_out_of_step
 
 
-def test_a_write_is_confirmed_by_its_copy(line: LineDriver, drive: Peer) -> None:
+def test_a_copy_of_a_tcp_write_confirms_it(line: LineDriver, drive: Peer) -> None:
     transaction = ask(line, drive, WRITE)
     line.receive(tcp(transaction, build_request(TCP, WRITE)[6:]))
     assert line.want == "done"
@@ -420,7 +422,7 @@ def test_bytes_that_are_not_a_header_end_the_connection(line: LineDriver, drive:
     assert line.completion.raw
 
 
-def test_frames_of_another_framing_never_leave(line: LineDriver, drive: Peer) -> None:
+def test_a_request_of_another_framing_is_not_sent_on_a_tcp_port(line: LineDriver, drive: Peer) -> None:
     line.begin(over_rtu(READ, drive))
     assert (line.want, line.completion.result) == ("done", FrameFault.BAD_REQUEST)
     serial = LineDriver()
@@ -428,7 +430,7 @@ def test_frames_of_another_framing_never_leave(line: LineDriver, drive: Peer) ->
     assert (serial.want, serial.completion.result) == ("done", FrameFault.BAD_REQUEST)
 
 
-def test_foreign_frames_without_end_fill_no_memory(line: LineDriver, drive: Peer) -> None:
+def test_memory_is_bounded_under_endless_foreign_frames(line: LineDriver, drive: Peer) -> None:
     transaction = ask(line, drive)
     for foreign in (transaction ^ 1, transaction):
         line.receive(tcp(foreign, bytes([9]) + bytes(250)) * 50)
@@ -437,7 +439,7 @@ def test_foreign_frames_without_end_fill_no_memory(line: LineDriver, drive: Peer
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20), st.sampled_from(list(Transactions)[1:]))
-def test_random_bytes_at_any_time_break_no_rule(pieces: list[bytes], transactions: Transactions) -> None:
+def test_every_exchange_ends_whatever_bytes_come(pieces: list[bytes], transactions: Transactions) -> None:
     line, drive = LineDriver(transactions), Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
     for piece in pieces:
         line.begin(exchange(READ, drive))
@@ -460,7 +462,7 @@ def gateway() -> LineDriver:
     return LineDriver(Transactions.IGNORED)
 
 
-def test_a_gateway_may_have_ids_of_its_own(gateway: LineDriver, drive: Peer) -> None:
+def test_with_ids_ignored_a_reply_with_another_id_is_accepted(gateway: LineDriver, drive: Peer) -> None:
     for raw in range(10):
         line = gateway
         line.receive(value((ask(line, drive) + 1) & 0xFFFF, raw))
@@ -468,7 +470,7 @@ def test_a_gateway_may_have_ids_of_its_own(gateway: LineDriver, drive: Peer) -> 
         assert line.completion.reply.data == words(raw)
 
 
-def test_without_ids_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
+def test_with_ids_ignored_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
     miss(gateway, drive)
     gateway.begin(exchange(READ, drive))
     assert gateway.completion.result == Failure.LATE_ANSWER_DUE
@@ -480,7 +482,7 @@ def test_without_ids_a_late_reply_delays_the_next_request(gateway: LineDriver, d
     assert gateway.completion.reply.data == words(2)
 
 
-def test_without_ids_the_drive_may_answer_after_a_gateway_s_exception(
+def test_with_ids_ignored_a_drive_may_reply_after_a_gateways_exception(
     gateway: LineDriver, drive: Peer
 ) -> None:
     gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
@@ -500,13 +502,15 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
         yield ours, theirs
 
 
-def test_a_connection_out_of_step_is_lost(ends: tuple[socket.socket, socket.socket], drive: Peer) -> None:
+def test_bytes_that_are_not_modbus_tcp_end_the_connection_as_lost(
+    ends: tuple[socket.socket, socket.socket], drive: Peer
+) -> None:
     ours, theirs = ends
     port = Port(ours.fileno(), -1, transactions=Transactions.MATCHED)
     try:
         theirs.send(bytes.fromhex("01 03 02 00 07 F9 86"))
         found = port.carry_out(exchange(READ, drive))
-        while found.result != Failure.LINE_LOST:  # it may be sent before the bytes are seen
+        while found.result != Failure.LINE_LOST:  # a request may be sent before the bytes are read
             found = port.carry_out(exchange(READ, drive))
         assert found.error == errno.EPROTO, os.strerror(found.error)
         assert port.lost

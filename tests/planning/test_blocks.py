@@ -1,4 +1,4 @@
-"""Plans: never over a limit, never into forbidden addresses, never slower than brute force."""
+"""Plans: never over a limit, never across forbidden addresses, never slower than a brute-force search."""
 
 import math
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ from multidrop.planning.bus_time import gap, in_order, silence
 
 
 class Example(Drive):
-    """Room for four registers in a read, reserved addresses readable up to 20."""
+    """A read has at most four registers, and reserved addresses up to 20 may be read."""
 
     most_registers = {HOLDING: 4, INPUT: 2}
     readable_gaps = {HOLDING: range(0, 21)}
@@ -50,7 +50,7 @@ class Example(Drive):
 
 
 def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
-    """Return the seconds of silence, request, response delay and reply."""
+    """Return the seconds that silence, request, response delay and reply take together."""
     return silence(drive) + sending(drive, block) + (drive.response_delay if delay is None else delay)
 
 
@@ -70,16 +70,16 @@ def test_forbidden_addresses_are_never_read_across() -> None:
     assert spans(Example(1), "far", "farther") == [(30, 1), (32, 1)]
 
 
-def test_order_and_repetition_do_not_matter() -> None:
+def test_blocks_do_not_depend_on_order_or_repetition_of_the_registers() -> None:
     assert spans(Example(1), "c", "a", "b", "a") == [(1, 4)]
 
 
-def test_what_cannot_be_read_is_refused() -> None:
+def test_planning_a_register_that_cannot_be_read_raises() -> None:
     with pytest.raises(ValueError, match=r"run of .* cannot be read: it is a command"):
         blocks(Example(1), [Example.run])
 
 
-def test_requests_are_the_standard_s() -> None:
+def test_blocks_have_the_standards_read_requests() -> None:
     (block,) = blocks(Example(7), [Example.a, Example.b])
     assert block.request == Message(7, 3, 1, 2)
     assert write_request(Example(7), Example.coil, 1) == Message(7, 5, 3, data=b"\xff\x00")
@@ -90,11 +90,11 @@ def test_requests_are_the_standard_s() -> None:
         write_request(Example(7), Example.a, 1)
 
 
-def test_a_block_takes_its_characters_silence_and_delay() -> None:
+def test_the_duration_of_a_block_is_characters_silence_and_delay() -> None:
     drive = Example(1, baudrate=9600, format="8N1")
     (block,) = blocks(drive, [Example.a])
     characters = 8 + 7
-    silence = 3.5 * 10 / 9600 + 1 / 9600  # one bit more, for a second stop bit
+    silence = 3.5 * 10 / 9600 + 1 / 9600  # one bit more, in case of a second stop bit
     expected = characters * 10 / 9600 + silence + drive.response_delay
     assert duration(drive, block) == pytest.approx(expected)
 
@@ -114,7 +114,7 @@ def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
     assert spans(Sparse(1), "high", "beyond") == [(3, 1), (5, 1)]
 
 
-def test_each_rate_has_blocks_of_its_own() -> None:
+def test_registers_of_different_rates_share_no_block() -> None:
     drive = Example(1)
     found = planned(drive, [(Example.a, 0.1), (Example.b, None), (Example.c, 0.1)])
     assert [(each.block.start, each.block.count, each.every) for each in found] == [(1, 4, 0.1), (2, 1, None)]
@@ -132,7 +132,7 @@ def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[
 
 
 def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float | None = None) -> float:
-    """By trying every way to cut the sorted registers of one table into requests."""
+    """Return the least seconds of all ways to cut the sorted registers of one table into requests."""
     table = registers[0].table
     limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
     readable = {
@@ -165,8 +165,8 @@ def span(register: Register[float]) -> range:
     st.sampled_from([1200, 9600, 38400, 115200]),
     st.sampled_from([Framing.RTU, Framing.ASCII]),
 )
-def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing: Framing) -> None:
-    """Pairs of words and single ones, some side by side, and reserved addresses between them."""
+def test_no_other_plan_takes_less_time(pairs: dict[int, bool], baudrate: int, framing: Framing) -> None:
+    """Registers of one and two words, some side by side, with reserved addresses between others."""
     registers = {
         f"r{address}": reading(address, number_format=NumberFormat.U32 if pair else NumberFormat.U16)
         for address, pair in pairs.items()
@@ -196,7 +196,7 @@ def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing
 
 
 class Scattered(Drive):
-    """Registers with readable gaps of many lengths between them."""
+    """A family whose registers have readable gaps of many lengths between them."""
 
     framings = (Framing.RTU, Framing.ASCII)
     most_registers = {HOLDING: 90}
@@ -214,7 +214,7 @@ class Scattered(Drive):
     st.floats(0, 0.2),
     st.floats(0, 1),
 )
-def test_a_plan_is_the_best_at_the_delays_that_it_suits_and_at_no_others(
+def test_a_plan_is_the_quickest_exactly_at_the_delays_that_it_suits(
     wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
 ) -> None:
     drive = Scattered(1, baudrate=baudrate, framing=framing)
@@ -222,7 +222,7 @@ def test_a_plan_is_the_best_at_the_delays_that_it_suits_and_at_no_others(
     found = plan(drive, [(register, None) for register in registers], delay)
 
     def excess(at: float) -> float:
-        """Seconds by which another plan is quicker at this response delay."""
+        """Return the seconds by which the best plan is quicker than `found` at the response delay `at`."""
         own = sum(duration(drive, one.block, at) for one in found.planned)
         return own - cheapest_of_all(drive, registers, at)
 
@@ -236,7 +236,7 @@ def test_a_plan_is_the_best_at_the_delays_that_it_suits_and_at_no_others(
             assert excess(outside) > 1e-6
 
 
-def test_a_plan_of_several_rates_suits_the_delays_that_suit_each() -> None:
+def test_a_plan_of_several_rates_suits_the_delays_that_suit_every_rate() -> None:
     drive = Scattered(1, baudrate=9600)
     rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
     apart = [
@@ -260,12 +260,12 @@ def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Tab
         block = Block(table, 0, count, (), request)
         if framing is Framing.DELIXI:
             request = Message(1, 7, 0, data=bytes(4))
-        wire = Framing.RTU if framing is Framing.TCP else framing  # a gateway's
+        wire = Framing.RTU if framing is Framing.TCP else framing  # the framing behind a gateway
         frames = len(build_request(wire, request)) + reply_length(wire, request)
         assert sending(drive, block) == pytest.approx(frames * drive.settings.character)
 
 
-FORBIDDEN = {  # addresses within the tables that the documents do not declare readable
+FORBIDDEN = {  # addresses that the documents do not declare as readable
     "erman-er-g-220": {"holding register": (89, 0xFFFF), "input register": (0x1000, 0xFFFF)},
     "invt-che": {"holding register": (0x1000, 0x1000, 0x3017, 0x4FFF, 0x5002, 0xFFFF)},
     "innovert-ibd": {"holding register": (0, 2, 5, 21, 0x2000, 0x2001)},
@@ -275,7 +275,7 @@ FORBIDDEN = {  # addresses within the tables that the documents do not declare r
 @pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(st.data())
-def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
+def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject) -> None:
     model = data.draw(st.sampled_from(sorted(MODELS)))
     family = MODELS[model]
     tables: dict[Table, list[Register[float]]] = {}
@@ -284,7 +284,7 @@ def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
             tables.setdefault(register.table, []).append(register)
     registers = data.draw(st.sampled_from([*tables.values()]))
     first = data.draw(st.integers(0, len(registers) - 1))
-    near = registers[first : first + 12]  # so that some can share a request
+    near = registers[first : first + 12]  # neighbours, so that some can share a request
     wanted = data.draw(st.lists(st.sampled_from(near), unique=True, min_size=1, max_size=8))
     drive = family(
         1,
@@ -299,7 +299,7 @@ def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
         forbidden = [range(low, high + 1) for low, high in zip(bounds[::2], bounds[1::2], strict=True)]
         asked = range(block.start, block.start + block.count)
         assert not any(at in part for at in asked for part in forbidden)
-        if model.startswith(("delixi", "yd1000")):  # their documents show reads of one register only
+        if model.startswith(("delixi", "yd1000")):  # their documents describe only reads of one register
             assert len(block.registers) == 1
 
 
@@ -312,7 +312,7 @@ def silences(order: list[Drive], switching: float = 0.0) -> float:
 
 @st.composite
 def companies(draw: st.DrawFn) -> list[Drive]:
-    """Up to six drives of any families, with any settings."""
+    """Return up to six drives of any families, with any settings."""
     kinds = draw(st.lists(st.sampled_from(sorted(MODELS)), min_size=1, max_size=6))
     return [
         MODELS[kind](
@@ -333,7 +333,7 @@ def test_no_other_order_has_less_silence(drives: list[Drive]) -> None:
     assert silences(order) == pytest.approx(least, abs=1e-8)
 
 
-def test_where_switching_takes_time_it_is_done_seldom() -> None:
+def test_if_switching_takes_time_drives_with_equal_settings_are_side_by_side() -> None:
     families = ("invt-che", "delixi-modbus", "innovert-ibd")
     drives = [
         MODELS[model](address, baudrate=baudrate)
@@ -347,7 +347,7 @@ def test_where_switching_takes_time_it_is_done_seldom() -> None:
     assert silences(order, 0.05) < silences(drives, 0.05)
 
 
-def test_a_gap_is_the_longer_silence_and_the_switch() -> None:
+def test_a_gap_is_the_longer_silence_plus_the_switching_time() -> None:
     slow, fast = MODELS["yd1000"](1), MODELS["erman-er-g-220"](2)
     longer = 24 * 11 / 9600 + 1 / 9600
     assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)
@@ -355,7 +355,7 @@ def test_a_gap_is_the_longer_silence_and_the_switch() -> None:
     assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
 
 
-def test_what_has_no_read_function_is_no_block() -> None:
+def test_a_block_of_a_table_without_read_function_raises() -> None:
     table = Table("command word", None, 0x06)
     with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
         read_request(Example(1), table, 0, 1)

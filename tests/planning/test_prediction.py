@@ -1,4 +1,4 @@
-"""Predictions: against manually counted frame lengths, and invariants of any line."""
+"""Predictions: compared with manually counted frame lengths and with the core, and invariants of any line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ predict = partial(predict_with_host, lateness=0.0)
 
 
 class Simple(Drive):
-    """Four registers in two requests."""
+    """A family whose four registers take two requests."""
 
     title = "SIMPLE"
     baudrates = (9600, 19200, 38400)
@@ -61,7 +61,7 @@ def test_a_cycle_is_characters_delays_and_silences() -> None:
     assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
 
 
-def test_lines_alike_are_scheduled_once_and_others_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_lines_are_simulated_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
     begun = 0
 
     class CountedSchedule(prediction.Schedule[prediction.Job]):
@@ -81,14 +81,14 @@ def test_lines_alike_are_scheduled_once_and_others_anew(monkeypatch: pytest.Monk
     assert begun == 3
 
 
-def test_a_shorter_silence_is_reckoned_with() -> None:
+def test_a_prediction_includes_a_shorter_silence() -> None:
     usual, short = ErmanERG220(1), ErmanERG220(1, silence=500e-6)
     cycles = [predict(asked(each, None, "output_current")).cycle for each in (usual, short)]
     assert cycles[0] - cycles[1] == pytest.approx(1.25e-3)
 
 
-def test_ten_ms_stand_on_both_sides_of_an_ibd() -> None:
-    """Two of three gaps are the IBD's, whatever t3.5 is at the other drives' baud rate."""
+def test_a_prediction_includes_10_ms_of_silence_before_and_after_an_ibd() -> None:
+    """Two of three gaps have the IBD's silence, although the other drives' silence is shorter."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
     exchanges = [asked(one, None, "output_current") for one in (che, other, ibd)]
     found = predict([one for each in exchanges for one in each])
@@ -104,7 +104,7 @@ def test_each_switch_of_settings_adds_its_time() -> None:
     assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
 
 
-def test_a_network_port_has_nothing_to_switch() -> None:
+def test_a_prediction_for_a_network_port_includes_no_switching() -> None:
     drives = [InvtCHE(1, baudrate=9600), InvtCHE(2, baudrate=19200)]
     for drive in drives:
         drive.take_framing_of("tcp://10.0.0.7")
@@ -113,7 +113,7 @@ def test_a_network_port_has_nothing_to_switch() -> None:
     assert predict(exchanges, switching=0.01).cycle == predict(exchanges).cycle
 
 
-def test_a_suggestion_reckons_with_the_switching() -> None:
+def test_suggestions_include_the_switching_time() -> None:
     drives = [ErmanERG220(1), YD1000(2)]
     exchanges = [each for drive in drives for each in asked(drive, 0.06, "output_frequency")]
     periods = []
@@ -125,13 +125,13 @@ def test_a_suggestion_reckons_with_the_switching() -> None:
     assert periods[1] > periods[0]
 
 
-def test_measured_delays_take_the_place_of_the_document_s() -> None:
+def test_measured_delays_replace_the_documented_delays() -> None:
     one, two = Simple(1), Simple(2)
     exchanges = [*asked(one), *asked(two)]
     assert predict(exchanges, {one: 9e-3}).cycle == pytest.approx(predict(exchanges).cycle + 2 * 5e-3)
 
 
-def test_slow_rates_leave_the_rest_of_the_line_to_the_others() -> None:
+def test_registers_without_a_period_get_the_time_that_slow_rates_leave() -> None:
     timed, eager = Simple(1, format="8N1"), Simple(2, format="8N1")
     found = predict([*asked(timed, 0.1), *asked(eager)])
     load = 2 * (OWN + SILENCE) / 0.1
@@ -140,7 +140,7 @@ def test_slow_rates_leave_the_rest_of_the_line_to_the_others() -> None:
     assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
 
 
-def test_what_is_asked_too_often_gets_what_the_line_gives() -> None:
+def test_a_rate_that_is_too_high_reaches_what_the_line_allows() -> None:
     drives = [Simple(address, format="8N1") for address in range(1, 5)]
     found = predict([each for drive in drives for each in asked(drive, 0.05)])
     assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
@@ -148,7 +148,7 @@ def test_what_is_asked_too_often_gets_what_the_line_gives() -> None:
     assert [rate.reached for rate in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
 
 
-def test_a_drive_that_is_polled_in_turn_keeps_its_share_of_a_crowded_line() -> None:
+def test_a_drive_without_a_period_keeps_its_share_of_an_overloaded_line() -> None:
     hasty, eager = Simple(1, name="hasty", format="8N1"), Simple(2, name="eager", format="8N1")
     found = predict([*asked(hasty, 0.02), *asked(eager)])
     assert [(rate.drive.name, rate.fits) for rate in found.rates] == [("hasty", False), ("eager", True)]
@@ -156,16 +156,16 @@ def test_a_drive_that_is_polled_in_turn_keeps_its_share_of_a_crowded_line() -> N
     assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
 
 
-def test_a_host_is_late_in_each_exchange() -> None:
+def test_a_prediction_adds_the_hosts_lateness_to_each_exchange() -> None:
     exchanges = [*asked(Simple(1)), *asked(Simple(2))]
     assert predict_with_host(exchanges).cycle == pytest.approx(predict(exchanges).cycle + 4 * LATENESS)
 
 
-# ---- against the core's own line, on a clock that only the test moves ----
+# ---- compared with the core's line, on a clock that the test sets ----
 
 
 def carried_out(exchanges: Sequence[Planned]) -> float:
-    """Seconds of a bus cycle in which every drive answers after its document's delay."""
+    """Return the seconds of a bus cycle of the core in which every drive has its documented delay."""
     drives = in_order(dict.fromkeys(exchange.drive for exchange in exchanges))
     order = [exchange for drive in drives for exchange in exchanges if exchange.drive is drive]
     peers = {each: Peer(least_timeout=0.02, most_timeout=each.response_timeout) for each in drives}
@@ -198,7 +198,7 @@ def carried_out(exchanges: Sequence[Planned]) -> float:
         max_size=8,
     )
 )
-def test_the_core_s_line_takes_what_was_predicted(wanted: list[tuple[str, int, int]]) -> None:
+def test_the_cores_line_takes_the_predicted_time(wanted: list[tuple[str, int, int]]) -> None:
     exchanges: list[Planned] = []
     for address, (model, framing, count) in enumerate(wanted, 1):
         family = MODELS[model]
@@ -215,8 +215,8 @@ PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 @pytest.mark.story
 @settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
-def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | None]]) -> None:
-    """All that is reached, each exchange with its own characters and delay alone, fits into a second."""
+def test_predicted_rates_never_need_more_than_the_lines_time(wanted: list[tuple[str, float | None]]) -> None:
+    """The exchanges per second of all rates, even counted without silence, fit into a second."""
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
         drive = MODELS[model](address)
@@ -231,7 +231,7 @@ def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | 
         assert rate.every is None or rate.reached * rate.every <= 1.01
 
 
-# ---- what would make it fit ----
+# ---- suggestions ----
 
 
 def with_suggestion(drives: list[Drive], found: Suggestions, every: float, which: str) -> list[Planned]:
@@ -251,7 +251,7 @@ def with_suggestion(drives: list[Drive], found: Suggestions, every: float, which
 
 
 @pytest.mark.parametrize("which", ["every", "baudrate", "registers"])
-def test_each_suggestion_makes_it_fit(which: str) -> None:
+def test_each_suggestion_makes_the_line_reach_its_rates(which: str) -> None:
     drives: list[Drive] = [Simple(address, name=f"drive-{address}") for address in range(1, 5)]
     exchanges = [each for drive in drives for each in asked(drive, 0.15)]
     prediction = predict(exchanges)
@@ -270,7 +270,7 @@ def test_a_suggestion_is_no_larger_than_needed() -> None:
     assert found.registers == 2  # one request
 
 
-def test_where_nothing_helps_that_is_said() -> None:
+def test_a_change_that_does_not_help_is_not_suggested() -> None:
     drive = YD1000(1)
     exchanges = asked(drive, 0.001, "output_frequency")
     found = suggest(exchanges, predict(exchanges))
@@ -280,18 +280,18 @@ def test_where_nothing_helps_that_is_said() -> None:
     assert "every" in str(found)
 
 
-def test_a_duration_is_told_as_a_plant_file_has_it() -> None:
+def test_duration_text_returns_a_plant_files_notation() -> None:
     assert [duration_text(each) for each in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
 
 
-def test_framing_counts() -> None:
+def test_a_prediction_depends_on_the_framing() -> None:
     rtu, text = InnovertIBD(1), InnovertIBD(1, framing=Framing.ASCII)
     ascii_own = (17 + 15 + 1.5) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n"
     assert predict(asked(text, None, "output_current")).cycle == pytest.approx(ascii_own)
     assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
 
 
-def test_suggestions_are_told_in_a_sentence() -> None:
+def test_suggestions_as_text_are_one_sentence() -> None:
     every = 'every = "100 ms" instead of 50 ms'
     found = Suggestions(((0.05, 0.1),), (19200, (YD1000(1, name="fan-1"), YD1000(2, name="fan-2"))), 3)
     assert str(found) == (

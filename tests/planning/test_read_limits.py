@@ -1,4 +1,4 @@
-"""Block sizes if a class states no limit, and groups that always share a request."""
+"""Block sizes without a stated limit, tables with one read function, and groups that share a request."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
 @pytest.mark.parametrize(
     ("table", "most", "apart"), [(HOLDING, 125, 1), (INPUT, 125, 1), (COIL, 2000, 8), (DISCRETE, 2000, 8)]
 )
-def test_side_by_side_the_standard_s_limits_hold(table: Table, most: int, apart: int) -> None:
+def test_without_a_stated_limit_adjacent_registers_are_read_up_to_the_standards_limit(
+    table: Table, most: int, apart: int
+) -> None:
     drive = family(**{f"r{at}": reading(at, table=table) for at in range(most + 1)})(1)
     asked = [f"r{at}" for at in (*range(0, most, apart), most - 1)]
     assert [count for _, count in spans(drive, *asked)] == [most]
@@ -64,19 +66,19 @@ def test_undeclared_addresses_are_never_read_across() -> None:
     assert spans(drive, "a", "b", "c", "d", "e") == [(1, 2), (4, 2), (7, 1)]
 
 
-def test_a_declared_register_that_nobody_wants_is_read_across() -> None:
+def test_a_request_may_include_a_declared_register_that_is_not_wanted() -> None:
     drive = family(a=reading(1), b=reading(2), c=reading(3))(1)
     assert spans(drive, "a", "c") == [(1, 3)]
 
 
-def test_what_is_stated_for_one_table_leaves_the_others_to_the_standard() -> None:
+def test_a_limit_of_one_table_does_not_apply_to_other_tables() -> None:
     registers = {f"h{at}": reading(at) for at in range(4)}
     registers |= {f"i{at}": reading(at, table=INPUT) for at in range(4)}
     drive = family(most_registers={HOLDING: 2}, **registers)(1)
     assert spans(drive) == [(0, 2), (2, 2), (0, 4)]
 
 
-def test_delixi_s_own_frames_have_room_for_one() -> None:
+def test_a_delixi_request_reads_one_register() -> None:
     table = Table("parameter", 0x07, 0x05, Carrier.LONG)
     drive = family(framings=(Framing.DELIXI,), a=reading(500, table=table), b=reading(501, table=table))(1)
     assert spans(drive) == [(500, 1), (501, 1)]
@@ -98,16 +100,16 @@ REQUESTS = {
 
 
 @table("model", REQUESTS)
-def test_no_built_in_family_s_requests_have_changed(model: str) -> None:
+def test_the_requests_of_built_in_families_are_unchanged(model: str) -> None:
     drive = MODELS[model](3)
     found = [(block.request.function, block.start, block.count) for block in blocks(drive, drive.readings())]
     assert sorted(found) == REQUESTS[model]
 
 
-# ---- the meter ----
+# ---- a meter of 39 floats ----
 
 
-def test_a_meter_of_39_floats_is_read_in_eight_requests_by_default_and_in_four_with_its_gaps() -> None:
+def test_a_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() -> None:
     assert len(ADDRESSES) == 39
     lines = []
     for meter in (Meter, StatedMeter):
@@ -118,7 +120,7 @@ def test_a_meter_of_39_floats_is_read_in_eight_requests_by_default_and_in_four_w
     assert lines == [(8, 0.341), (4, 0.268)]
 
 
-def test_by_default_the_meter_is_asked_for_what_it_declares_and_nothing_else() -> None:
+def test_by_default_requests_to_the_meter_include_only_declared_registers() -> None:
     drive = Meter(1)
     declared = {at for address in ADDRESSES.values() for at in (address, address + 1)}
     asked = [range(one.start, one.start + one.count) for one in blocks(drive, drive.readings())]
@@ -126,11 +128,11 @@ def test_by_default_the_meter_is_asked_for_what_it_declares_and_nothing_else() -
     assert {at for one in asked for at in one} == declared | {0xFC00, 0xFC01}
 
 
-# ---- tables that are read alike ----
+# ---- tables with the same read function ----
 
 
 class Mixed(Drive):
-    """Some registers are written by 06, others by 10H alone; all are read by 03."""
+    """Some registers are written by function 06, others only by 10H. All are read by 03."""
 
     low = setting(1, "", span=(0, 9))
     multiple = setting(2, "", span=(0, 9), table=HOLDING_MULTIPLE)
@@ -145,7 +147,7 @@ def test_tables_of_one_read_function_share_requests() -> None:
     assert (HOLDING_MULTIPLE.read, HOLDING_MULTIPLE.write, HOLDING_MULTIPLE.name) == (3, 16, HOLDING.name)
 
 
-def test_the_least_limit_stated_for_what_is_read_alike_holds() -> None:
+def test_of_tables_with_one_read_function_the_smallest_limit_applies() -> None:
     class Narrow(Mixed):
         most_registers = {HOLDING_MULTIPLE: 2, HOLDING: 3}
 
@@ -153,7 +155,7 @@ def test_the_least_limit_stated_for_what_is_read_alike_holds() -> None:
     assert len(blocks(drive, [Narrow.low, Narrow.multiple, Narrow.read_only])) == 2
 
 
-def test_one_word_is_written_by_10h() -> None:
+def test_a_register_of_one_word_can_be_written_by_10h() -> None:
     drive, sim = Mixed(1), SimulatedDrive(Mixed(1))
     request = write_request(drive, Mixed.multiple, 7)
     assert request == Message(1, 0x10, 2, 1, b"\0\7")
@@ -180,7 +182,7 @@ LAYOUTS = st.lists(
 
 
 def partitions(registers: list[Register[float]]) -> list[list[list[Register[float]]]]:
-    """Return all ways to put registers into groups, neighbours or not."""
+    """Return all partitions of the registers into groups, which need not be neighbours."""
     if not registers:
         return [[]]
     first, *others = registers
@@ -199,7 +201,7 @@ def allowed(drive: Drive, group: list[Register[float]], limit: int) -> bool:
 
 @settings(max_examples=examples(150), deadline=None)
 @given(LAYOUTS, st.sampled_from([None, 1, 3]), st.sampled_from([1200, 115200]))
-def test_no_other_way_to_read_registers_that_overlap_is_quicker(
+def test_no_other_plan_for_overlapping_registers_takes_less_time(
     layout: list[tuple[int, NumberFormat]], limit: int | None, baudrate: int
 ) -> None:
     registers = {
@@ -228,7 +230,7 @@ def test_no_other_way_to_read_registers_that_overlap_is_quicker(
 
 
 class Grouped(Drive):
-    """Energy in two words with others between, a state that is to be read first, and much gap."""
+    """Energy in two registers with others between them, a state that is read first, and large gaps."""
 
     most_registers = {HOLDING: 100}
     readable_gaps = {HOLDING: range(200)}
@@ -241,7 +243,7 @@ class Grouped(Drive):
 
 
 @pytest.mark.parametrize("baudrate", [1200, 9600, 115200])
-def test_a_group_shares_a_request_where_apart_would_be_quicker(baudrate: int) -> None:
+def test_a_group_shares_a_request_even_if_separate_requests_are_quicker(baudrate: int) -> None:
     drive = Grouped(1, baudrate=baudrate)
     assert (0, 61) in spans(drive, "energy_high", "energy_low")
     found = [
@@ -250,13 +252,13 @@ def test_a_group_shares_a_request_where_apart_would_be_quicker(baudrate: int) ->
     assert all(Grouped.energy_high in block.registers for block in found)
 
 
-def test_one_of_a_group_alone_costs_no_more_than_itself() -> None:
+def test_a_single_register_of_a_group_is_read_without_the_others() -> None:
     assert spans(Grouped(1), "energy_low") == [(60, 1)]
     rates = [(Grouped.energy_high, 1.0), (Grouped.energy_low, None)]
     assert [(one.block.start, one.block.count) for one in planned(Grouped(1), rates)] == [(0, 1), (60, 1)]
 
 
-def test_groups_are_asked_in_the_declared_order_and_before_all_else() -> None:
+def test_groups_are_read_first_and_in_the_declared_order() -> None:
     order = [block.registers[0].name for block in blocks(Grouped(1), Grouped.registers.values())]
     assert order[:2] == ["latch", "energy_high"]
     assert order[-1] == "other"
@@ -278,7 +280,9 @@ def test_groups_are_asked_in_the_declared_order_and_before_all_else() -> None:
         ({"most_registers": {HOLDING: 0}}, "not a number from 1 to 125"),
     ],
 )
-def test_what_cannot_be_is_a_declaration_error(details: dict[str, Any], sentence: str) -> None:
+def test_an_invalid_group_limit_or_interval_is_a_declaration_error(
+    details: dict[str, Any], sentence: str
+) -> None:
     registers = {"a": reading(1), "b": reading(2), "far": reading(9), "input_3": reading(3, table=INPUT)}
     with pytest.raises(DeclarationError, match=sentence):
         family(**registers, run=command(4), **details)

@@ -30,7 +30,7 @@ def schedule(*jobs: Job) -> Schedule[Job]:
 
 
 def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> list[tuple[Job, int]]:
-    """From an idle line: the jobs, each with the ms before which it is not to be sent."""
+    """Take turns for an idle line; return each job with its earliest time in ms."""
     now = now_ms * MS
     return [
         (each, not_before // MS) for each, not_before, _ in made.take(now, now, now + ahead_ms * MS, most)
@@ -38,7 +38,7 @@ def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> l
 
 
 def carry_out(made: Schedule[Job], seconds: int) -> list[tuple[Job, int | None, int]]:
-    """Run one job at a time on a line; return each with its slot and the time of its request."""
+    """Run one job at a time; return each with its slot and the time of its request."""
     at, done = 0, []
     while at < seconds * 1000 * MS:
         ((chosen, not_before, due),) = made.take(at, at, at + 10_000 * MS, 1)
@@ -52,29 +52,29 @@ def fail(made: Schedule[Job], drive: int, failures: int, now_ms: int, late_until
     made.back_off.observe(drive, failures, now_ms * MS, late_until_ns=late_until_ms * MS, cost_ns=0)
 
 
-def test_a_period_keeps_its_own_grid_whenever_it_is_planned() -> None:
+def test_slots_start_at_multiples_of_the_period_whenever_they_are_planned() -> None:
     made = schedule(poll := job(period_ms=20))
     planned = [due for now in range(0, 1000, 37) for _, due in take(made, now, 100)]
     assert planned == list(range(0, planned[-1] + 1, 20))
     assert poll.skipped == 0
 
 
-def test_after_a_stall_slots_are_counted_and_not_made_up_for() -> None:
+def test_slots_missed_in_a_stall_are_counted_and_skipped() -> None:
     made = schedule(poll := job(period_ms=20))
     assert take(made, 0, 1) == [(poll, 0)]
-    assert take(made, 110, 1) == [(poll, 100)]  # 20, 40, 60 and 80 are over
+    assert take(made, 110, 1) == [(poll, 100)]  # the slots from 20, 40, 60 and 80 ms are over
     assert poll.skipped == 4
     assert take(made, 111, 10) == [(poll, 120)]
 
 
-def test_what_the_line_will_be_too_late_for_is_not_queued() -> None:
-    """The line is already busy for so long."""
+def test_a_slot_that_ends_before_the_line_is_free_is_not_queued() -> None:
+    """Earlier turns keep the line busy until after the slot's end."""
     made = schedule(poll := job(period_ms=20))
     assert made.take(0, 110 * MS, 111 * MS, 9) == [(poll, 100 * MS, 100 * MS)]
     assert poll.skipped == 5
 
 
-def test_the_slot_that_ends_first_goes_first_and_the_others_fill_in_turn() -> None:
+def test_the_slot_that_ends_first_goes_first_and_jobs_without_a_period_fill_the_rest() -> None:
     timed, late = job(1, 40), job(2, 60)
     first, second, third = job(3), job(4), job(5)
     made = schedule(first, late, second, timed, third)
@@ -83,57 +83,57 @@ def test_the_slot_that_ends_first_goes_first_and_the_others_fill_in_turn() -> No
     assert [each for each, _ in take(made, 40, 10)] == [timed, first]
 
 
-def test_slow_jobs_that_are_due_together_do_not_block_a_fast_one() -> None:
+def test_slow_jobs_that_are_due_together_do_not_delay_a_fast_job() -> None:
     slow = [job(drive, 1000, duration_ms=20) for drive in range(2, 32)]
     made = schedule(*slow, fast := job(1, 50, duration_ms=10))
     done = carry_out(made, 10)
     waited = [sent - due for each, due, sent in done if each is fast]
     assert len(waited) == pytest.approx(200, abs=1)
-    assert max(waited) <= 20 * MS  # until the one that is on the line is over
+    assert max(waited) <= 20 * MS  # until the job in flight has ended
     assert [each.skipped for each in made.jobs] == [0] * 31
 
 
-def test_of_a_line_that_is_asked_for_too_much_everybody_gets_a_part() -> None:
+def test_on_an_overloaded_line_every_job_gets_a_share() -> None:
     fast = [job(drive, 20, duration_ms=10) for drive in (1, 2, 3)]
     slow = [job(drive, 1000, duration_ms=10) for drive in (4, 5)]
     turn = [job(drive, duration_ms=10) for drive in (6, 7)]
     made = schedule(*turn, *fast, *slow)
     done = carry_out(made, 100)
     counts = {each: sum(1 for other, _, _ in done if other is each) for each in made.jobs}
-    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)  # jobs with few requests
+    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)  # slow jobs keep all slots
     assert max(counts[each] for each in fast) - min(counts[each] for each in fast) <= 2
     assert sum(counts[each] for each in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
     assert abs(counts[turn[0]] - counts[turn[1]]) <= 1
-    for each in (*fast, *slow):  # every slot was requested, or is counted
+    for each in (*fast, *slow):  # every slot was carried out, or is counted as skipped
         slots = 100_000 * MS // (each.period_ns or 1)
         assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
 
-def test_jobs_in_turn_have_their_share_from_the_start_of_an_overload() -> None:
+def test_jobs_without_a_period_get_their_share_from_the_start_of_an_overload() -> None:
     made = schedule(turn := job(1, duration_ms=10))
-    take(made, 0, 10_000)  # it had the line for itself
+    take(made, 0, 10_000)  # before the overload
     for drive in (2, 3):
         made.add(job(drive, 10, duration_ms=10), 10_000 * MS)
     taken = [each for each, _ in take(made, 10_000, 3_000)]
     assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
 
 
-def test_a_share_that_nobody_wanted_is_not_saved_up() -> None:
+def test_an_unused_share_of_jobs_without_a_period_is_not_saved_up() -> None:
     made = schedule(job(1, 10, duration_ms=10))
     take(made, 0, 10_000)
     made.add(turn := job(2, duration_ms=10), 10_000 * MS)
     assert [each for each, _ in take(made, 10_000, 100)].count(turn) <= 1
 
 
-def test_where_deadlines_allow_it_jobs_of_one_kind_go_together() -> None:
+def test_jobs_of_one_kind_go_together_if_no_slot_is_missed() -> None:
     jobs = [job(drive, 210, duration_ms=10, kind=drive % 2) for drive in range(1, 21)]
     done = carry_out(schedule(*jobs), 20)
     switches = sum(one.kind != other.kind for (one, _, _), (other, _, _) in pairwise(done))
-    assert switches < len(done) / 5  # about two in each round of twenty
+    assert switches < len(done) / 5  # about two changes of kind in each round of twenty jobs
     assert [each.skipped for each in jobs] == [0] * 20
 
 
-def test_a_slot_that_is_about_to_end_goes_before_its_kind() -> None:
+def test_a_slot_that_is_about_to_end_goes_before_jobs_of_the_last_kind() -> None:
     made = schedule(one := job(1, 30, 10, kind=1), *(job(drive, 1000, 10, kind=2) for drive in range(2, 12)))
     made.take(0, 0, 1, 1)
     waited = [sent - due for each, due, sent in carry_out(made, 1) if each is one]
@@ -141,15 +141,15 @@ def test_a_slot_that_is_about_to_end_goes_before_its_kind() -> None:
     assert one.skipped == 0
 
 
-def test_a_job_in_turn_is_not_begun_twice_while_others_wait() -> None:
+def test_no_job_of_the_round_gets_a_second_turn_while_others_wait() -> None:
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
     assert [each for each, _ in take(made, 0, 10)] == jobs[2:4]
 
 
-def test_a_cycle_that_is_interrupted_goes_on_where_it_was() -> None:
-    """Else those at its end would never be asked."""
+def test_an_interrupted_round_continues_at_the_same_job() -> None:
+    """Otherwise the jobs at its end would never be carried out."""
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert made.cycle(0) == jobs
@@ -160,11 +160,11 @@ def test_a_cycle_that_is_interrupted_goes_on_where_it_was() -> None:
     fail(made, 0, 0, now_ms=15)
     assert made.cycle(15 * MS) == [*jobs[1:], jobs[0]]
     made.remove(jobs[2])
-    made.go_on(jobs[2])  # it was its turn when it was removed
+    made.go_on(jobs[2])  # job 2 was next when the round was interrupted
     assert made.cycle(15 * MS)[0] in jobs
 
 
-def test_no_more_is_planned_than_there_is_room_for() -> None:
+def test_take_returns_at_most_the_given_number_of_turns() -> None:
     made = schedule(job(1), job(2, 10))
     assert len(take(made, 0, 1000, most=7)) == 7
 
@@ -174,13 +174,13 @@ def test_at_least_one_job_is_taken_however_long_it_lasts() -> None:
     assert take(made, 0, 1) == [(long, 0)]
 
 
-def test_what_is_queued_already_counts() -> None:
+def test_exchanges_that_are_already_queued_count_towards_the_horizon() -> None:
     made = schedule(job(1))
     assert made.take(0, 100 * MS, 100 * MS, 9) == []
     assert len(made.take(0, 90 * MS, 100 * MS, 9)) == 2
 
 
-def test_a_silent_drive_rests_longer_and_longer_and_the_others_go_on() -> None:
+def test_a_silent_drive_rests_longer_each_time_while_others_are_polled() -> None:
     dead, alive = job(1), job(2)
     made = schedule(dead, alive)
     fail(made, 1, 2, now_ms=0)
@@ -198,7 +198,7 @@ def test_a_silent_drive_rests_longer_and_longer_and_the_others_go_on() -> None:
     assert LONGEST_REST_NS // MS <= rests[-1] <= LONGEST_REST_NS // MS + 100
 
 
-def test_a_rest_is_over_to_the_nanosecond() -> None:
+def test_a_rest_ends_exactly_on_time() -> None:
     made = schedule(dead := job(1))
     at = 0
     for failures, rest_ms in enumerate([500, 1000, 2000, 2000], 2):
@@ -208,7 +208,7 @@ def test_a_rest_is_over_to_the_nanosecond() -> None:
         assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
 
 
-def test_all_silent_drives_together_cost_their_share() -> None:
+def test_all_silent_drives_together_take_at_most_their_share() -> None:
     jobs = [job(drive, duration_ms=40) for drive in range(10)]
     made = schedule(*jobs, job(99))
     cost_ms, asked = 300, 0
@@ -230,8 +230,8 @@ def test_all_silent_drives_together_cost_their_share() -> None:
 @pytest.mark.story
 @pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
-def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int | None) -> None:
-    """Once it is known, the others of 31 keep 97 % of the rate that they have without them."""
+def test_with_dead_drives_the_others_keep_97_percent_of_their_rate(dead: int, period_ms: int | None) -> None:
+    """Of 31 drives, those that answer keep 97 % of the rate that they have without the dead ones."""
     answered: list[int] = []
     for count in (31, 31 - dead):
         made = schedule(*(job(drive, period_ms, duration_ms=12) for drive in range(count)))
@@ -252,7 +252,7 @@ def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int |
     assert answered[0] >= 0.97 * answered[1]
 
 
-def test_a_drive_that_wakes_is_asked_one_thing_and_is_back_with_its_first_answer() -> None:
+def test_a_resting_drive_gets_one_request_and_after_a_reply_all_its_jobs() -> None:
     made = schedule(job(1), job(1), other := job(2))
     fail(made, 1, 2, now_ms=0)
     woken = take(made, 501, 50)
@@ -261,16 +261,16 @@ def test_a_drive_that_wakes_is_asked_one_thing_and_is_back_with_its_first_answer
     assert len({each for each, _ in take(made, 520, 50)}) == 3
 
 
-def test_a_silent_drive_is_asked_its_shortest_question_whatever_its_rate() -> None:
+def test_a_silent_drive_gets_its_shortest_request_at_any_rate() -> None:
     made = schedule(job(1, 100, 20), short := job(1, 60_000, 7), job(1, None, 9))
     fail(made, 1, 2, now_ms=0)
     take(made, 1, 400)
-    assert take(made, 501, 50) == [(short, 0)]  # off its grid, which goes on
+    assert take(made, 501, 50) == [(short, 0)]  # outside its slots, which stay the same
     fail(made, 1, 0, now_ms=502)
     assert (short, 60_000) in take(made, 502, 60_000, most=10_000)
 
 
-def test_a_silent_drive_is_asked_in_the_others_spare_time() -> None:
+def test_a_silent_drive_is_tried_in_the_spare_time_of_other_drives() -> None:
     made = schedule(dead := job(1), timed := job(2, 10, 5))
     fail(made, 1, 2, now_ms=0)
     take(made, 0, 450)
@@ -278,21 +278,21 @@ def test_a_silent_drive_is_asked_in_the_others_spare_time() -> None:
     assert [each for each, _ in taken[:3]] == [timed, dead, timed]
 
 
-def test_a_silent_drive_is_asked_also_when_there_is_no_spare_time() -> None:
+def test_a_silent_drive_is_tried_even_without_spare_time() -> None:
     made = schedule(dead := job(1), job(2, 10, 10), job(3, 10, 10))
     fail(made, 1, 2, now_ms=0)
     asked = sum(dead in (each for each, _ in take(made, now, 100)) for now in range(0, 5000, 100))
     assert asked >= 3
 
 
-def test_nothing_is_asked_while_a_late_answer_may_still_come() -> None:
+def test_a_drive_gets_no_request_while_its_late_reply_may_come() -> None:
     made = schedule(poll := job(1), other := job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=300)
     assert {each for each, _ in take(made, 0, 299)} == {other}
     assert poll in {each for each, _ in take(made, 300, 20)}
 
 
-def test_a_late_answer_that_has_come_ends_the_waiting() -> None:
+def test_a_drive_gets_a_request_once_its_late_reply_has_come() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=900)
     assert poll not in [each for each, _ in take(made, 0, 100)]
@@ -300,15 +300,15 @@ def test_a_late_answer_that_has_come_ends_the_waiting() -> None:
     assert poll in [each for each, _ in take(made, 100, 20)]
 
 
-def test_a_late_answer_of_a_silent_drive_gives_it_another_chance() -> None:
+def test_a_resting_drive_is_tried_once_after_its_late_reply() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=0, late_until_ms=900)
     fail(made, 1, 2, now_ms=100, late_until_ms=0)
     assert [each for each, _ in take(made, 100, 60)].count(poll) == 1
 
 
-def test_all_that_is_due_fits_to_the_nanosecond() -> None:
-    """So those of the kind that was last go first; with a nanosecond less the one that ends first."""
+def test_jobs_of_the_last_kind_go_first_only_if_all_due_jobs_fit_exactly() -> None:
+    """With a nanosecond less, the job whose slot ends first goes first."""
     for less, order in ((0, [2, 1]), (1, [1, 2])):
         made = schedule(job(3, 1000, 10, kind=2))
         take(made, 0, 1)
@@ -317,14 +317,14 @@ def test_all_that_is_due_fits_to_the_nanosecond() -> None:
         assert [each.drive for each, _ in take(made, 10, 1 + 19)] == order
 
 
-def test_a_line_that_has_caught_up_is_late_no_more() -> None:
+def test_after_the_line_has_caught_up_the_slot_that_ends_first_goes_first() -> None:
     made = schedule(quick := job(1, 10, 2), slow := job(2, 1000, 2), middling := job(3, 100, 2))
     take(made, 0, 1, most=3)
-    taken = take(made, 1000, 1010)  # slots of the quick one are over
+    taken = take(made, 1000, 1010)  # slots of the quick job are over
     assert [each for each, due in taken if due >= 2000] == [quick, middling, slow]
 
 
-def test_a_slot_passes_whose_drive_falls_silent_before_its_turn() -> None:
+def test_a_started_slot_is_skipped_if_its_drive_falls_silent() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100))
     assert take(made, 0, 100, most=1) == [(one, 0)]
     fail(made, 2, 1, now_ms=5, late_until_ms=60)
@@ -333,13 +333,13 @@ def test_a_slot_passes_whose_drive_falls_silent_before_its_turn() -> None:
     assert {each for each, _ in take(made, 100, 20)} == {one, two}
 
 
-def test_who_is_asleep_keeps_its_place_in_the_round() -> None:
+def test_a_job_whose_drive_gets_no_request_is_skipped_in_the_round() -> None:
     made = schedule(*(jobs := [job(drive, None, 10) for drive in range(3)]))
     fail(made, 1, 1, now_ms=0, late_until_ms=10_000)
     assert [each for each, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
 
 
-def test_a_question_to_a_silent_drive_may_take_its_whole_time_out() -> None:
+def test_the_plan_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -> None:
     made = schedule(dead := job(1), job(2))
     made.back_off.observe(1, 2, 0, late_until_ns=0, cost_ns=2 * MS)
     take(made, 1, 400)
@@ -347,20 +347,20 @@ def test_a_question_to_a_silent_drive_may_take_its_whole_time_out() -> None:
     assert take(made, 60_000, 300) == [(dead, 0)]
 
 
-def test_the_same_outcome_told_again_ends_no_rest() -> None:
+def test_observing_the_same_failures_again_does_not_end_a_rest() -> None:
     made = schedule(poll := job(1), job(2))
     for now in (0, 100):
         fail(made, 1, 2, now_ms=now)
     assert poll not in [each for each, _ in take(made, 100, 300)]
 
 
-def test_one_failure_is_no_rest_that_would_be_told() -> None:
+def test_after_one_failure_no_slot_is_reported_as_not_asked() -> None:
     made = schedule(job(1))
     fail(made, 1, 1, now_ms=7)
     assert made.unasked == []
 
 
-def test_damage_alone_costs_no_rest() -> None:
+def test_a_drive_does_not_rest_after_one_failure() -> None:
     made = schedule(poll := job(1))
     fail(made, 1, 1, now_ms=0)
     assert take(made, 0, 5) == [(poll, 0)]
@@ -373,31 +373,31 @@ def test_slots_of_a_resting_drive_are_reported_with_the_time_they_were_due() -> 
     assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
 
 
-def test_each_rest_is_told_once_for_jobs_in_turn() -> None:
+def test_a_job_without_a_period_is_reported_once_per_rest() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=7)
     take(made, 8, 300)
     assert made.unasked == [(poll, 7 * MS)]
 
 
-def test_while_the_port_is_gone_every_slot_passes() -> None:
+def test_pass_all_returns_every_slot_and_every_job_of_the_round() -> None:
     made = schedule(poll := job(1, period_ms=100), fast := job(2))
     assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]
 
 
-def test_what_was_not_asked_when_it_ends_is_told() -> None:
+def test_pass_slots_returns_the_slots_that_were_not_requested() -> None:
     made = schedule(poll := job(1, period_ms=100), job(2))
     take(made, 0, 50)
     assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
 
 
-def test_slots_that_have_begun_pass_too_and_so_do_those_that_begin_just_now() -> None:
+def test_pass_slots_includes_started_slots_and_slots_that_start_now() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
     assert [each for each, _ in take(made, 0, 100, most=2)] == [one, two]
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
 
 
-def test_a_job_that_is_removed_leaves_the_others_their_turns() -> None:
+def test_removing_a_job_keeps_the_order_of_the_others() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs, timed := job(9, 1000), other := job(8, 1000))
     assert [each for each, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]
@@ -408,14 +408,14 @@ def test_a_job_that_is_removed_leaves_the_others_their_turns() -> None:
     assert made.jobs == [*jobs[1:], other]
 
 
-def test_a_job_that_is_removed_within_its_slot_is_not_taken() -> None:
+def test_a_job_removed_during_its_slot_is_not_carried_out() -> None:
     made = schedule(first := job(1, 1000), second := job(2, 1000))
     assert take(made, 0, 100, most=1) == [(first, 0)]
     made.remove(second)
     assert take(made, 5, 100) == []
 
 
-def test_who_replaces_others_has_their_place_in_the_round_and_their_next_slot() -> None:
+def test_new_jobs_get_the_place_in_the_round_and_the_next_slot_of_those_they_replace() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 10)] == jobs[:2]
@@ -429,7 +429,7 @@ def test_who_replaces_others_has_their_place_in_the_round_and_their_next_slot() 
     assert set(made.jobs) == {jobs[1], both, one, other, slower}
 
 
-def test_a_cycle_repeats_where_all_answer_and_nobody_has_slots() -> None:
+def test_cycle_returns_the_round_only_if_all_drives_answer_and_no_job_has_slots() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]
     fail(made, 1, 0, now_ms=0)
@@ -454,10 +454,10 @@ KINDS = st.lists(
 
 @pytest.mark.slow
 @given(KINDS, st.lists(st.integers(0, 60) | st.just(700), min_size=30, max_size=60))
-def test_no_drift_no_burst_whatever_stalls(
+def test_stalls_cause_neither_drift_nor_bursts(
     kinds: list[tuple[int, int | None, int, int]], stalls: list[int]
 ) -> None:
-    """The line or Python stalls for longer than is planned ahead."""
+    """The line or Python stalls for longer than the horizon of the planned turns."""
     made = schedule(*(job(*kind) for kind in kinds))
     busy_until = now = 0
     slots: dict[Job, list[int]] = {each: [] for each in made.jobs}
@@ -465,23 +465,23 @@ def test_no_drift_no_burst_whatever_stalls(
         for each, not_before, due in made.take(now, busy_until, now + 100 * MS, 64):
             busy_until = max(busy_until, now, not_before)
             if due is not None and each.period_ns:
-                assert busy_until < due + each.period_ns  # it is not over
+                assert busy_until < due + each.period_ns  # the slot is not over
                 slots[each].append(due)
             busy_until += each.duration_ns
         now += stall * MS
     for each, taken in slots.items():
         if each.period_ns:
-            assert all(due % each.period_ns == 0 for due in taken)  # on its grid
+            assert all(due % each.period_ns == 0 for due in taken)  # slots start at multiples of the period
             assert taken == sorted(set(taken))  # each slot once
-            assert each.due_ns // each.period_ns == len(taken) + each.skipped  # and none unaccounted for
+            assert each.due_ns // each.period_ns == len(taken) + each.skipped  # none uncounted
 
 
 @settings(max_examples=examples(50))
 @given(KINDS)
-def test_nobody_starves_whatever_is_asked_for(kinds: list[tuple[int, int | None, int, int]]) -> None:
+def test_every_job_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int | None, int, int]]) -> None:
     made = schedule(*(job(*kind) for kind in kinds))
     done = carry_out(made, 3)
-    # Each of the others once, a few rounds of its class, and the share of those in turn.
+    # Each other job once, a few rounds of jobs of this kind, and the share of jobs without a period.
     longest = 80 * MS + 8 * 10 * MS / TURN_SHARE + 1000 * MS
     for each in made.jobs:
         sent = [0, *(at for other, _, at in done if other is each), 3000 * MS]
@@ -492,8 +492,8 @@ def test_nobody_starves_whatever_is_asked_for(kinds: list[tuple[int, int | None,
 
 @settings(max_examples=examples(50))
 @given(KINDS)
-def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> None:
-    """All jobs fit into the shortest period together: none is ever left out."""
+def test_no_slot_is_skipped_if_all_jobs_fit(kinds: list[tuple[int, int | None, int, int]]) -> None:
+    """All jobs together fit into the shortest period, so no slot is ever skipped."""
     least = sum(duration for _, _, duration, _ in kinds)
     made = schedule(*(job(d, p and p + least, duration, kind) for d, p, duration, kind in kinds))
     done = carry_out(made, 3)
@@ -503,8 +503,8 @@ def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> Non
             assert sum(1 for other, _, _ in done if other is each) >= 2900 * MS // each.period_ns
 
 
-def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come() -> None:
-    """Two requests between two observations, the first unanswered: otherwise it would be retried forever."""
+def test_a_drive_that_answers_again_gets_no_request_while_an_earlier_reply_may_come() -> None:
+    """The first of two requests between observations got no reply; otherwise that could repeat forever."""
     made = schedule(quick := job(1), timed := job(2, period_ms=10))
     fail(made, 1, 0, now_ms=0, late_until_ms=100)
     fail(made, 2, 0, now_ms=0, late_until_ms=60)
@@ -514,7 +514,7 @@ def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come
 
 
 class Operation(RuleBasedStateMachine):
-    """A line's days: jobs come and go, the host stalls, drives fall silent and wake, the port vanishes."""
+    """Random events on a line: jobs come and go, the host stalls, drives fall silent, the port vanishes."""
 
     AHEAD = 100 * MS
 
@@ -523,10 +523,10 @@ class Operation(RuleBasedStateMachine):
         self.made: Schedule[Job] = Schedule()
         self.now = self.busy_until = 1000 * MS
         self.added: dict[Job, int] = {}
-        self.slots: dict[Job, list[int]] = {}  # carried out
-        self.passed: Counter[Job] = Counter()  # reported as not asked
+        self.slots: dict[Job, list[int]] = {}  # start times of the slots that were carried out
+        self.passed: Counter[Job] = Counter()  # number of slots reported as not asked
         self.failures = dict.fromkeys(range(4), 0)
-        self.silent_until = dict.fromkeys(range(4), 0)  # a late answer may come so long
+        self.silent_until = dict.fromkeys(range(4), 0)  # until when a late reply may come
 
     @rule(drive=st.integers(0, 3), period=st.none() | st.integers(5, 80), duration=st.integers(1, 10))
     def add(self, drive: int, period: int | None, duration: int) -> None:
@@ -573,10 +573,10 @@ class Operation(RuleBasedStateMachine):
             assert each in self.made.jobs
             # No request leaves while a late reply may come, even if the line is ready too soon.
             assert max(self.now, not_before) >= self.silent_until[each.drive]
-            if each.period_ns and due is None:  # asked to see whether its drive answers, in no slot
+            if each.period_ns and due is None:  # a request to a silent drive, outside the slots
                 assert self.failures[each.drive] >= 2
             elif each.period_ns:
-                assert (due - self.added[each]) % each.period_ns == 0  # on its grid
+                assert (due - self.added[each]) % each.period_ns == 0  # at multiples of the period
                 assert due > max(self.slots[each], default=-1)  # each slot once, in their order
                 assert due > at - each.period_ns  # missed slots are not made up for
                 self.slots[each].append(due)
@@ -595,7 +595,7 @@ class Operation(RuleBasedStateMachine):
                 assert slots == len(self.slots[job]) + job.skipped + self.passed[job]
 
     def teardown(self) -> None:
-        """All drives answer again, and are polled in turn or at their rates."""
+        """Check that all drives, once they answer again, are polled: in the round or at their rates."""
         for drive in range(4):
             self.wake(drive)
         load = sum(job.duration_ns / job.period_ns for job in self.made.jobs if job.period_ns)
@@ -613,10 +613,10 @@ TestOperation = Operation.TestCase
 TestOperation.settings = settings(max_examples=examples(100), stateful_step_count=30, deadline=None)
 
 
-# ---- jobs that leave ----
+# ---- removed jobs ----
 
 
-def test_what_is_due_next_is_known_when_a_job_has_left() -> None:
+def test_the_next_due_job_is_found_after_a_job_was_removed() -> None:
     made: Schedule[Job] = Schedule()
     jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
     for at, each in jobs.items():
@@ -625,7 +625,7 @@ def test_what_is_due_next_is_known_when_a_job_has_left() -> None:
     assert take(made, 0, 14) == [(jobs[13], 13)]
 
 
-def test_one_of_several_is_due_before_the_horizon() -> None:
+def test_only_slots_within_the_horizon_are_planned() -> None:
     made: Schedule[Job] = Schedule()
     soon, later = job(1, 1000), job(2, 1000)
     made.add(soon, 10 * MS)
@@ -633,15 +633,15 @@ def test_one_of_several_is_due_before_the_horizon() -> None:
     assert take(made, 0, 100) == [(soon, 10)]
 
 
-def test_the_turn_goes_on_where_a_job_has_left() -> None:
+def test_the_round_continues_after_the_place_of_a_removed_job() -> None:
     first, second, third = job(1), job(2), job(3)
     made = schedule(first, second, third)
     assert take(made, 0, 1, 1) == [(first, 0)]
-    made.remove(second)  # whose turn it would be
+    made.remove(second)  # the job that was next
     assert [each for each, _ in take(made, 5, 1, 1)] == [third]
 
 
-def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
+def test_a_forgotten_drive_is_polled_like_a_new_one() -> None:
     made = schedule(silent := job(1), job(2))
     fail(made, 1, 9, 0)
     made.remove(silent)
@@ -665,18 +665,18 @@ def answer(made: Schedule[Job], asked: Job, now_ms: int) -> None:
     made.back_off.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
 
 
-def test_a_new_drive_is_asked_one_question_until_its_outcome_is_known() -> None:
+def test_a_new_drive_gets_one_request_until_the_outcome_is_known() -> None:
     made = meet(one := job(1), two := job(1), job(2, period_ms=50), job(2))
     assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
     assert take(made, 10, 1000) == []
     assert made.cycle(10 * MS) == []
-    made.back_off.conclude(one.drive)  # its answer was damaged, perhaps: it has not answered yet
+    made.back_off.conclude(one.drive)  # perhaps after a damaged reply, which does not count as an answer
     assert [asked for asked, _ in take(made, 20, 1000)] == [two]
     answer(made, two, 30)
     assert [asked for asked, _ in take(made, 30, 20)] == [one, two, one, two]
 
 
-def test_no_slot_of_a_new_drive_is_lost_doubled_or_asked_early() -> None:
+def test_no_slot_of_a_new_drive_is_lost_repeated_or_early() -> None:
     made = meet(fast := job(1, period_ms=20), slow := job(1, period_ms=50), job(2, period_ms=1000))
     assert {asked.drive for asked, _ in take(made, 0, 300, most=2)} == {1, 2}
     assert take(made, 1, 300) == []
@@ -686,13 +686,13 @@ def test_no_slot_of_a_new_drive_is_lost_doubled_or_asked_early() -> None:
     assert (fast.skipped, slow.skipped) == (0, 0)
 
 
-def test_a_new_drive_that_does_not_answer_rests_at_once() -> None:
+def test_a_silent_new_drive_rests_immediately() -> None:
     made = meet(dead := job(1), living := job(2))
     assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
     answer(made, living, 1)
     made.back_off.conclude(dead.drive)
     made.back_off.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
-    rest_ms = 30_000  # in which that is the share of the silent
+    rest_ms = 30_000  # after it, the cost is within the share of silent drives
     assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
     assert made.unasked == [(dead, 60 * MS)]
     assert take(made, 60 + rest_ms, 1) == [(dead, 0)]
@@ -701,22 +701,22 @@ def test_a_new_drive_that_does_not_answer_rests_at_once() -> None:
     assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}
 
 
-def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
-    """A reply may have been lost."""
+def test_silent_new_drives_get_a_second_request_immediately_if_they_are_few() -> None:
+    """The silent drives may exist, because a reply may have been lost."""
     lost, living = job(1), job(2)
     for cost_ms, again in {300: {lost}, 500: set()}.items():
         made = meet(lost, living)
         take(made, 0, 100)
         made.back_off.conclude(lost.drive)
         made.back_off.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
-        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # the other one is still unknown
+        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # the other drive is pending
         answer(made, living, 90)
         assert lost not in {asked for asked, _ in take(made, 100, 90)}
         assert {asked for asked, _ in take(made, 200, 20)} - {living} == again
-        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # before the outcome is known
+        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # still pending itself
 
 
-def test_when_a_silent_drive_is_back_another_one_is_asked_and_no_more() -> None:
+def test_when_a_silent_drive_answers_again_exactly_one_other_is_tried() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
     for drive in (0, 1, 2):
         made.back_off.observe(drive, 2, 0, late_until_ns=0, cost_ns=300 * MS)

@@ -1,4 +1,4 @@
-"""The gain of a stated gap: reported for a class that states none, and never for a shipped family."""
+"""The gain of readable gaps: suggested for a class that declares none, and never for a built-in family."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SENTENCE = (
 )
 
 
-def test_the_meter_would_save_a_fifth() -> None:
+def test_readable_gaps_would_save_a_fifth_of_the_meters_reading_time() -> None:
     drive = Meter(1, baudrate=9600, format="8N1")
     gain = reading_gain(drive, [(drive.register(name), None) for name in ADDRESSES])
     assert gain is not None
@@ -53,7 +53,7 @@ def test_the_meter_would_save_a_fifth() -> None:
     assert reading_gain(told, [(told.register(name), None) for name in ADDRESSES]) is None
 
 
-def test_a_family_s_file_is_told_what_to_write_there(tmp_path: Path) -> None:
+def test_the_suggestion_for_a_family_file_uses_its_notation(tmp_path: Path) -> None:
     source = (
         "[family]\ntitle = 'Meter'\nmanual = 'of this test'\ncounts_from = 0\n[reading]\n"
         "low = { at = 1, unit = 'V' }\nhigh = { at = 3, unit = 'V' }\n"
@@ -69,7 +69,7 @@ def test_a_family_s_file_is_told_what_to_write_there(tmp_path: Path) -> None:
     assert gains[1] is None
 
 
-def test_nothing_is_said_where_gaps_are_stated_or_would_save_nothing() -> None:
+def test_gaps_are_not_suggested_if_declared_or_useless() -> None:
     class Compact(Drive):
         a = reading(1)
         b = reading(2)
@@ -79,7 +79,7 @@ def test_nothing_is_said_where_gaps_are_stated_or_would_save_nothing() -> None:
         assert reading_gain(drive, [(register, None) for register in drive.readings()]) is None
 
 
-def test_a_stated_limit_bounds_what_gaps_would_save() -> None:
+def test_a_stated_limit_bounds_the_gain_of_readable_gaps() -> None:
     class Limited(Drive):
         most_registers = {HOLDING: 3}
         a = reading(1)
@@ -92,7 +92,7 @@ def test_a_stated_limit_bounds_what_gaps_would_save() -> None:
     assert [len(gap) for _, gap in gain.gaps] == [1]
 
 
-def test_plan_and_models_say_it_of_a_user_s_own_class_alone(
+def test_plan_and_models_suggest_gaps_only_for_a_users_own_class(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = tmp_path / "hall.toml"
@@ -111,12 +111,10 @@ def test_plan_and_models_say_it_of_a_user_s_own_class_alone(
         main(["models", model])
         told = " ".join(capsys.readouterr().out.split())
         assert "readable_gaps" not in told
-        assert (
-            "the family states none" not in told or model in SHIPPED
-        )  # not all of their documents state one
+        assert "the family states none" not in told or model in SHIPPED  # not all documents state gaps
 
 
-def test_a_group_and_an_interval_are_facts_of_a_family(
+def test_plan_and_models_show_a_familys_groups_and_interval(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = (

@@ -32,14 +32,14 @@ def simulated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Simul
         yield bus
 
 
-def test_the_frame_and_the_words_are_modbus(simulated: SimulatedBus) -> None:
+def test_read_raw_sends_and_parses_the_standards_example(simulated: SimulatedBus) -> None:
     """Application protocol V1.1b3, 6.3: 7BH = 123 tenths, 96H = 150 hundredths; CRC by any calculator."""
     (toy,) = simulated.bus.drives
     assert toy.read_raw(3, 1, 2) == bytes.fromhex("007B 0096")
     assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
 
 
-def test_a_read_request_is_not_a_write(simulated: SimulatedBus, tmp_path: Path) -> None:
+def test_read_raw_is_not_treated_as_a_write(simulated: SimulatedBus, tmp_path: Path) -> None:
     """Neither audited nor retried nor in doubt, and no identity check goes before it."""
     (toy,) = simulated.bus.drives
     simulated.loses = lambda request: True
@@ -49,14 +49,14 @@ def test_a_read_request_is_not_a_write(simulated: SimulatedBus, tmp_path: Path) 
     assert list(read_audit(tmp_path / "audit.jsonl")) == []
 
 
-def test_an_exception_is_the_drives_refusal(simulated: SimulatedBus) -> None:
+def test_read_raw_raises_drive_exception_for_an_exception(simulated: SimulatedBus) -> None:
     (toy,) = simulated.bus.drives
     with pytest.raises(DriveException) as refusal:
         toy.read_raw(3, 0x4000, 1)
     assert refusal.value.code == 2
 
 
-def test_a_read_must_start_in_time(simulated: SimulatedBus) -> None:
+def test_read_raw_raises_expired_if_it_cannot_start_in_time(simulated: SimulatedBus) -> None:
     (toy,) = simulated.bus.drives
     simulated.queue_time = 0.3
     with pytest.raises(Expired, match=r"a read of 2 from 1 by function 03H was not sent: .* within 0.2 s"):
@@ -65,7 +65,7 @@ def test_a_read_must_start_in_time(simulated: SimulatedBus) -> None:
     assert toy.read_raw(3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
 
 
-def test_a_late_answer_is_awaited_no_longer_than_the_read_may_take(
+def test_read_raw_waits_for_late_replies_only_until_it_expires(
     monkeypatch: pytest.MonkeyPatch, simulated: SimulatedBus
 ) -> None:
     (toy,) = simulated.bus.drives
@@ -78,7 +78,7 @@ def test_a_late_answer_is_awaited_no_longer_than_the_read_may_take(
     assert simulated.seconds - begun < 0.21
 
 
-def test_a_copy_of_the_request_is_no_reply(simulated: SimulatedBus) -> None:
+def test_a_copy_of_the_request_is_not_returned_as_a_raw_reply(simulated: SimulatedBus) -> None:
     """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
     (toy,) = simulated.bus.drives
     echo = checksums.rtu(bytes.fromhex("07 01 03 20 00 11"))
@@ -104,7 +104,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("asked", WRONG)
-def test_an_impossible_read_is_an_error_before_any_frame(
+def test_an_impossible_raw_read_raises_before_any_frame_is_sent(
     simulated: SimulatedBus, asked: tuple[int, int, int]
 ) -> None:
     (toy,) = simulated.bus.drives
@@ -114,7 +114,7 @@ def test_an_impossible_read_is_an_error_before_any_frame(
 
 
 @pytest.mark.parametrize("asked", [(True, 1, 1), (3, 1.0, 1), (3, 1, "2")])
-def test_a_count_that_is_not_a_number_is_an_error(
+def test_a_raw_read_with_a_count_that_is_not_a_number_raises(
     simulated: SimulatedBus, asked: tuple[int, int, int]
 ) -> None:
     (toy,) = simulated.bus.drives
@@ -127,7 +127,7 @@ def test_a_count_that_is_not_a_number_is_an_error(
 
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])
-def test_a_raw_request_is_no_read(simulated: SimulatedBus, function: int) -> None:
+def test_send_raw_rejects_read_functions_before_sending(simulated: SimulatedBus, function: int) -> None:
     """It waits as long as a write may take: a late reply to the one before could then be its own."""
     (toy,) = simulated.bus.drives
     with pytest.raises(
@@ -137,7 +137,7 @@ def test_a_raw_request_is_no_read(simulated: SimulatedBus, function: int) -> Non
     assert simulated.frames == []
 
 
-def test_limits_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_raw_is_limited_by_the_familys_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     _, native, _ = one(monkeypatch, DelixiNative(1))
     with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
         native.read_raw(3, 1, 1)
@@ -150,7 +150,7 @@ def test_limits_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_line_that_is_polled_is_asked_between_the_polls() -> None:
+def test_read_raw_works_on_a_polled_line() -> None:
     """However busy the machine is: a reply that it delays is another's neither here nor there."""
     drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])
     expected = proofs(drive)

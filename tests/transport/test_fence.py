@@ -50,7 +50,7 @@ def test_a_suspended_master_sends_nothing_and_is_killed() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_resumed_master_sends_nothing() -> None:
+def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
     """Without the kernel's timer, which is hours away: only the check of the clock holds it back."""
     with fence(timer=3600) as made:
         found = rounds(made, 6)
@@ -61,7 +61,7 @@ def test_a_resumed_master_sends_nothing() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_master_without_the_deadline_check_sends() -> None:
+def test_a_master_without_the_deadline_check_does_send() -> None:
     """So the tests above can fail: the master believes that it may send for longer than others know."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)

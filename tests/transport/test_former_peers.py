@@ -74,7 +74,7 @@ def leave_a_reply_behind(wire: HoldingWire, port: str) -> None:
 
 
 @pytest.mark.parametrize("family", [Quick, Successor])
-def test_a_port_that_is_opened_again_gives_no_value_of_another_register(
+def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
     wire: HoldingWire, family: type[Toy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
@@ -86,7 +86,7 @@ def test_a_port_that_is_opened_again_gives_no_value_of_another_register(
         assert bus.peer(pump).late == 1
 
 
-def test_a_poller_that_opens_it_again_gives_none_either(wire: HoldingWire) -> None:
+def test_a_late_reply_on_a_reopened_port_is_not_polled_as_another_register(wire: HoldingWire) -> None:
     leave_a_reply_behind(wire, wire.path)
     drive = Quick(1, name="pump")
     values: set[float] = set()
@@ -95,7 +95,9 @@ def test_a_poller_that_opens_it_again_gives_none_either(wire: HoldingWire) -> No
     assert values == {1.11}
 
 
-def test_another_way_to_spell_the_port_is_the_same_port(wire: HoldingWire, tmp_path: Path) -> None:
+def test_late_replies_are_recognised_under_another_name_of_the_port(
+    wire: HoldingWire, tmp_path: Path
+) -> None:
     link = tmp_path / "hall"
     link.symlink_to(wire.path)
     leave_a_reply_behind(wire, str(link))
@@ -103,7 +105,7 @@ def test_another_way_to_spell_the_port_is_the_same_port(wire: HoldingWire, tmp_p
         assert bus.peer(bus.attach(Quick, 1)).owes
 
 
-def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
+def test_a_later_pseudo_terminal_of_the_same_number_has_another_identity() -> None:
     def made() -> set[str]:
         ours, theirs = os.openpty()
         try:
@@ -116,14 +118,14 @@ def test_a_pseudo_terminal_of_the_same_number_is_another_port() -> None:
     until(lambda: made() != first)  # their times are some ms apart, and less than any time-out
 
 
-def test_a_peer_without_owed_replies_is_not_kept(wire: HoldingWire) -> None:
+def test_a_peer_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
     before = dict(peers._former)
     with Bus(wire.path) as bus:
         bus.attach(Quick, 1).read(Quick.output_current)
     assert peers._former == before
 
 
-def test_an_owed_reply_is_forgotten_when_the_core_forgets_it(
+def test_a_remembered_peer_is_forgotten_after_the_same_time_as_in_the_core(
     wire: HoldingWire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
@@ -162,7 +164,7 @@ def answer_to_another(drive: Drive) -> bytes:
 
 @pytest.mark.long
 @table("name", LINES)
-def test_a_late_answer_to_an_earlier_process_is_not_misread(name: str) -> None:
+def test_a_late_reply_to_an_earlier_process_is_never_read_as_a_value(name: str) -> None:
     """Every value is the register's own, from the first on."""
     drives = of_one_variant(LINES[name])
     wire = PathWire([EncodedDrive(drive) for drive in drives], Faults())

@@ -46,7 +46,7 @@ def read_and_write(bus: Bus) -> None:
 # ---- the kinds of ports ----
 
 
-def test_a_socket() -> None:
+def test_a_drive_is_read_and_written_through_a_socket_port() -> None:
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path) as bus:
         read_and_write(bus)
     assert sim.wires[0].drives[0]["frequency"] == 25.0
@@ -66,7 +66,7 @@ def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: i
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_network_that_stalls_hands_on_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stalled_connection_is_cut_and_sends_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """A loopback loses no packets, so this test reads the socket options."""
     told: list[int] = []
 
@@ -92,7 +92,7 @@ def test_the_echo_option_is_kept_when_the_port_is_reopened(
         assert told == [Echo(echo)] * 2
 
 
-def test_a_port_discards_bytes_and_settles_after_each_opening(
+def test_a_port_waits_and_discards_bytes_after_each_opening(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A gateway that restarts when its port is opened prints that, and is deaf for a while."""
@@ -116,24 +116,24 @@ def test_a_port_discards_bytes_and_settles_after_each_opening(
 
 
 @pytest.mark.parametrize("settle", [-1, 10.1, float("nan"), "1.5 s", True])
-def test_a_port_settles_for_a_number_of_seconds(settle: object) -> None:
+def test_a_settle_that_is_not_a_number_of_seconds_raises(settle: object) -> None:
     with pytest.raises(ValueError, match="is not a number of seconds from 0 to 10"):
         Bus("/dev/nowhere", settle=settle)  # type: ignore[arg-type]
 
 
-def test_an_echo_option_is_one_of_three_words() -> None:
+def test_an_unknown_echo_option_raises() -> None:
     with pytest.raises(ValueError, match='echo \'loud\' is none of "auto", "on" and "off"'):
         Bus("/dev/null", echo="loud")
 
 
-def test_a_pty_is_opened_again_and_again() -> None:
+def test_a_pty_can_be_opened_repeatedly() -> None:
     with Simulator([wire()]) as sim:
         for _ in range(5):
             with Bus(sim.wires[0].path) as bus:
                 read_and_write(bus)
 
 
-def test_a_pty_at_settings_that_it_cannot_have() -> None:
+def test_a_pty_works_although_it_ignores_the_parity() -> None:
     """It stays at 8 bits without parity for any settings, and all bytes pass."""
     drive = simulated(Toy(1, format="8E1"))
     drive["output_current"] = 3.25
@@ -143,7 +143,7 @@ def test_a_pty_at_settings_that_it_cannot_have() -> None:
                 read_and_write(bus)
 
 
-def test_a_port_is_set_to_low_latency(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_is_set_to_low_latency_mode(monkeypatch: pytest.MonkeyPatch) -> None:
     """USB adapters do it for 16 ms."""
     told: list[bool] = []
     monkeypatch.setattr(Serial, "set_low_latency_mode", lambda port, wanted: told.append(wanted))
@@ -154,7 +154,7 @@ def test_a_port_is_set_to_low_latency(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
-def test_a_port_without_low_latency_is_opened(
+def test_a_port_without_low_latency_mode_is_opened(
     monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
 ) -> None:
     def refuse(port: Serial, wanted: bool) -> None:
@@ -175,7 +175,7 @@ def server() -> Iterator[SerialServer]:
 
 @pytest.mark.slow
 @pyserials_own
-def test_a_port_without_a_descriptor(server: SerialServer) -> None:
+def test_a_drive_is_read_and_written_through_an_rfc2217_port(server: SerialServer) -> None:
     with Bus(server.url, baudrate=19200, format="8E1") as bus:
         read_and_write(bus)
         far = server.port
@@ -184,7 +184,7 @@ def test_a_port_without_a_descriptor(server: SerialServer) -> None:
 
 @pytest.mark.slow
 @pyserials_own
-def test_a_port_without_a_descriptor_is_polled(server: SerialServer) -> None:
+def test_an_rfc2217_port_is_polled(server: SerialServer) -> None:
     toy = polled(Toy(1, baudrate=19200), [Toy.output_current])
     with Poller(plant(line(server.url, toy))) as poller:
         rows = []
@@ -194,7 +194,7 @@ def test_a_port_without_a_descriptor_is_polled(server: SerialServer) -> None:
 
 @pytest.mark.slow
 @pyserials_own
-def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServer) -> None:
+def test_drives_with_different_settings_on_an_rfc2217_port_raise(server: SerialServer) -> None:
     slow, fast = Toy(1, baudrate=9600), Toy(2, baudrate=19200)
     with pytest.raises(LineError, match=r"cannot change its settings from drive to drive$"):
         Poller(plant(line(server.url, polled(slow, [Toy.status]), polled(fast, [Toy.status]))))
@@ -231,7 +231,7 @@ def os_words_of_an_unknown_zone() -> str:
         ("spy://{tmp}/absent", "there is no such port"),
     ],
 )
-def test_an_unopenable_port_is_one_sentence(tmp_path: Path, port: str, reason: str) -> None:
+def test_opening_an_invalid_port_raises_one_sentence(tmp_path: Path, port: str, reason: str) -> None:
     (tmp_path / "file").write_text("no port")
     with socket.create_server(("127.0.0.1", 0)) as listener:
         closed = listener.getsockname()[1]
@@ -246,7 +246,7 @@ def test_an_unopenable_port_is_one_sentence(tmp_path: Path, port: str, reason: s
     assert isinstance(caught.value, ValueError) == is_mistaken
 
 
-def test_a_port_is_opened_by_one_at_a_time() -> None:
+def test_a_port_that_is_open_cannot_be_opened_by_another_bus() -> None:
     with Simulator([wire()]) as sim:
         port = sim.wires[0].path
         with Bus(port) as first:
@@ -257,7 +257,7 @@ def test_a_port_is_opened_by_one_at_a_time() -> None:
         Line(port).open().close()
 
 
-def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path) -> None:
+def test_closed_and_unopened_ports_leave_no_descriptors_or_threads(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
         Line(sim.wires[0].path).open().close()  # lazily opened descriptors are open now
         before = descriptors(), threads()
@@ -287,7 +287,7 @@ def vanishing_socket() -> tuple[str, Callable[[], None]]:
 
 
 @pytest.mark.slow
-def test_a_port_that_is_flooded_before_its_first_exchange_and_after_it() -> None:
+def test_on_a_flooded_port_a_read_raises_no_reply() -> None:
     master, slave = os.openpty()
     with Bus(os.ttyname(slave)) as bus:
         toy = bus.attach(Toy(1))
@@ -301,7 +301,9 @@ def test_a_port_that_is_flooded_before_its_first_exchange_and_after_it() -> None
 
 
 @pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
-def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Callable[[], None]]]) -> None:
+def test_a_port_lost_during_a_read_raises_line_error(
+    make: Callable[[], tuple[str, Callable[[], None]]],
+) -> None:
     path, hang_up = make()
     thread = threading.Thread(target=hang_up)
     thread.start()
@@ -320,7 +322,7 @@ def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Calla
 
 
 @pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
-def test_a_write_on_a_port_that_is_lost_may_have_happened(
+def test_a_port_lost_during_a_write_raises_unconfirmed(
     make: Callable[[], tuple[str, Callable[[], None]]],
 ) -> None:
     path, hang_up = make()
@@ -335,7 +337,7 @@ def test_a_write_on_a_port_that_is_lost_may_have_happened(
             toy.send_raw(6, 0x15, bytes(2))
 
 
-def test_a_port_is_opened_again_under_its_link(tmp_path: Path) -> None:
+def test_a_port_is_reopened_by_the_device_link(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     with Simulator([wire(str(link))]), Bus(str(link)) as bus:
         read_and_write(bus)
@@ -349,7 +351,7 @@ def test_a_port_is_opened_again_under_its_link(tmp_path: Path) -> None:
     os.close(held)
 
 
-def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None:
+def test_a_tap_continues_after_the_port_is_reopened(tmp_path: Path) -> None:
     with (
         Simulator([wire()]) as sim,
         Bus(sim.wires[0].path) as bus,
@@ -366,7 +368,7 @@ def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None
         ]
 
 
-def test_a_bridged_port_has_its_settings_when_it_is_opened_again() -> None:
+def test_a_bridged_port_keeps_its_settings_when_it_is_reopened() -> None:
     """spy:// is pyserial's way to watch a port; the drive ignores another baud rate."""
     with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
         path = sim.wires[0].path
@@ -379,7 +381,7 @@ def test_a_bridged_port_has_its_settings_when_it_is_opened_again() -> None:
             assert toy.read(toy.output_current) == 0
 
 
-def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
+def test_a_bridged_port_that_cannot_be_set_up_raises_one_sentence() -> None:
     master, slave = os.openpty()
     port = f"spy://{os.ttyname(slave)}"
     with Bus(port) as bus:
@@ -393,7 +395,7 @@ def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_is_not_freed_while_another_thread_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_is_not_freed_while_another_thread_ends_its_exchanges(monkeypatch: pytest.MonkeyPatch) -> None:
     closing: list[threading.Thread] = []
     end = Port.end
 
@@ -413,7 +415,7 @@ def test_a_port_is_not_freed_while_another_thread_ends_it(monkeypatch: pytest.Mo
         assert not ours.end()
 
 
-def test_a_closed_bus_says_so() -> None:
+def test_reading_through_a_closed_bus_raises_that_it_is_closed() -> None:
     with Simulator([wire()]) as sim:
         with Bus(sim.wires[0].path) as bus:
             toy = bus.attach(Toy, 1)
@@ -445,7 +447,7 @@ def test_closing_ends_exchanges_that_wait_for_a_reply() -> None:
     assert [failure.port for failure in failures] == [bus.line.port]
 
 
-def test_a_file_named_by_a_port_s_url_stays_as_it_is(tmp_path: Path) -> None:
+def test_a_file_named_in_a_ports_url_is_not_changed(tmp_path: Path) -> None:
     """pyserial's spy:// empties the file that it names."""
     precious = tmp_path / "precious"
     precious.write_text("precious")

@@ -28,7 +28,7 @@ def messages(caplog: pytest.LogCaptureFixture, logger: str) -> list[tuple[str, s
     return [(record.levelname, record.getMessage()) for record in caplog.records if record.name == logger]
 
 
-def test_a_port_that_is_opened_and_closed(caplog: pytest.LogCaptureFixture) -> None:
+def test_opening_and_closing_a_port_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with (
         caplog.at_level(logging.INFO, "multidrop"),
         Simulator([Wire([SimulatedDrive(PatientToy(1))])]) as sim,
@@ -39,7 +39,7 @@ def test_a_port_that_is_opened_and_closed(caplog: pytest.LogCaptureFixture) -> N
     assert told == [("INFO", f"{port}: opened ({port})"), ("INFO", f"{port}: closed")]
 
 
-def test_a_port_that_never_was_there_is_not_missed_again(
+def test_a_port_that_was_never_opened_is_not_logged_as_lost(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     with caplog.at_level(logging.INFO, "multidrop"):
@@ -52,7 +52,7 @@ def test_a_port_that_never_was_there_is_not_missed_again(
     assert first == ("WARNING", f"{tmp_path}/port: not opened: there is no such port")
 
 
-def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     """Its loss is logged once, despite repeated requests."""
     link = tmp_path / "port"
 
@@ -82,7 +82,7 @@ def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_
     assert levels[:3] == [("INFO", "opened"), ("WARNING", "lost"), ("INFO", "opened again")]
 
 
-def test_frames_are_logged_at_debug_alone(caplog: pytest.LogCaptureFixture) -> None:
+def test_frames_are_logged_only_at_level_debug(caplog: pytest.LogCaptureFixture) -> None:
     with (
         Simulator([Wire([SimulatedDrive(PatientToy(1))], unpaced=True)]) as sim,
         Bus(sim.wires[0].path) as bus,
@@ -131,7 +131,7 @@ class Hanging(logging.Handler):
         self.released.wait(PATIENCE)
 
 
-def test_a_handler_that_hangs_keeps_no_stop_from_being_repeated(
+def test_a_stop_is_repeated_although_a_log_handler_hangs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))

@@ -61,7 +61,7 @@ def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
 
 @pytest.mark.long
 @given(st.binary(max_size=200), st.lists(st.integers(0, 1000), max_size=20))
-def test_a_far_end_s_escaped_data_come_back(data: bytes, cuts: list[int]) -> None:
+def test_escaped_telnet_data_are_restored(data: bytes, cuts: list[int]) -> None:
     near, far = socket.socketpair()
     stream = b"".join(manager(near).escape(data))
     near.close()
@@ -73,12 +73,12 @@ def test_a_far_end_s_escaped_data_come_back(data: bytes, cuts: list[int]) -> Non
     st.lists(st.sampled_from([IAC, SB, SE, rfc2217.DO, rfc2217.WONT, b"\xf1", b"a", b"\x2c"]), max_size=40),
     st.lists(st.integers(0, 1000), max_size=20),
 )
-def test_a_stream_means_the_same_in_any_pieces(stream: list[bytes], cuts: list[int]) -> None:
+def test_a_telnet_stream_is_split_alike_in_any_pieces(stream: list[bytes], cuts: list[int]) -> None:
     whole = b"".join(stream)
     assert split(pieces(whole, cuts)) == split([whole])
 
 
-def test_a_stream_is_decoded_to_data_and_commands() -> None:
+def test_a_telnet_stream_is_split_into_data_and_commands() -> None:
     stream = b"ab" + IAC + rfc2217.DO + b"\x2c" + IAC + SB + b"\x2c\x65" + IAC + IAC + IAC + SE + b"c"
     assert split([stream]) == [
         (b"", b"ab"),
@@ -88,7 +88,7 @@ def test_a_stream_is_decoded_to_data_and_commands() -> None:
     ]
 
 
-def test_a_suboption_without_an_end_fills_no_memory() -> None:
+def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
     telnet, flood = Telnet(), bytes(65536)
     assert not list(telnet.split(IAC + SB))
     tracemalloc.start()
@@ -177,7 +177,7 @@ class HeldUp:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
-def test_a_request_that_waited_behind_another_is_never_sent() -> None:
+def test_a_request_that_waited_behind_a_blocked_request_is_never_sent() -> None:
     """It has expired, and may be a start."""
     port = HeldUp()
     bridge = Bridge(port)  # type: ignore[arg-type]
@@ -221,7 +221,7 @@ def test_a_bridge_forwards_requests_without_socket_timestamps(monkeypatch: pytes
     bridge.close()
 
 
-def test_a_bridge_for_which_there_are_no_threads_is_a_port_that_failed(
+def test_a_bridge_without_threads_raises_os_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     started: list[threading.Thread] = []
@@ -239,7 +239,7 @@ def test_a_bridge_for_which_there_are_no_threads_is_a_port_that_failed(
     assert not started[0].is_alive()
 
 
-def test_a_bridge_passes_pieces_that_the_core_reads_whole() -> None:
+def test_a_bridge_passes_long_input_in_pieces() -> None:
     port = HeldUp()
     arrived = bytes(range(256)) * 20
     chunks = [arrived[:1], b""]
@@ -267,7 +267,7 @@ def test_a_bridge_with_unread_data_closes() -> None:
     assert not any(thread.is_alive() for thread in bridge._threads)
 
 
-def test_a_network_that_takes_nothing_is_a_lost_port_at_once() -> None:
+def test_a_write_to_a_full_network_fails_immediately() -> None:
     near, far = socket.socketpair()
     near.settimeout(3600)  # pyserial's own is 5 s
     port = RFC2217Port()
@@ -418,7 +418,7 @@ def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: F
     assert START not in taken
 
 
-def test_a_network_is_given_up_before_a_write_is() -> None:
+def test_a_stalled_network_is_cut_before_a_write_times_out() -> None:
     """Otherwise a write could arrive after it was reported as unconfirmed."""
     assert MOST_AGE + MOST_STALL_MS / 1000 <= WRITE_TIMEOUT
 
@@ -436,14 +436,14 @@ def test_every_connection_limits_unacknowledged_data() -> None:
         far.close()
 
 
-def test_a_port_that_was_never_opened_is_closed_without_a_word() -> None:
+def test_closing_a_port_that_was_never_opened_prints_nothing() -> None:
     """Python 3.13 prints errors of such a port's finalizer."""
     port = SocketPort()
     port.close()
     assert not port.is_open
 
 
-def test_a_port_opens_whatever_the_number_of_its_descriptor() -> None:
+def test_a_socket_port_works_with_a_descriptor_above_1023() -> None:
     """Hundreds of lines take more than the 1024 that select() bears."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < 1400:

@@ -78,7 +78,7 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
 )
-def test_a_device_is_described_by_its_adapter(
+def test_adapter_of_returns_place_and_serial_number(
     tmp_path: Path, device: str, serial: str, port_number: str, adapter: USBAdapter | None
 ) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -100,7 +100,7 @@ def test_a_device_is_described_by_its_adapter(
         (("1-1", "A1"), ("1-2", ""), False),
     ],
 )
-def test_a_port_is_opened_again_with_the_same_adapter_alone(
+def test_a_port_is_reopened_only_with_the_same_adapter(
     tmp_path: Path, before: tuple[str, str], now: tuple[str, str], is_same: bool
 ) -> None:
     folder = tmp_path / "-".join(before + now)
@@ -149,7 +149,7 @@ def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path
             assert found.is_lost
 
 
-def test_a_plant_file_gets_the_name_that_lasts(
+def test_lasting_name_returns_the_name_with_the_serial_number(
     tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by_id, names = tmp_path / "by-id", {}
@@ -168,7 +168,7 @@ def test_a_plant_file_gets_the_name_that_lasts(
         assert lasting_name(other) == other
 
 
-def test_a_name_by_the_place_is_whatever_is_plugged_in_there(
+def test_a_port_named_by_its_usb_socket_opens_with_any_adapter(
     tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(open_port, "BY_PLACE", str(tmp_path))

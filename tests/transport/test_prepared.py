@@ -86,7 +86,7 @@ def completions_of(
 
 
 @pytest.mark.slow
-def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Counted) -> None:
+def test_repeated_reads_of_the_same_registers_are_planned_once(bus: Bus, counted: Counted) -> None:
     one, other = bus.attach(PatientToy, 1), bus.attach(PatientToy, 2)
     first = one.read_many(WANTED)
     assert counted.since() == (1, 2)
@@ -99,7 +99,7 @@ def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Count
 
 
 @pytest.mark.slow
-def test_a_drive_that_left_leaves_nothing_behind(bus: Bus, counted: Counted) -> None:
+def test_detaching_a_drive_removes_its_prepared_reads(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
     drive.read_many(WANTED)
     bus.detach(drive)
@@ -112,7 +112,7 @@ def test_a_drive_that_left_leaves_nothing_behind(bus: Bus, counted: Counted) -> 
     assert counted.since() == (1, 2)
 
 
-def test_a_reopened_port_has_its_reads_planned_again(bus: Bus, counted: Counted) -> None:
+def test_reads_are_planned_again_after_the_port_is_reopened(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
     drive.read_many(WANTED)
     bus.line.reopen()
@@ -125,7 +125,7 @@ def test_a_reopened_port_has_its_reads_planned_again(bus: Bus, counted: Counted)
     ("name", "value"),
     [("settings", Settings(19200, "8N1")), ("agreed_silence", 0.01), ("response_delay", 0.2), ("address", 3)],
 )
-def test_a_planned_read_follows_changed_settings(bus: Bus, name: str, value: object) -> None:
+def test_a_prepared_read_follows_changed_settings(bus: Bus, name: str, value: object) -> None:
     drive = bus.attach(PatientToy, 1)
     before = bus._exchanges._prepare(drive)
     assert bus._exchanges._prepare(drive) is before
@@ -139,7 +139,7 @@ def test_a_planned_read_follows_changed_settings(bus: Bus, name: str, value: obj
     assert made.c.silence_ns == round(silence(drive) * 1e9)
 
 
-def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_cached_read_plans_is_limited(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prepared_reads, "MOST_PREPARED", 3)
     drive = bus.attach(PatientToy, 1)
     for wanted in permutations(WANTED):
@@ -148,7 +148,7 @@ def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.Mo
     assert prepared.of.cache_info().currsize == 3
 
 
-def test_each_read_fills_its_completion_in_again_and_again(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_reads_reuse_their_completion(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = bus.attach(PatientToy, 1)
     asked = completions_of(bus, monkeypatch)
     first = drive.read_many(WANTED)
@@ -158,7 +158,7 @@ def test_each_read_fills_its_completion_in_again_and_again(bus: Bus, monkeypatch
     assert asked[:2] * 4 == asked
 
 
-def test_reads_at_once_go_into_completions_of_their_own(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_reads_use_separate_completions(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = bus.attach(PatientToy, 1)
     value = drive.read(Toy.acceleration_time)
     both = Barrier(2)
@@ -170,7 +170,7 @@ def test_reads_at_once_go_into_completions_of_their_own(bus: Bus, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_a_read_that_failed_keeps_its_completion(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_completion_of_a_failed_read_is_not_reused(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     gone = bus.attach(Toy, 3)
     asked = completions_of(bus, monkeypatch)
     for _ in range(2):
@@ -252,7 +252,7 @@ def decoder() -> BlockDecoder:
 
 
 @given(st.binary(min_size=2 * WORDS, max_size=2 * WORDS))
-def test_each_value_is_the_one_that_its_bytes_say(data: bytes) -> None:
+def test_each_value_is_decoded_from_its_bytes(data: bytes) -> None:
     found = decoder().decode(reply(data))
     assert found == expected(data)
     assert type(found["pulses"]) is int  # more digits than a float holds
@@ -260,7 +260,7 @@ def test_each_value_is_the_one_that_its_bytes_say(data: bytes) -> None:
 
 @example(bytes(2 * WORDS - 1))
 @given(st.binary(max_size=2 * WORDS - 1))
-def test_a_reply_that_ends_too_soon_has_the_values_that_are_whole(data: bytes) -> None:
+def test_a_short_reply_has_the_values_that_are_complete(data: bytes) -> None:
     block = Block.of(Mixed(1), REGISTERS)
     found = decoder_of(block).decode(reply(data))
     assert found == {one.name: one.value_in(data, one.address - FIRST) for one in REGISTERS}
@@ -271,6 +271,6 @@ def test_the_core_decodes_floats() -> None:
     assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 
-def test_drives_of_a_kind_share_a_decoder_and_other_blocks_have_their_own() -> None:
+def test_drives_of_a_model_share_a_decoder_and_other_blocks_do_not() -> None:
     assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
     assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()

@@ -18,7 +18,7 @@ from multidrop.errors import BadReply, DriveException, NoReply
 WIDE = 24
 
 
-def test_a_refusal_splits_and_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_block_is_read_in_parts_until_the_port_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=8)
     bus = SimulatedBus(monkeypatch, sim)
@@ -35,7 +35,7 @@ def test_a_refusal_splits_and_is_remembered(monkeypatch: pytest.MonkeyPatch) -> 
     assert sim.asked[0] == (0, WIDE)
 
 
-def test_a_refused_register_is_refused_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_refused_block_names_the_refused_register(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, refused={3})
     bus = SimulatedBus(monkeypatch, sim)
@@ -74,7 +74,7 @@ def test_a_read_is_complete_or_names_the_refused_register(
 
 
 @pytest.mark.parametrize("code", [1, 5, 6])
-def test_busy_splits_nothing(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_block_refused_as_busy_is_not_split(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = family(WIDE)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, sim := Picky(drive))
     bus.attach(drive)
@@ -85,7 +85,7 @@ def test_busy_splits_nothing(code: int, monkeypatch: pytest.MonkeyPatch) -> None
     assert sim.asked == [(0, WIDE)]
 
 
-def test_a_refusal_of_several_registers_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_several_refused_registers_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
     scaled = {"flow": reading(2, scale_register="power"), "power": reading(3, number_format=NumberFormat.I16)}
     drive = family(2, **scaled)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, sim := Picky(drive))
@@ -109,7 +109,7 @@ def test_a_long_request_without_a_reply_is_split(
     assert [count for _, count in sim.asked] == [6] * 4
 
 
-def test_a_dead_drive_costs_one_request_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dead_drive_gets_only_one_additional_request(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = family(WIDE)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, sim := Picky(drive, silent_beyond=0))
     bus.attach(drive)

@@ -95,7 +95,7 @@ def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list
 @pytest.mark.parametrize(
     ("mode", "sending", "receiving"), [("rts-up", "up", "down"), ("rts-down", "down", "up")]
 )
-def test_rts_stands_for_sending_while_a_request_leaves_and_no_longer(
+def test_rts_switches_to_sending_only_while_a_request_is_sent(
     driver: Path, mode: str, sending: str, receiving: str
 ) -> None:
     read, events = play(driver, mode, 20)
@@ -114,7 +114,7 @@ def test_rts_stands_for_sending_while_a_request_leaves_and_no_longer(
 
 
 @pytest.mark.long
-def test_the_driver_s_own_mode_is_switched_on_as_it_was_set_up(driver: Path) -> None:
+def test_the_drivers_rs485_mode_is_switched_on_with_its_configured_polarity(driver: Path) -> None:
     for flags in (ON_SEND, AFTER_SEND):
         read, events = play(driver, "kernel", 3, RS485_FLAGS=flags)
         assert len(read) == 3
@@ -124,7 +124,7 @@ def test_the_driver_s_own_mode_is_switched_on_as_it_was_set_up(driver: Path) -> 
 
 
 @pytest.mark.long
-def test_a_driver_without_rs485_is_an_error_before_any_frame(driver: Path) -> None:
+def test_a_driver_without_rs485_raises_before_any_frame_is_sent(driver: Path) -> None:
     for mode, variables, why in (
         ("kernel", {}, f"has no RS-485 mode ({os.strerror(errno.ENOTTY)})"),
         ("rts-up", {"RS485_CALLS": 0}, f"does not switch RTS ({os.strerror(errno.ENOTTY)})"),
@@ -135,7 +135,7 @@ def test_a_driver_without_rs485_is_an_error_before_any_frame(driver: Path) -> No
 
 
 @pytest.mark.long
-def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -> None:
+def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -> None:
     said, events = play(driver, "rts-up", 9, RS485_CALLS=6)
     assert said[-1].endswith(os.strerror(errno.EIO))
     broken = [event.what for event in events].index("broken")
@@ -146,7 +146,7 @@ def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -
 # ---- without that driver: a pseudo-terminal's has no RTS ----
 
 
-def test_a_poller_fails_immediately_and_leaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_poller_fails_immediately_without_rts_and_leaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
         Bus(sim.wires[0].path).close()  # the core's thread starts with the first port, and stays
@@ -158,14 +158,14 @@ def test_a_poller_fails_immediately_and_leaks_nothing(monkeypatch: pytest.Monkey
         assert (descriptors(), threads()) == before
 
 
-def test_a_pseudo_terminal_goes_without() -> None:
+def test_a_pseudo_terminal_works_without_transceiver_switching() -> None:
     for mode in RS485:
         with Simulator([Wire([simulated(Toy(1))])]) as sim, Bus(sim.wires[0].path, rs485=mode) as bus:
             toy = bus.attach(Toy, 1)
             assert toy.read(toy.output_current) is not None
 
 
-def test_the_word_is_one_of_four_and_the_port_a_device() -> None:
+def test_an_unknown_rs485_option_or_a_network_port_raises() -> None:
     with pytest.raises(ValueError, match='rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'):
         Bus("/dev/null", rs485="on")
     with pytest.raises(ValueError, match="serial devices only, and tcp://h is not one; remove it"):
@@ -184,7 +184,7 @@ address = 1
 """
 
 
-def test_a_plant_file_says_it_of_a_line(tmp_path: Path) -> None:
+def test_rs485_is_read_from_a_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT.format("/dev/ttyS0", '"rts-down"'))
     loaded = load_plant(path)
@@ -201,7 +201,9 @@ def test_a_plant_file_says_it_of_a_line(tmp_path: Path) -> None:
         ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one; remove it"),
     ],
 )
-def test_an_invalid_line_option_is_one_mistake(tmp_path: Path, port: str, value: str, sentence: str) -> None:
+def test_an_invalid_line_option_is_reported_as_one_mistake(
+    tmp_path: Path, port: str, value: str, sentence: str
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT.format(port, value))
     with pytest.raises(PlantError) as wrong:

@@ -65,12 +65,12 @@ def test_buckets_follow_each_other_closely() -> None:
     assert all(high - low <= low / 8 for low, high in pairwise(edges[1:]))
 
 
-def test_no_reply_has_no_delay() -> None:
+def test_without_replies_the_delays_are_0() -> None:
     found = Statistics(1.0, Counters()).delays
     assert (found.replies, found.p50, found.p99, found.longest) == (0, 0, 0, 0)
 
 
-def test_statistics_count_the_drive_s_own_delay(line: LineDriver, drive: Peer) -> None:
+def test_delays_include_only_the_drives_response_time(line: LineDriver, drive: Peer) -> None:
     for delay in (10, 10, 10, 15):
         answer(line, drive, delay * MS)
     found = Statistics(1.0, drive.counters()).delays
@@ -86,7 +86,9 @@ def test_utilisation_follows_the_wire_s_settings(line: LineDriver, drive: Peer, 
     assert drive.counters().ideal_ns == pytest.approx(10 * (characters + delay_ms * MS + SILENCE), rel=0.1)
 
 
-def test_a_port_without_a_wire_is_not_used_for_longer_than_there_is(line: LineDriver, drive: Peer) -> None:
+def test_the_utilisation_of_a_port_faster_than_its_settings_is_at_most_1(
+    line: LineDriver, drive: Peer
+) -> None:
     """The whole reply is there after 0.1 ms; a wire takes 15 characters."""
     begun = line.now
     for _ in range(100):
@@ -133,7 +135,7 @@ def counted(known: Peer) -> Counter[str]:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_the_guides_counters(line: LineDriver, drive: Peer, ending: str) -> None:
+def test_each_outcome_is_counted_in_the_guides_counters(line: LineDriver, drive: Peer, ending: str) -> None:
     request, received, expected = ENDINGS[ending]
     line.echo = lib.MD_NO_ECHO
     ask(line, drive, request)
@@ -143,7 +145,7 @@ def test_the_guides_counters(line: LineDriver, drive: Peer, ending: str) -> None
     assert counted(drive) == expected
 
 
-def test_noise_on_a_line_of_text(line: LineDriver, drive: Peer) -> None:
+def test_noise_on_an_ascii_line_is_counted_as_communication_error(line: LineDriver, drive: Peer) -> None:
     line.begin(exchange(READ, drive, Framing.ASCII))
     line.wait_until_write()
     line.receive(b"\xff\xff")
@@ -151,7 +153,7 @@ def test_noise_on_a_line_of_text(line: LineDriver, drive: Peer) -> None:
     assert counted(drive) == DAMAGED
 
 
-def test_a_late_reply_is_a_message_of_its_own(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_is_counted_as_a_separate_message(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.wait_until_done()
     line.receive(rtu("01 03 02 00 07"))
@@ -185,7 +187,7 @@ def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> 
     return line_statistics(seconds, drives, overruns)
 
 
-def test_a_span_is_the_difference_of_two_looks() -> None:
+def test_statistics_of_a_span_are_the_difference_of_two_readings() -> None:
     one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({10: 3})))
     two = line_of(
         12,
@@ -202,7 +204,7 @@ def test_a_span_is_the_difference_of_two_looks() -> None:
     assert found.drives["pump"].utilisation == 0.5
 
 
-def test_the_longest_delay_of_a_span() -> None:
+def test_the_longest_delay_of_a_span_is_derived_from_its_buckets() -> None:
     early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
     found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
     assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # no record: its bucket's end
@@ -219,7 +221,7 @@ def toy() -> SimulatedDrive:
 
 
 @pytest.mark.slow
-def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
+def test_a_bus_counts_exchanges_and_delays(toy: SimulatedDrive) -> None:
     with Simulator([Wire([toy], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         pump, nobody = bus.attach(Toy, 1, name="pump"), bus.attach(Toy, 2, name="nobody")
         pump.read_many(pump.readings())
@@ -259,7 +261,7 @@ def test_a_poller_counts_its_rows_by_status(toy: SimulatedDrive) -> None:
     assert poller.statistics()["line"].exchanges == 0
 
 
-def test_drives_that_were_renamed_or_exchanged_count_from_the_reset_on(toy: SimulatedDrive) -> None:
+def test_renamed_and_replaced_drives_are_counted_since_the_reset(toy: SimulatedDrive) -> None:
     """Otherwise one has earlier counts, and another negative ones."""
     others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]
     with Simulator([Wire([toy, *others], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
@@ -289,7 +291,7 @@ STEPS = 400
 
 @pytest.mark.long
 @table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
-def test_a_line_is_never_used_for_longer_than_there_is(seconds: float) -> None:
+def test_the_utilisation_of_a_polled_line_is_at_most_1(seconds: float) -> None:
     """An exchange under way at a reading counts after it, with all its time."""
     pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]
     wire = ClockedWire([EncodedDrive(pump) for pump in pumps], Faults())

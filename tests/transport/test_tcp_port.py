@@ -74,13 +74,13 @@ def responder(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
         ("tcp://[fe80::1]", "socket://[fe80::1]:502", "[fe80::1]:502"),
     ],
 )
-def test_a_port_without_a_number_is_502(name: str, opened: str, identity: str) -> None:
+def test_the_default_tcp_port_is_502(name: str, opened: str, identity: str) -> None:
     assert unopened(name).port == opened
     assert of_name(name) == identity
 
 
 @table("name", ["tcp://", "tcp://:502", "tcp://10.0.0.7:0", "tcp://10.0.0.7:99999"])
-def test_a_name_without_a_place_is_a_sentence(name: str) -> None:
+def test_an_invalid_tcp_url_raises_one_sentence(name: str) -> None:
     with pytest.raises(NoSuchPort, match=r"it needs a host, such as tcp://10\.0\.0\.7|Port out of range"):
         Bus(name)
 
@@ -99,7 +99,7 @@ def port() -> Iterator[str]:
         yield line.wires[0].path
 
 
-def test_every_drive_takes_the_port_s_framing_and_gives_it_back(port: str) -> None:
+def test_a_drive_uses_the_ports_framing_while_it_is_attached(port: str) -> None:
     drive = InnovertIBD(1)
     with Bus(port) as bus:
         bus.attach(drive)
@@ -119,7 +119,7 @@ def test_every_drive_takes_the_port_s_framing_and_gives_it_back(port: str) -> No
         (DelixiNative(1), "does not speak Modbus, and tcp://.* carries nothing else"),
     ],
 )
-def test_another_framing_on_tcp_is_a_sentence(port: str, drive: Drive, sentence: str) -> None:
+def test_another_framing_on_tcp_raises_one_sentence(port: str, drive: Drive, sentence: str) -> None:
     with Bus(port) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
 
@@ -131,13 +131,13 @@ def test_another_framing_on_tcp_is_a_sentence(port: str, drive: Drive, sentence:
         (Meter(0), "framing tcp is for tcp:// ports"),
     ],
 )
-def test_tcp_on_a_serial_port_is_a_sentence(drive: Drive, sentence: str) -> None:
+def test_tcp_framing_on_a_serial_port_raises_one_sentence(drive: Drive, sentence: str) -> None:
     wire = Wire([simulated(InnovertIBD(9))])
     with Simulator([wire]), Bus(wire.path) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
 
 
-def test_a_unit_id_beyond_a_serial_line_s_addresses_stays_on_tcp() -> None:
+def test_unit_ids_of_modbus_tcp_raise_on_other_ports() -> None:
     class Both(Drive):
         title = "Both"
         addresses = range(256)
@@ -158,7 +158,7 @@ def test_every_unit_id_is_read(unit: int) -> None:
         assert bus.attach(Meter, unit).read(Meter.voltage) == 230
 
 
-def test_nothing_is_broadcast() -> None:
+def test_no_broadcast_is_sent_on_modbus_tcp() -> None:
     drives = [YD1000(1), YD1000(2)]
     sims = [simulated(drive) for drive in drives]
     wire = Wire(sims, port="tcp://127.0.0.1:0", unpaced=True)
@@ -226,7 +226,7 @@ def answer_when_both_asked(listening: socket.socket) -> None:
         threading.Thread(target=serve, args=[listening.accept()[0]], daemon=True).start()
 
 
-def test_two_lines_of_one_gateway_have_a_request_under_way_each(tmp_path: Path) -> None:
+def test_two_lines_of_one_gateway_have_concurrent_requests(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         threading.Thread(target=answer_when_both_asked, args=[listening], daemon=True).start()
         port = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
@@ -236,7 +236,7 @@ def test_two_lines_of_one_gateway_have_a_request_under_way_each(tmp_path: Path) 
     assert found - {("pump-1", None), ("pump-2", None)} <= {("pump-1", 0.1), ("pump-2", 0.2)}
 
 
-def test_one_unit_is_on_one_line_of_its_gateway(tmp_path: Path) -> None:
+def test_a_unit_on_two_lines_of_one_gateway_is_a_mistake(tmp_path: Path) -> None:
     sentence = r'line "net-2", drive "pump-2": address 1 is already used by line "net-1", drive "pump-1"'
     with pytest.raises(PlantError, match=sentence):
         load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
@@ -270,7 +270,7 @@ def test_modbus_tcp_behind_a_socket_url_is_reported() -> None:
 
 
 @pytest.mark.slow
-def test_silence_names_the_other_way() -> None:
+def test_the_error_for_a_silent_port_names_the_other_protocol() -> None:
     with responder(None) as (place, _):
         for kind, other in (("tcp", "socket"), ("socket", "tcp")):
             with Bus(f"{kind}://{place}") as bus:
@@ -302,7 +302,7 @@ def test_a_gateway_s_unreachable_drive_gives_no_reply() -> None:
 
 
 @pytest.mark.parametrize("kind", ["socket", "tcp"])
-def test_only_the_other_way_s_shape_is_taken_for_it(kind: str) -> None:
+def test_mixed_up_recognises_only_frames_of_the_other_protocol(kind: str) -> None:
     port = f"{kind}://10.0.0.7:502"
     rtu, tcp = build_request(Framing.RTU, READ), build_request(Framing.TCP, READ)
     own, other = (rtu, tcp) if kind == "socket" else (tcp, rtu)
@@ -364,7 +364,7 @@ def answered(frame: bytes, request: Message) -> bytes:
     return frame[:2] + reply[2:]
 
 
-def test_a_read_goes_on_when_the_peer_closes_after_each_reply() -> None:
+def test_a_read_continues_if_the_peer_closes_after_each_reply() -> None:
     with closing_peer(1) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))
         for _ in range(2):
@@ -382,7 +382,7 @@ def test_a_read_raises_if_the_peer_closes_before_any_reply() -> None:
         assert len(asked) == 1
 
 
-def test_a_write_is_not_repeated_on_a_port_that_is_opened_again() -> None:
+def test_a_write_is_not_repeated_on_a_reopened_port() -> None:
     with closing_peer(1) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))
         assert drive.read(drive.first) == 1
