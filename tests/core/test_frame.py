@@ -77,7 +77,7 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
 def test_every_printed_frame_is_parsed() -> None:
     assert (
         len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
-    )  # 19 of them have a copy as their reply
+    )  # 19 replies are copies
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 

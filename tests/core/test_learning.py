@@ -84,7 +84,7 @@ def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver
     assert (line.want, line.wake) == (
         "wait",
         line.now + 3 * CHARACTER,
-    )  # four missing: read before the end
+    )  # 4 missing
     line.now = line.wake
     line.receive(reply()[3:6])
     assert line.want == "read"

@@ -316,7 +316,7 @@ def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_repl
     assert [line.want, line.want] == [
         "read",
         "done",
-    ]  # a last read: the host may be late
+    ]  # the host may be late
     found = line.completion
     assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 

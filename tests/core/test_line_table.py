@@ -83,7 +83,7 @@ class Walk:
             *often * (1 + seed % 2 * 9),
             self.noise,
             self.abandon,
-        ]  # every second line is calm
+        ]  # the odd lines are calm
 
     def run(self, steps: int) -> Iterator[tuple[int, int]]:
         """Yield the state before and after each step."""

@@ -1,4 +1,4 @@
-"""`Drive.read_raw`: raw reads past the register table, which never write."""
+"""`Drive.read_raw`: raw reads of any address, which never write."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def simulated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Simul
 
 
 def test_read_raw_sends_and_parses_the_standards_example(simulated: SimulatedBus) -> None:
-    """Application protocol V1.1b3, 6.3: 7BH = 123 tenths, 96H = 150 hundredths; CRC by any calculator."""
+    """The request is that of the application protocol V1.1b3, 6.3; its CRC was calculated separately."""
     (toy,) = simulated.bus.drives
     assert toy.read_raw(3, 1, 2) == bytes.fromhex("007B 0096")
     assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
 
 
 def test_read_raw_is_not_treated_as_a_write(simulated: SimulatedBus, tmp_path: Path) -> None:
-    """Neither audited nor retried nor in doubt, and no identity check goes before it."""
+    """It is not audited, retried or reported as unconfirmed, and no identity check precedes it."""
     (toy,) = simulated.bus.drives
     simulated.loses = lambda request: True
     with pytest.raises(NoReply):
@@ -86,7 +86,7 @@ def test_a_copy_of_the_request_is_not_returned_as_a_raw_reply(simulated: Simulat
     with pytest.raises(BadReply, match="copy of the request"):
         toy.read_raw(1, 0x320, 17)
     assert simulated.frames[0][1] == echo.hex(" ").upper()
-    simulated.has_echo = True  # the line distinguishes the two
+    simulated.has_echo = True  # on a line known to echo, a copy and a reply are distinguishable
     assert toy.read_raw(1, 0x320, 17) == bytes.fromhex("20 00 11")
 
 
@@ -97,7 +97,7 @@ WRONG = {
     (3, 65536, 1): "start = 65536 is not an address",
     (3, 65535, 2): r"start \+ count = 65537: the last address is 65535",
     (3, 1, 0): "count = 0 is not from 1 to 10, which toy@7 reads in one request",
-    (3, 1, 11): "count = 11 is not from 1 to 10",  # the family's own limit
+    (3, 1, 11): "count = 11 is not from 1 to 10",  # a limit of the family
     (4, 1, 126): "count = 126 is not from 1 to 125",
     (1, 1, 2001): "count = 2001 is not from 1 to 2000",
 }
@@ -128,7 +128,7 @@ def test_a_raw_read_with_a_count_that_is_not_a_number_raises(
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])
 def test_send_raw_rejects_read_functions_before_sending(simulated: SimulatedBus, function: int) -> None:
-    """It waits as long as a write may take: a late reply to the one before could then be its own."""
+    """A read sent as a write would wait so long that a late reply to an earlier read could be accepted."""
     (toy,) = simulated.bus.drives
     with pytest.raises(
         ValueError, match=rf"{function:02X}H is a read.*call drive.read_raw\({function}, 80, 2\)"
@@ -151,7 +151,7 @@ def test_read_raw_is_limited_by_the_familys_limits(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_read_raw_works_on_a_polled_line() -> None:
-    """However busy the machine is: a reply that it delays is another's neither here nor there."""
+    """On a busy computer too, neither the read nor the poll accepts a delayed reply as another's."""
     drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])
     expected = proofs(drive)
     status = int(proof(drive.drive, Toy.status)).to_bytes(2)

@@ -1,6 +1,6 @@
-"""A suspended master sends no byte on lines that another took over, judged by their far end.
+"""A suspended master sends no byte on lines that another master took over, as seen at their far ends.
 
-`python -m bench.questions.fence` does the same 2,000 times.
+`python -m bench.questions.fence` repeats this test 2,000 times.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ def test_a_suspended_master_sends_nothing_and_is_killed() -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
-    """Without the kernel's timer, which is hours away: only the check of the clock holds it back."""
+    """The kernel's timer is hours away, so only the check of the clock prevents sending."""
     with fence(timer=3600) as made:
         found = rounds(made, 6)
     assert not any(each.is_killed for each in found)
-    # a stop between look and write lets one request through, once in a thousand stops
+    # once in a thousand suspensions, the master is suspended between check and write, and sends one request
     assert sum(each.stale for each in found) <= 1
 
 
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_master_without_the_deadline_check_does_send() -> None:
-    """So the tests above can fail: the master believes that it may send for longer than others know."""
+    """So the tests above can fail. This master is given a later deadline than the other master knows."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)
-    assert any(each.stale > 0 for each in found)  # a busy machine may not let it go on while it is watched
+    assert any(each.stale > 0 for each in found)  # on a busy computer it may not resume in time
     assert not any(each.is_killed for each in found)

@@ -1,4 +1,4 @@
-"""Late replies to requests of an earlier open port, or of an earlier process, are recognised."""
+"""Late replies to requests sent before the port was reopened, or by another process, are recognised."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from multidrop.transport import peers
 
 
 class Quick(Toy):
-    """It is given up soon."""
+    """A drive with a short timeout."""
 
     response_timeout = 0.05
 
 
 class Successor(Quick):
-    """Another family."""
+    """A drive of another family at the same address."""
 
     model = "successor"
 
 
 class HoldingWire(Wire):
-    """A path that keeps the next reply, once `holds`, until the one after it."""
+    """A line that, once `holds` is set, keeps back the next reply until the reply after it."""
 
     holds = False
     _kept = b""
@@ -63,7 +63,7 @@ def wire(sim: SimulatedDrive) -> Iterator[HoldingWire]:
 
 
 def leave_a_reply_behind(wire: HoldingWire, port: str) -> None:
-    """Close a bus with an unanswered request."""
+    """Send a request whose reply is held back, and close the bus."""
     with Bus(port) as bus:
         pump = bus.attach(Quick, 1)
         assert pump.read(Quick.output_current) == 1.11
@@ -78,7 +78,7 @@ def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
     wire: HoldingWire, family: type[Toy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
-    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # or a busy machine's replies were late too
+    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # else busy computers' replies are late
     with Bus(wire.path) as bus:
         pump = bus.attach(family, 1)
         assert bus.peer(pump).owes
@@ -115,7 +115,7 @@ def test_a_later_pseudo_terminal_of_the_same_number_has_another_identity() -> No
             os.close(ours)
 
     first = made()
-    until(lambda: made() != first)  # their times are some ms apart, and less than any time-out
+    until(lambda: made() != first)  # the creation times must differ by some ms
 
 
 def test_a_peer_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
@@ -141,10 +141,10 @@ def test_a_remembered_peer_is_forgotten_after_the_same_time_as_in_the_core(
 # ---- an earlier process ----
 
 
-BEGIN = 1000.0  # s; the start of these lines' clock
+BEGIN = 1000.0  # s; time at which the clock of these lines starts
 
 
-DELAY = 0.1  # s, of the path
+DELAY = 0.1  # s; delay of the network between line and drive
 
 
 def answer_to_another(drive: Drive) -> bytes:
@@ -165,7 +165,7 @@ def answer_to_another(drive: Drive) -> bytes:
 @pytest.mark.long
 @table("name", LINES)
 def test_a_late_reply_to_an_earlier_process_is_never_read_as_a_value(name: str) -> None:
-    """Every value is the register's own, from the first on."""
+    """Every value read belongs to its register, from the first read on."""
     drives = of_one_variant(LINES[name])
     wire = PathWire([EncodedDrive(drive) for drive in drives], Faults())
     wire._path.append((BEGIN + DELAY / 2, answer_to_another(drives[0])))

@@ -1,4 +1,4 @@
-"""Ports of every kind open, fail with one sentence each, and leave no descriptors."""
+"""Ports of every kind: they open, their failures are one sentence each, and they leave no descriptors."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_drive_is_read_and_written_through_a_socket_port() -> None:
     [(family, baudrate) for family in MODELS.values() for baudrate in family.baudrates],
 )
 def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: int) -> None:
-    """A drive may hold the code of its baud rate, which is then part of what its replies prove."""
+    """A drive may have a register with its baud rate's code, whose known value then serves as a proof."""
     drive = simulated(family(1, baudrate=baudrate))
     with Simulator([Wire([drive], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         attached = bus.attach(family, 1, baudrate=baudrate)
@@ -67,7 +67,7 @@ def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: i
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
 def test_a_stalled_connection_is_cut_and_sends_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A loopback loses no packets, so this test reads the socket options."""
+    """A loopback connection cannot stall, so this test reads the socket options."""
     told: list[int] = []
 
     class Watched(Port):
@@ -95,7 +95,7 @@ def test_the_echo_option_is_kept_when_the_port_is_reopened(
 def test_a_port_waits_and_discards_bytes_after_each_opening(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A gateway that restarts when its port is opened prints that, and is deaf for a while."""
+    """Some gateways restart when their port is opened: they print text, and ignore requests for a while."""
     slept: list[float] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
         host, number = listener.getsockname()
@@ -134,7 +134,7 @@ def test_a_pty_can_be_opened_repeatedly() -> None:
 
 
 def test_a_pty_works_although_it_ignores_the_parity() -> None:
-    """It stays at 8 bits without parity for any settings, and all bytes pass."""
+    """A pty stays at 8 bits without parity whatever is set, and passes all bytes."""
     drive = simulated(Toy(1, format="8E1"))
     drive["output_current"] = 3.25
     with Simulator([Wire([drive], unpaced=True)]) as sim:
@@ -144,7 +144,7 @@ def test_a_pty_works_although_it_ignores_the_parity() -> None:
 
 
 def test_a_port_is_set_to_low_latency_mode(monkeypatch: pytest.MonkeyPatch) -> None:
-    """USB adapters do it for 16 ms."""
+    """Otherwise USB adapters delay received bytes by up to 16 ms."""
     told: list[bool] = []
     monkeypatch.setattr(Serial, "set_low_latency_mode", lambda port, wanted: told.append(wanted))
     with Simulator([wire()]) as sim, Bus(sim.wires[0].path) as bus:
@@ -259,7 +259,7 @@ def test_a_port_that_is_open_cannot_be_opened_by_another_bus() -> None:
 
 def test_closed_and_unopened_ports_leave_no_descriptors_or_threads(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
-        Line(sim.wires[0].path).open().close()  # lazily opened descriptors are open now
+        Line(sim.wires[0].path).open().close()  # opens the descriptors that are opened only once
         before = descriptors(), threads()
         for each in sim.wires:
             for _ in range(3):
@@ -275,7 +275,7 @@ def test_closed_and_unopened_ports_leave_no_descriptors_or_threads(tmp_path: Pat
 
 
 def vanishing_socket() -> tuple[str, Callable[[], None]]:
-    """A peer that closes the connection when it has heard a request."""
+    """Return the URL of a peer, and a function that closes the connection after one request."""
     listener = socket.create_server(("127.0.0.1", 0))
     path = f"socket://127.0.0.1:{listener.getsockname()[1]}"
 
@@ -309,7 +309,7 @@ def test_a_port_lost_during_a_read_raises_line_error(
     thread.start()
     with Bus(path) as bus:
         toy = bus.attach(PatientToy, 1)
-        for _ in range(2):  # and it stays lost
+        for _ in range(2):  # the second time, the port is still lost
             with pytest.raises(LineError) as caught:
                 toy.read(toy.output_current)
             assert str(caught.value).startswith(f"{path}: the port was lost (")
@@ -333,7 +333,7 @@ def test_a_port_lost_during_a_write_raises_unconfirmed(
         with pytest.raises(Unconfirmed, match=r"it is not known whether .* took effect: the port was lost"):
             toy.send_raw(6, 0x15, bytes(2))
         thread.join()
-        with pytest.raises(LineError):  # and this has not
+        with pytest.raises(LineError):  # this write was not sent
             toy.send_raw(6, 0x15, bytes(2))
 
 
@@ -342,7 +342,7 @@ def test_a_port_is_reopened_by_the_device_link(tmp_path: Path) -> None:
     with Simulator([wire(str(link))]), Bus(str(link)) as bus:
         read_and_write(bus)
         first = link.readlink()
-        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # its number is not given again so long
+        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # so that the system does not reuse its number
     with Simulator([wire(str(link))]):
         assert link.readlink() != first
         bus.line.reopen()
@@ -369,7 +369,7 @@ def test_a_tap_continues_after_the_port_is_reopened(tmp_path: Path) -> None:
 
 
 def test_a_bridged_port_keeps_its_settings_when_it_is_reopened() -> None:
-    """spy:// is pyserial's way to watch a port; the drive ignores another baud rate."""
+    """The port is pyserial's spy://. At another baud rate the drive would not answer."""
     with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
         path = sim.wires[0].path
         with Bus(f"spy://{path}", baudrate=19200) as bus:
@@ -402,7 +402,7 @@ def test_a_port_is_not_freed_while_another_thread_ends_its_exchanges(monkeypatch
     def end_slowly(port: Port) -> bool:
         closing.append(threading.Thread(target=ours.close))
         closing[0].start()
-        closing[0].join(0.2)  # it would be over by then
+        closing[0].join(0.2)  # without the lock it would have ended by then
         assert port.c is not None
         return end(port)
 
@@ -439,7 +439,7 @@ def test_closing_ends_exchanges_that_wait_for_a_reply() -> None:
 
     waiting = threading.Thread(target=wait)
     waiting.start()
-    os.read(master, 1024)  # the request
+    os.read(master, 1024)  # wait for the request
     bus.close()
     waiting.join()
     os.close(slave)

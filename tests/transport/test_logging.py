@@ -1,4 +1,4 @@
-"""Loggers under `multidrop.*`: ports that open, vanish and return, frames, writes, refusals and stops."""
+"""Log entries of `multidrop.*`: opened, lost and reopened ports, frames, writes, refusals and stops."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_port_that_was_never_opened_is_not_logged_as_lost(
 
 
 def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    """Its loss is logged once, despite repeated requests."""
+    """Its loss is logged only once, although several requests fail."""
     link = tmp_path / "port"
 
     def plugged_in() -> tuple[int, int]:
@@ -120,7 +120,7 @@ def test_writes_refusals_and_stops_are_logged(
 
 
 class Hanging(logging.Handler):
-    """A handler whose disk hangs until it is released."""
+    """A log handler that blocks until it is released, as if its disk hung."""
 
     def __init__(self) -> None:
         super().__init__()

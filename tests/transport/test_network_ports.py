@@ -48,7 +48,7 @@ def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
 
 
 def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
-    """Return a stream's commands, with adjacent data joined."""
+    """Return the data and commands of a telnet stream, with adjacent data joined."""
     telnet, found = Telnet(), list[tuple[bytes, bytes]]()
     for chunk in chunks:
         for kind, content in telnet.split(chunk):
@@ -96,7 +96,7 @@ def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
         for _ in range(100):
             for _, content in telnet.split(flood):
                 assert len(content) <= len(flood)
-        assert tracemalloc.get_traced_memory()[0] < len(flood)  # of a hundred; other threads have some
+        assert tracemalloc.get_traced_memory()[0] < len(flood)  # less than one of the hundred
     finally:
         tracemalloc.stop()
 
@@ -106,7 +106,7 @@ def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
 
 @contextmanager
 def flooding() -> Iterator[tuple[str, threading.Event]]:
-    """The URL of a port that sends endlessly, and an event after 32 MB."""
+    """Yield the URL of a port that sends endlessly, and an event that is set after 32 MB."""
     listener = socket.create_server(("127.0.0.1", 0))
     sent = threading.Event()
 
@@ -125,7 +125,7 @@ def flooding() -> Iterator[tuple[str, threading.Event]]:
             while received := client.recv(1024):
                 b"".join(far.filter(received))
                 purges += received.count(rfc2217.COM_PORT_OPTION + rfc2217.PURGE_DATA)
-                if purges == 2 and not floods.ident:  # its buffers are empty: it is open
+                if purges == 2 and not floods.ident:  # the second purge: the client has opened the port
                     floods.start()
         client.close()
         floods.join()
@@ -155,7 +155,7 @@ def test_an_unread_flood_does_not_fill_the_memory() -> None:
 
 
 class HeldUp:
-    """A port that blocks until it is released, and keeps its requests."""
+    """A port whose `write` blocks until it is released, and records the requests."""
 
     def __init__(self) -> None:
         self.begun, self.free = threading.Event(), threading.Event()
@@ -178,7 +178,7 @@ class HeldUp:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
 def test_a_request_that_waited_behind_a_blocked_request_is_never_sent() -> None:
-    """It has expired, and may be a start."""
+    """The request has expired, and may be a start."""
     port = HeldUp()
     bridge = Bridge(port)  # type: ignore[arg-type]
     os.write(bridge.theirs.fileno(), b"first")
@@ -197,7 +197,7 @@ def test_a_request_that_waited_behind_a_blocked_request_is_never_sent() -> None:
 
 
 class AsOnWindows:
-    """A socket without the calls that POSIX alone has."""
+    """A socket without the calls that only POSIX systems have."""
 
     def __init__(self, whole: socket.socket) -> None:
         self._whole = whole
@@ -269,7 +269,7 @@ def test_a_bridge_with_unread_data_closes() -> None:
 
 def test_a_write_to_a_full_network_fails_immediately() -> None:
     near, far = socket.socketpair()
-    near.settimeout(3600)  # pyserial's own is 5 s
+    near.settimeout(3600)  # pyserial's timeout is 5 s
     port = RFC2217Port()
     port.is_open, port._socket, port._write_lock = True, near, threading.Lock()
 
@@ -287,23 +287,23 @@ def test_a_write_to_a_full_network_fails_immediately() -> None:
 # ---- a network that is cut ----
 
 
-_DONE, _TIME_WAIT = "05", "06"  # everything of ours has arrived (net/tcp_states.h: TCP_FIN_WAIT2)
+_DONE, _TIME_WAIT = "05", "06"  # states in which all our data has arrived (net/tcp_states.h: TCP_FIN_WAIT2)
 _numbers = count()
 
 
 def connections(port: int) -> list[list[str]]:
-    """This machine's connections to that port in which the kernel may still send something."""
+    """Return this computer's connections to that port on which the kernel may still send data."""
     rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     return [row for row in rows if row[2].endswith(f":{port:04X}") and row[3] not in (_DONE, _TIME_WAIT)]
 
 
 def waits_to_arrive(port: int) -> bool:
-    """Return True while the kernel has something that the far end has not confirmed."""
+    """Return True while the kernel has data that the far end has not acknowledged."""
     return any(int(row[4].partition(":")[0], 16) for row in connections(port))
 
 
 class FarNetwork:
-    """A network of its own, with a server in it, that can be cut off and joined again."""
+    """A separate network namespace with a server, which can be disconnected and connected again."""
 
     def __init__(self, kind: str) -> None:
         number = next(_numbers)
@@ -326,7 +326,7 @@ class FarNetwork:
         self.url = f"{kind}://{self.address}:{self.port}"
 
     def _make(self, ours: str, near: str, far: str) -> None:
-        """A pair of cards. They know each other's number: else a packet waits seconds for it."""
+        """Make a pair of network interfaces that know each other's address, so that no packet waits for it."""
         near_card, far_card = "02:00:00:00:00:01", "02:00:00:00:00:02"
         peer = ("peer", "name", self._theirs, "address", far_card, "netns", self.name)
         self._ip("link", "add", ours, "address", near_card, "type", "veth", *peer)
@@ -358,7 +358,7 @@ class FarNetwork:
     def all_received(self) -> str:
         """Return the bytes on the server's serial line, once the network is restored."""
         self.join()
-        until(lambda: not connections(self.port))  # the kernel has stopped retransmitting
+        until(lambda: not connections(self.port))  # wait until the kernel no longer retransmits
         until(self._ends)
         taken, _ = self._server.communicate()
         return taken
@@ -387,7 +387,7 @@ START = "010600140001"  # write 1, which starts it, to the control register of d
 
 
 def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
-    """Send a START that expires. Earlier confirmations let it leave: no reply is due."""
+    """Send a START that expires. It is sent at all because no reply to earlier requests is due."""
     toy.send_raw(6, 0x14, bytes([0, 2]))
     network.cut()
     with pytest.raises(Unconfirmed):
@@ -408,11 +408,11 @@ def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: Far
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
 def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: FarNetwork) -> None:
-    """Although the network is restored as soon as the call has returned."""
+    """The network is restored as soon as the call has returned."""
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
         far_network.join()
-        until(lambda: not waits_to_arrive(far_network.port))  # it arrived, or was given up
+        until(lambda: not waits_to_arrive(far_network.port))  # the data arrived, or the kernel gave it up
     taken = far_network.all_received()
     assert "010600140002" in taken
     assert START not in taken
@@ -424,7 +424,7 @@ def test_a_stalled_network_is_cut_before_a_write_times_out() -> None:
 
 
 def test_every_connection_limits_unacknowledged_data() -> None:
-    """Without a network to cut: the socket options."""
+    """This needs no network to cut: it reads the socket options."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         near = socket.create_connection(listener.getsockname())
         far, _ = listener.accept()
@@ -437,14 +437,14 @@ def test_every_connection_limits_unacknowledged_data() -> None:
 
 
 def test_closing_a_port_that_was_never_opened_prints_nothing() -> None:
-    """Python 3.13 prints errors of such a port's finalizer."""
+    """Python 3.13 would print errors of the port's finalizer."""
     port = SocketPort()
     port.close()
     assert not port.is_open
 
 
 def test_a_socket_port_works_with_a_descriptor_above_1023() -> None:
-    """Hundreds of lines take more than the 1024 that select() bears."""
+    """Hundreds of lines need more than the 1024 descriptors that select() supports."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < 1400:
         pytest.skip("this system gives a process fewer than 1400 descriptors")

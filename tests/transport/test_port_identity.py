@@ -1,4 +1,4 @@
-"""Another USB adapter that gets the name of a lost port is not used: its line has other motors."""
+"""If another USB adapter gets the name of a lost port, it is not used: its line has other motors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ USB = "devices/pci0000:00/0000:00:14.0/usb1"
 
 
 class Sysfs:
-    """A folder that describes ttys as Linux does."""
+    """A folder that describes serial devices as Linux does in /sys."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder = folder
@@ -48,7 +48,7 @@ class Sysfs:
 
     @contextmanager
     def plugged_in(self, link: Path, place: str, serial: str = "") -> Iterator[Wire]:
-        """Simulate a line behind an adapter, which is known before its port has the name, as by Linux."""
+        """Simulate a line behind a USB adapter. As on Linux, the adapter exists before its device name."""
         port = link.with_name(place)
         with Simulator([wire := Wire([EncodedDrive(InnovertIBD(1))], port=str(port), unpaced=True)]):
             self.add(port.resolve().name, f"{USB}/{place}/{place}:1.0/tty", serial)
@@ -72,8 +72,13 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
             "MX",
             "1",
             USBAdapter("1-1:1.0.1", "MX:1.0.1"),
-        ),  # several of one interface
-        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),  # as many CH340 are
+        ),  # several ports on one USB interface
+        (
+            f"{USB}/1-1/1-1:1.0/ttyUSB0",
+            "",
+            "0",
+            USBAdapter("1-1:1.0.0", ""),
+        ),  # no serial number, as with many CH340
         (f"{USB}/1-3/1-3:1.0", "E66", "", USBAdapter("1-3:1.0.0", "E66:1.0.0")),  # ttyACM0
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
@@ -92,9 +97,9 @@ def test_adapter_of_returns_place_and_serial_number(
     ("before", "now", "is_same"),
     [
         (("1-1", "A1"), ("1-1", "A1"), True),
-        (("1-1", "A1"), ("1-2", "A1"), True),  # plugged in elsewhere
-        (("1-1", "A1"), ("1-2", "B2"), False),  # they came back in another order
-        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter, and perhaps another line
+        (("1-1", "A1"), ("1-2", "A1"), True),  # the same adapter in another USB socket
+        (("1-1", "A1"), ("1-2", "B2"), False),  # two adapters came back in another order
+        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter in this socket, perhaps of another line
         (("1-1", ""), ("1-1", ""), True),
         (("1-1", ""), ("1-2", ""), False),
         (("1-1", "A1"), ("1-2", ""), False),
@@ -122,7 +127,7 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
 
 @pytest.mark.parametrize("is_replaced", [False, True])
 def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path, is_replaced: bool) -> None:
-    """It belongs to anyone. A link that was replaced leads to the right one."""
+    """The later pseudo-terminal may belong to any program. A replaced link leads to the right one."""
     link = tmp_path / "port"
     ends = pty.openpty()
     device = Path(os.ttyname(ends[1]))
@@ -134,8 +139,8 @@ def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path
     with pytest.raises(LineError, match="no such port"):
         found.reopen()
     with ExitStack() as stack:
-        time.sleep(0.05)  # steps of the files' clock have some milliseconds
-        while not device.exists():  # other processes make terminals too
+        time.sleep(0.05)  # file times advance in steps of some ms
+        while not device.exists():  # other processes may get the number first
             for end in pty.openpty():
                 stack.callback(os.close, end)
         if is_replaced:
@@ -163,7 +168,7 @@ def test_lasting_name_returns_the_name_with_the_serial_number(
         sysfs.add(device.name, f"{USB}/1-{number}/1-{number}:1.0/{device.name}", serial)
     named, nameless = names
     assert lasting_name(str(named)) == str(names[named])
-    assert lasting_name(str(nameless)) == str(nameless)  # several adapters have that link's name in turn
+    assert lasting_name(str(nameless)) == str(nameless)  # any adapter can have that link
     for other in (str(names[named]), "/dev/ttyS0", "socket://127.0.0.1:4001", "COM5"):
         assert lasting_name(other) == other
 
@@ -184,7 +189,7 @@ def test_a_port_named_by_its_usb_socket_opens_with_any_adapter(
 def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
     tmp_path: Path, sysfs: Sysfs, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its drive would report a standstill, while the intended motor goes on."""
+    """The other line's drive would report a standstill while the intended motor keeps running."""
     link = tmp_path / "ttyUSB0"
     pump = InnovertIBD(1, name="pump")
     asked = line(str(link), polled(pump, [InnovertIBD.output_current]))

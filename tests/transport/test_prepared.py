@@ -1,4 +1,4 @@
-"""Reads with `Bus` are planned once, and again if their conditions change."""
+"""Reads with `Bus` are planned once, and planned again only if port, settings or drive change."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
 
 
 class Counted:
-    """Count the choices of blocks, and the exchanges."""
+    """Counts how often blocks are planned, and the exchanges."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0
@@ -51,7 +51,7 @@ class Counted:
         monkeypatch.setattr(prepared_reads, "make_read", make)
 
     def since(self) -> tuple[int, int]:
-        """Since its last read."""
+        """Return the numbers of plans and exchanges since the last call."""
         found = self.plans, self.made
         self.plans = self.made = 0
         return found
@@ -72,7 +72,7 @@ def bus() -> Iterator[Bus]:
 def completions_of(
     bus: Bus, monkeypatch: pytest.MonkeyPatch, meet: Callable[[], object] = lambda: None
 ) -> list[Completion]:
-    """Return a list that gets the completion which each exchange fills in."""
+    """Return a list to which the completion of each exchange is appended."""
     carry_out = bus.line.carry_out
     asked: list[Completion] = []
 
@@ -92,7 +92,7 @@ def test_repeated_reads_of_the_same_registers_are_planned_once(bus: Bus, counted
     assert counted.since() == (1, 2)
     assert [one.read_many(WANTED) for _ in range(5)] == 5 * [first]
     assert counted.since() == (0, 0)
-    one.read(Toy.acceleration_time)  # the block is listed above
+    one.read(Toy.acceleration_time)  # the same block as in WANTED
     assert counted.since() == (1, 0)
     other.read_many(WANTED)
     assert counted.since() == (1, 2)
@@ -218,7 +218,7 @@ FIRST, WORDS = 1, 27
 
 
 def expected(data: bytes) -> dict[str, Any]:
-    """Return the values as computed by `struct` and the table's own words."""
+    """Return the values of this data, computed with `struct` instead of the core."""
     tenths, celsius, energy, low, high, power = struct.unpack_from(">HhIHHf", data)
     pulses, drift, mode, perhaps, balance, flow, power_of_ten = struct.unpack_from(">QqHHiHh", data, 18)
     part, digits, fine = struct.unpack_from(">HHI", data, 46)
@@ -238,7 +238,7 @@ def expected(data: bytes) -> dict[str, Any]:
         "flow_power": power_of_ten,
         "nibble": part >> 4 & 0xF,
         "decimal": int(f"{digits:x}") if f"{digits:x}".isdecimal() else None,
-        "fine": fine * 123456789 / 10,  # more than a float holds before it is divided
+        "fine": fine * 123456789 / 10,  # before the division, too many digits for a float
     }
 
 
@@ -255,7 +255,7 @@ def decoder() -> BlockDecoder:
 def test_each_value_is_decoded_from_its_bytes(data: bytes) -> None:
     found = decoder().decode(reply(data))
     assert found == expected(data)
-    assert type(found["pulses"]) is int  # more digits than a float holds
+    assert type(found["pulses"]) is int  # too many digits for a float
 
 
 @example(bytes(2 * WORDS - 1))

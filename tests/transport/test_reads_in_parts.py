@@ -29,7 +29,7 @@ def test_a_refused_block_is_read_in_parts_until_the_port_is_reopened(monkeypatch
     sim.asked.clear()
     assert drive.read_many(drive.registers.values()) == first
     assert [count for _, count in sim.asked] == [6] * 4
-    bus.queue = object()  # the port was opened again
+    bus.queue = object()  # as after the port is reopened
     sim.asked.clear()
     assert drive.read_many(drive.registers.values()) == first
     assert sim.asked[0] == (0, WIDE)
@@ -48,7 +48,7 @@ def test_the_error_for_a_refused_block_names_the_refused_register(monkeypatch: p
     sim.asked.clear()
     with pytest.raises(DriveException, match=r"^pump-1 refuses r3: "):
         drive.read_many(drive.registers.values())
-    assert sim.asked == [(3, 1)]  # useless requests are not repeated
+    assert sim.asked == [(3, 1)]  # only the refused register is requested again
     sim.missing.clear()
     assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     others = [register for register in drive.registers.values() if register.address != 3]
@@ -64,7 +64,7 @@ def test_a_read_is_complete_or_names_the_refused_register(
         bus = SimulatedBus(monkeypatch, Picky(drive, refused, most)).bus
         bus.attach(drive)
         registers = [drive.register(f"r{at}") for at in sorted(asked)]
-        for _ in range(2):  # then the parts are known
+        for _ in range(2):  # the second time, the parts are known
             if not refused & asked:
                 assert drive.read_many(registers) == expected_values(asked)
                 continue
@@ -119,7 +119,7 @@ def test_a_dead_drive_gets_only_one_additional_request(monkeypatch: pytest.Monke
     sim.silent_beyond = 125
     assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     sim.asked.clear()
-    sim.silent_beyond = 1  # noise, say: it has answered the whole
+    sim.silent_beyond = 1  # perhaps noise, because the drive has answered the whole block
     with pytest.raises(NoReply):
         drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3
@@ -129,7 +129,7 @@ def test_a_dead_drive_gets_only_one_additional_request(monkeypatch: pytest.Monke
 def test_bytes_received_for_one_attempt_are_reported(
     monkeypatch: pytest.MonkeyPatch, silent: set[int]
 ) -> None:
-    """A read is split and retried: the first values are kept."""
+    """The attempts in `silent` receive no bytes; the others receive a foreign reply, which is reported."""
     drive = family(2)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, Picky(drive))
     bus.attach(drive)

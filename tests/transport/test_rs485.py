@@ -30,7 +30,7 @@ from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import open_port
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
-CHARACTER_NS = 1_041_667  # of a toy: 9600 8N1
+CHARACTER_NS = 1_041_667  # a toy's character at 9600 8N1
 ENABLED, ON_SEND, AFTER_SEND = 1, 2, 4  # linux/serial.h
 
 
@@ -73,7 +73,7 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list[Any], list[Event]]:
-    """Return the client's value or error, and the driver's calls."""
+    """Run a client with the simulated driver; return its values or error, and the driver's calls."""
     log = driver.with_name("log")
     log.unlink(missing_ok=True)
     log.touch()
@@ -102,15 +102,15 @@ def test_rts_switches_to_sending_only_while_a_request_is_sent(
     assert len(read) == 20
     writes = [at for at, event in enumerate(events) if event.what == "write"]
     assert len(writes) >= 21
-    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # from its opening on
+    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # since its opening
     late = []
     for at in writes:
         before, write, after = events[at - 1 : at + 2]
         assert (before.what, after.what) == (sending, receiving)
         late.append(after.ns - write.ns - write.count * CHARACTER_NS)
-    assert 0 <= min(late) < 3.5 * CHARACTER_NS  # a busy machine is late now and then
+    assert 0 <= min(late) < 3.5 * CHARACTER_NS  # at least once; a busy computer is sometimes late
     assert events[-1].what == receiving
-    assert events[-2].count == 49  # a broadcast: the port was closed at once, and waited for its last bit
+    assert events[-2].count == 49  # a broadcast: closing waited for its last bit
 
 
 @pytest.mark.long
@@ -143,13 +143,13 @@ def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -
     assert "write" not in [event.what for event in events[broken:]]
 
 
-# ---- without that driver: a pseudo-terminal's has no RTS ----
+# ---- without the simulated driver: a pseudo-terminal has no RTS ----
 
 
 def test_a_poller_fails_immediately_without_rts_and_leaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
-        Bus(sim.wires[0].path).close()  # the core's thread starts with the first port, and stays
+        Bus(sim.wires[0].path).close()  # starts the core's thread, which stays
         before = descriptors(), threads()
         drive = polled(Toy(1), [Toy.output_current])
         declared = replace(line(sim.wires[0].path, drive), rs485=RS485.RTS_UP)

@@ -1,4 +1,4 @@
-"""Statistics: each result of an exchange in the guide's counters, quantiles, time spans, and their owners."""
+"""Statistics: the guide's counters for each result, quantiles, time spans, buses and pollers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from multidrop.transport.statistics import Diagnostics, LineStatistics, Statisti
 
 __all__ = ["drive", "line"]  # fixtures
 
-LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # between these the error is known
+LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # between these delays the error is at most 1/16
 
 # ---- response delays ----
 
@@ -44,7 +44,7 @@ def test_quantiles_are_within_a_part_in_16(delays_ns: list[int]) -> None:
     found = Statistics(1.0, counters_of(delays_ns)).delays
     ordered = sorted(delays_ns)
     for told, percent in ((found.p50, 50), (found.p90, 90), (found.p99, 99)):
-        true = ordered[-(-percent * len(ordered) // 100) - 1]  # as many are not longer
+        true = ordered[-(-percent * len(ordered) // 100) - 1]  # the delay that `percent` % do not exceed
         assert told * 1e9 == pytest.approx(true, rel=1 / 16 + 1e-9)
     assert found.longest == max(delays_ns) / 1e9
     assert found.replies == len(delays_ns)
@@ -89,14 +89,14 @@ def test_utilisation_follows_the_wire_s_settings(line: LineDriver, drive: Peer, 
 def test_the_utilisation_of_a_port_faster_than_its_settings_is_at_most_1(
     line: LineDriver, drive: Peer
 ) -> None:
-    """The whole reply is there after 0.1 ms; a wire takes 15 characters."""
+    """The whole reply comes after 0.1 ms; a wire would take 15 characters."""
     begun = line.now
     for _ in range(100):
         ask(line, drive)
         line.now += MS // 10
         line.receive(reply())
         line.wait_until_done()
-    line.now += 8 * CHARACTER  # the last request is reckoned to leave by then
+    line.now += 8 * CHARACTER  # the calculated end of the last request
     found = Statistics((line.now - begun) / 1e9, drive.counters())
     assert found.samples == 100
     assert 0.9 < found.utilisation <= 1.0 + 1e-9
@@ -175,7 +175,7 @@ def test_overruns_are_read_from_the_port_s_driver(monkeypatch: pytest.MonkeyPatc
         answer[:] = struct.pack("20i", 1, 2, 3, 4, 5, 6, 7, 100, 9, 10, 20, *[0] * 9)
 
     with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
-        assert bus.statistics().diagnostics.bus_character_overruns is None  # a pty has none
+        assert bus.statistics().diagnostics.bus_character_overruns is None  # a pty has no such counter
         monkeypatch.setattr(fcntl, "ioctl", counts)
         assert bus.line.overruns() == 120
 
@@ -207,12 +207,12 @@ def test_statistics_of_a_span_are_the_difference_of_two_readings() -> None:
 def test_the_longest_delay_of_a_span_is_derived_from_its_buckets() -> None:
     early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
     found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
-    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # no record: its bucket's end
+    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # not the exact longest delay, but its bucket's end
     record = counters_of([50 * MS, 8 * MS, 70 * MS])
     assert line_of(2, pump=record).since(line_of(1, pump=early)).delays.longest == 0.070
 
 
-# ---- of a bus and of a poller ----
+# ---- statistics of a bus and of a poller ----
 
 
 @pytest.fixture
@@ -228,7 +228,7 @@ def test_a_bus_counts_exchanges_and_delays(toy: SimulatedDrive) -> None:
         with pytest.raises(TimeoutError):
             nobody.read(Toy.output_current)
         found = bus.statistics()
-        asked = found.drives["pump"].exchanges  # more than the replies, if the machine was slow
+        asked = found.drives["pump"].exchanges  # more than the replies, if the computer was slow
         assert asked >= found.drives["pump"].delays.replies > 0
         assert found.drives["nobody"].diagnostics.server_no_responses == found.drives["nobody"].exchanges == 3
         assert found.exchanges == asked + 3
@@ -236,7 +236,7 @@ def test_a_bus_counts_exchanges_and_delays(toy: SimulatedDrive) -> None:
         assert bus.statistics().exchanges == 0
         pump.read(Toy.output_current)
         assert bus.statistics().delays.replies == 1
-    assert bus.statistics() == bus.statistics()  # it stays the same once the bus is closed
+    assert bus.statistics() == bus.statistics()  # frozen once the bus is closed
     assert bus.statistics().delays.replies == 1
 
 
@@ -262,7 +262,7 @@ def test_a_poller_counts_its_rows_by_status(toy: SimulatedDrive) -> None:
 
 
 def test_renamed_and_replaced_drives_are_counted_since_the_reset(toy: SimulatedDrive) -> None:
-    """Otherwise one has earlier counts, and another negative ones."""
+    """Otherwise one drive would have earlier counts, and another drive negative ones."""
     others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]
     with Simulator([Wire([toy, *others], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
         known = [bus.attach(Toy, address=address, name=name) for address, name in ((1, "a"), (2, "b"))]
@@ -280,7 +280,7 @@ def test_renamed_and_replaced_drives_are_counted_since_the_reset(toy: SimulatedD
         found = bus.statistics()
         assert {name: drive.exchanges for name, drive in found.drives.items()} == {"c": 1, "a": 1, "b": 1}
         assert found.exchanges == 3
-    assert bus.statistics().exchanges == 3  # closed
+    assert bus.statistics().exchanges == 3  # the bus is closed, and the counts stay
 
 
 # ---- a polled line ----
@@ -292,7 +292,7 @@ STEPS = 400
 @pytest.mark.long
 @table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
 def test_the_utilisation_of_a_polled_line_is_at_most_1(seconds: float) -> None:
-    """An exchange under way at a reading counts after it, with all its time."""
+    """An exchange in flight at a reading counts only after it, with its whole time."""
     pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]
     wire = ClockedWire([EncodedDrive(pump) for pump in pumps], Faults())
     drives = [polled(pump, [Toy.output_frequency, Toy.acceleration_time]) for pump in pumps]

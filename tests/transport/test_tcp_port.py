@@ -29,7 +29,7 @@ from multidrop.transport.port_identity import of_name
 
 
 class Meter(Drive):
-    """A device with a connection of its own, whose unit id may be any."""
+    """A device with a separate connection, so that its unit id may be any."""
 
     title = "Meter"
     framings = (Framing.TCP,)
@@ -39,7 +39,7 @@ class Meter(Drive):
 
 @contextmanager
 def responder(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
-    """A server that answers these bytes to its first input; yields its address and the input."""
+    """Yield the address of a server that answers its first input with `answer`, and a list of its input."""
     came: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
@@ -206,7 +206,7 @@ def plant_of_two(path: Path, port: str, second: int) -> Path:
 
 
 def answer_when_both_asked(listening: socket.socket) -> None:
-    """Reply to no connection's first request before the other's is there."""
+    """Reply to the first requests of two connections only once both have come."""
     both_asked, answered = threading.Barrier(2), set[int]()
 
     def serve(connection: socket.socket) -> None:
@@ -242,7 +242,7 @@ def test_a_unit_on_two_lines_of_one_gateway_is_a_mistake(tmp_path: Path) -> None
         load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
 
 
-# ---- far ends of another kind ----
+# ---- far ends with another protocol ----
 
 READ = Message(1, 3, 3, 1)
 
@@ -257,7 +257,7 @@ def test_rtu_frames_behind_a_tcp_url_are_reported_and_end_the_connection() -> No
         bus.line.regain()
         with pytest.raises(PortLost):
             drive.read(drive.output_current)
-        until(lambda: len(came) == 2)  # on a connection of its own
+        until(lambda: len(came) == 2)  # the second request came on a new connection
 
 
 def test_modbus_tcp_behind_a_socket_url_is_reported() -> None:
@@ -280,7 +280,7 @@ def test_the_error_for_a_silent_port_names_the_other_protocol() -> None:
 
 
 def test_a_gateway_s_unreachable_drive_gives_no_reply() -> None:
-    """Its connection answers each request with 0BH, under the request's own id."""
+    """The gateway answers each request with exception 0BH and the request's id."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:
@@ -315,7 +315,7 @@ def test_mixed_up_recognises_only_frames_of_the_other_protocol(kind: str) -> Non
 
 
 class TwoBlocks(Drive):
-    """A device whose registers no single request reads."""
+    """A device whose registers need two requests."""
 
     title = "Two blocks"
     framings = (Framing.TCP,)
@@ -328,7 +328,7 @@ class TwoBlocks(Drive):
 
 @contextmanager
 def closing_peer(replies: int) -> Iterator[tuple[str, list[Message]]]:
-    """A Modbus TCP peer that closes each connection at its request after `replies` replies."""
+    """Yield a Modbus TCP peer that closes a connection at the request after `replies` replies."""
     asked: list[Message] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
@@ -358,7 +358,7 @@ def closing_peer(replies: int) -> Iterator[tuple[str, list[Message]]]:
 
 
 def answered(frame: bytes, request: Message) -> bytes:
-    """The reply whose registers hold their addresses."""
+    """Return a reply in which the registers hold their addresses."""
     words = b"".join((request.start + at).to_bytes(2) for at in range(request.count))
     reply = build_reply(Framing.TCP, replace(request, data=words))
     return frame[:2] + reply[2:]
