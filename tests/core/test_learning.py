@@ -81,10 +81,7 @@ def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver
     ask(line, drive)
     line.now += 60 * MS
     line.receive(reply()[:3])
-    assert (line.want, line.wake) == (
-        "wait",
-        line.now + 3 * CHARACTER,
-    )  # 4 missing
+    assert (line.want, line.wake) == ("wait", line.now + 3 * CHARACTER)  # four characters are missing
     line.now = line.wake
     line.receive(reply()[3:6])
     assert line.want == "read"

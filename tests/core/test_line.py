@@ -313,10 +313,7 @@ def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_repl
     assert line.listens
     assert line.wake == sent + 8 * CHARACTER + TIMEOUT + 7 * CHARACTER
     line.now = line.wake
-    assert [line.want, line.want] == [
-        "read",
-        "done",
-    ]  # the host may be late
+    assert [line.want, line.want] == ["read", "done"]  # the host may be late
     found = line.completion
     assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 

@@ -326,7 +326,7 @@ class FarNetwork:
         self.url = f"{kind}://{self.address}:{self.port}"
 
     def _make(self, ours: str, near: str, far: str) -> None:
-        """Make a pair of network interfaces that know each other's address, so that no packet waits for it."""
+        """Make a pair of network interfaces that know each other's address, so that no packet must wait."""
         near_card, far_card = "02:00:00:00:00:01", "02:00:00:00:00:02"
         peer = ("peer", "name", self._theirs, "address", far_card, "netns", self.name)
         self._ip("link", "add", ours, "address", near_card, "type", "veth", *peer)

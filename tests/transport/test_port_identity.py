@@ -73,12 +73,7 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
             "1",
             USBAdapter("1-1:1.0.1", "MX:1.0.1"),
         ),  # several ports on one USB interface
-        (
-            f"{USB}/1-1/1-1:1.0/ttyUSB0",
-            "",
-            "0",
-            USBAdapter("1-1:1.0.0", ""),
-        ),  # no serial number, as with many CH340
+        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),  # many CH340: no serial number
         (f"{USB}/1-3/1-3:1.0", "E66", "", USBAdapter("1-3:1.0.0", "E66:1.0.0")),  # ttyACM0
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
