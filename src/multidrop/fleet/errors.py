@@ -1,4 +1,4 @@
-"""Errors of a fleet's servers; the message of each is one sentence."""
+"""Errors of a fleet's servers. The message of each error is one sentence."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from multidrop.printable import masked
 
 
 class FleetError(OSError):
-    """The fleet's servers cannot be used; the message says why in one sentence."""
+    """The fleet's servers cannot be used. The message says why, in one sentence."""
 
 
 class TooOld(FleetError):
-    """A server that may grant one lease to two gateways."""
+    """The NATS server's version is too old: it may grant one lease to two gateways."""
 
 
 class NotAdmitted(FleetError):
-    """A server refused our credentials, or its certificate is not trusted."""
+    """A server refused our credentials, or we do not trust its certificate."""
 
 
 class NoRight(FleetError):
-    """These credentials do not allow a request, or reading its answer."""
+    """Our credentials do not allow us to send a request, or to read its answer."""
 
 
 class NotDelivered(FleetError):
-    """A request that certainly reached no receiver."""
+    """A request certainly reached no receiver."""
 
 
 class MayNotSend(NoRight, NotDelivered):
-    """A request that the server did not forward because of missing rights."""
+    """The server did not forward a request, because our credentials do not allow us to send it."""
 
 
 class NobodyThere(NotDelivered):
@@ -41,15 +41,15 @@ class NobodyThere(NotDelivered):
 
 
 class Unsure(FleetError):
-    """A request without a timely answer: it may have been carried out, or may still be."""
+    """A request got no timely or usable answer: it may have been carried out, or may still be carried out."""
 
 
 class Conflict(Exception):
-    """A record has another revision than the one to be replaced."""
+    """A record was not replaced, because its revision is not the expected one."""
 
 
 MOST_DENIALS = 1000
-REFUSALS = (  # part of an error's text, and the sentence for users
+REFUSALS = (  # part of a client's error message, and the sentence that users see
     (
         "authorization violation",
         "{} refuses these credentials, or the lack of any: see --credentials",
@@ -83,7 +83,7 @@ def failure_to_connect(url: str, failure: BaseException) -> FleetError:
 
 
 def _words(text: str) -> str:
-    """Return an error's text without error numbers; for asyncio's connection errors, the system's text."""
+    """Return an error's text without its numbers; for asyncio's connection errors, the system's texts."""
     numbers = dict.fromkeys(re.findall(r"\[Errno (\d+)\] Connect call failed", text))
     if numbers:
         return ", ".join(os.strerror(int(number)) for number in numbers)
@@ -91,18 +91,18 @@ def _words(text: str) -> str:
 
 
 class Denials:
-    """The subjects that one connection may not use, as the server reports them; each is logged once."""
+    """Counts the server's denials on one connection, by subject, and logs each denied subject once."""
 
     def __init__(self) -> None:
-        self._said: Counter[tuple[str, str]] = Counter()  # count by kind and subject
-        self._raised = ""  # a subscription whose denial is raised instead of logged
+        self._said: Counter[tuple[str, str]] = Counter()  # number of denials by kind and subject
+        self._raised = ""  # the subject whose denied subscription is raised instead of logged
 
     async def note(self, failure: Exception) -> None:
-        """Note a denial, if this error message of a server reports one."""
+        """Count a denial, if this error message of a server reports one."""
         found = _DENIAL.search(str(failure))
         if not found:
             return
-        kind, subject = found[1].lower(), found[2].lower()  # nats-py turns messages into lower case
+        kind, subject = found[1].lower(), found[2].lower()  # nats-py converts messages to lower case
         if (kind, subject) not in self._said:
             if len(self._said) >= MOST_DENIALS:
                 return
@@ -115,10 +115,10 @@ class Denials:
         return self._said["publish", subject.lower()]
 
     def check_request(self, subject: str, inbox: str, before: int) -> None:
-        """Raise MayNotSend or NoRight if missing rights explain a missing answer.
+        """Raise MayNotSend or NoRight if missing rights explain why a request got no answer.
 
         `before` is the number of denials of this subject before the request was sent. MayNotSend means that
-        the request was not forwarded, NoRight that the answer in this inbox cannot be read.
+        the request was not forwarded. NoRight means that we may not read answers in `inbox`.
         """
         if self.of_request(subject) > before:
             raise MayNotSend(_sentence("publish", subject))

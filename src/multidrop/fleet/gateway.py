@@ -1,4 +1,5 @@
-"""FleetGateway: one process of a fleet, which polls its share of the lines and forwards their samples."""
+"""FleetGateway: one gateway process of a fleet. It polls its share of the lines and forwards their samples.
+"""
 
 from __future__ import annotations
 
@@ -37,17 +38,17 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
-FORWARD_S = 10.0  # time limit for forwarding the rest at shutdown; the next start continues
-IN_TROUBLE_S = 3.0  # the same limit if the stream has a problem
-SYNC_S = 3.0  # time limit for writing the last rows to the disk, before forwarding
+FORWARD_S = 10.0  # time limit at shutdown for forwarding; the next start forwards the other samples
+IN_TROUBLE_S = 3.0  # the same time limit if the samples' stream has a problem
+SYNC_S = 3.0  # time limit at shutdown for writing the last rows to the disk
 ENDING_S = 0.05
-LOOK_S = 0.2  # between checks of the threads
+LOOK_S = 0.2  # pause between checks of the threads
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class FleetGateway:
-    """A fleet's gateway called `name`; `folder` holds its lock, spool and logs.
+    """A fleet's gateway called `name`. `folder` holds its lock file, spool and logs.
 
     Raises ValueError for an invalid name, FleetError if another process uses the folder.
     """
@@ -74,7 +75,7 @@ class FleetGateway:
         self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(
             self.lines.poller,
-            may_command=lambda line: self.member.keeper.may_command(line),  # created below
+            may_command=lambda line: self.member.keeper.may_command(line),  # `member` is set below
             may_stop=lambda line: self.member.keeper.may_stop(line),
         )
         self.log = CommandLog(folder / "commands.jsonl")
@@ -89,11 +90,11 @@ class FleetGateway:
         self._end = asyncio.Event()
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Poll and forward until `end` is called; then close all lines, and forward the rest.
+        """Poll and forward until `end` is called; then close all lines, and forward the remaining samples.
 
-        Raises FleetError if no server answers, or the fleet was not set up. Raises Ended, after an orderly
-        end, if a task or thread that must not end has ended, or polling has failed: others take the lines
-        over.
+        Raises FleetError if no server answers, or if the fleet was not set up. Raises Ended if polling has
+        failed, or if a task or thread ended that must run as long as the gateway. Ended is raised after an
+        orderly shutdown, so other gateways take over the lines.
         """
         try:
             await open_all(self.paths)
@@ -119,7 +120,7 @@ class FleetGateway:
                 await self._until_the_end()
                 for name in ("look", "member"):
                     supervisor().let_go(name)
-                self.member.end()  # no effect if the member is ending already
+                self.member.end()  # no effect if `end` was called already
                 await asyncio.wait([member])
                 await end_tasks(looking)
                 with suppress(Ended, PollingFailed, asyncio.CancelledError):  # the supervisor reports them
@@ -133,7 +134,7 @@ class FleetGateway:
             await end_tasks(forwarding)
 
     async def _until_the_end(self) -> None:
-        """Wait until `end` is called, or a task or thread that must not end has ended."""
+        """Wait until `end` is called; return early if a task or thread has ended that must not."""
         waits = [asyncio.ensure_future(one.wait()) for one in (self._end, supervisor().has_dead)]
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         await end_tasks(*waits)
@@ -173,7 +174,7 @@ class FleetGateway:
     # ---- requests ----
 
     async def _answer(self, message: Msg) -> None:
-        """Answer a request about this gateway; ignore it without a session, as a namesake may have one."""
+        """Answer a request about this gateway, unless it has no session: a namesake may have one."""
         if not self.member.lease.session or not names.is_inbox(message.reply):
             return
         if message.subject == names.gateway_subject(self.name, "drain"):

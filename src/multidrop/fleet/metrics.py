@@ -1,8 +1,8 @@
-"""Metrics of a fleet's gateway: its state as OpenMetrics, and the port that serves it on this computer.
+"""Metrics of a fleet's gateway: its state as OpenMetrics, and the HTTP port that serves it on this computer.
 
-An unknown figure, such as the margin without a lease, has no sample. Every client that can connect can read,
-so the port listens only on loopback addresses. It also checks the `Host` header, so that a web page whose
-name resolves to this computer cannot read the metrics.
+A figure that is unknown, such as the lease's remaining time when there is no lease, has no sample. Every
+client that can connect can read the metrics, so the port listens only on loopback addresses. It also checks
+the `Host` header, so that a web page whose name resolves to this computer cannot read the metrics.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from multidrop.fleet.leases.member import MemberState
 
 
 class _Figure(NamedTuple):
-    """A metric, and the keys of its value in a gateway's state."""
+    """A metric, and where its value is in a gateway's state."""
 
     name: str
     kind: str  # "gauge" or "counter"
@@ -66,7 +66,7 @@ def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily
     yield _family("servers", "gauge", "Servers that its three connections use.", servers)
     yield _family("troubled_lines", "gauge", "Lines that cannot be opened, or fail.", len(state["troubles"]))
     for key, text in _LINES.items():
-        if key in state:  # earlier versions do not report it
+        if key in state:  # gateways of earlier versions do not report every figure
             yield _family(f"{key}_lines", "gauge", text, len(state[key]))
     for figure in _FIGURES:
         value: Any = state
@@ -81,7 +81,7 @@ def _family(name: str, kind: str, text: str, value: float) -> MetricFamily:
 
 
 EXAMPLE = "127.0.0.1:9464"
-MOST_HEAD = 8192  # bytes of a request
+MOST_HEAD = 8192  # size limit of a request's head, in bytes
 MOST_CLIENTS = 32
 PATIENCE_S = 5.0  # time limit for receiving a request and sending its answer
 NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
@@ -93,7 +93,7 @@ Metrics = Callable[[], Iterable[MetricFamily]]
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port. Raises ValueError if invalid, or if other computers can reach it."""
+    """Return host and port. Raises ValueError if they are invalid, or if other computers can reach them."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
@@ -114,7 +114,10 @@ def _is_loopback(host: str) -> bool:
 
 
 def listen(text: str) -> socket.socket:
-    """Return a listening socket at HOST:PORT. Raises ValueError for a bad address, OSError if it is taken."""
+    """Return a socket that listens at HOST:PORT.
+
+    Raises ValueError for an invalid address, OSError if the port is in use.
+    """
     address = parse_address(text)
     try:
         family, *_, where = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
@@ -136,7 +139,7 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
                     writer.write(_answer(await reader.readuntil(b"\r\n\r\n"), metrics))
                     await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # the client is gone or too slow, or sent too much
+            pass  # the client closed the connection, was too slow, or sent too much
         finally:
             clients.discard(writer)
             writer.close()

@@ -20,11 +20,14 @@ from multidrop.fleet.servers.setup import check_buckets
 from multidrop.printable import masked
 
 MOVES_SHOWN = 20
-MISSED_MS = 30 * 24 * 3600 * 1000  # how long a gateway that did not come back is reported
+MISSED_MS = 30 * 24 * 3600 * 1000  # a missing gateway is reported for this long: 30 days
 
 
 class FleetView:
-    """The state of a fleet, read over one path. Each `look` reads the changes and asks every gateway."""
+    """The state of a fleet, read over one server path.
+
+    Each call of `look` reads the changed records and asks every gateway for its state.
+    """
 
     def __init__(self, path: ServerPath) -> None:
         self._path = path
@@ -48,7 +51,7 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # invalid moves
+            with suppress(KeyError, TypeError, ValueError):  # a gateway sent invalid moves
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
@@ -59,9 +62,10 @@ class FleetView:
     def fleet(self) -> dict[str, Any]:
         """Return living and missing gateways, lines with their masters, and the last moves.
 
-        A dead gateway is listed as living until another one has ended its session. Its `says` is None if it
-        does not answer, and `unseen_s` is how long (s) no renewal was seen. Afterwards it is listed as
-        missing, with the time of its last renewal (`seen_ms`, UTC), until it runs again.
+        A dead gateway is listed as living until another one has ended its session. If a gateway does not
+        answer, its `says` is None. Its `unseen_s` is the time since its last renewal was seen, in s. Once its
+        session is ended, a gateway is listed as missing until it runs again. `seen_ms` is then the time of
+        its last renewal (UTC).
         """
         sessions = self._records.observer.sessions()
         lines = self._lines(sessions)
@@ -89,7 +93,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # does an owner's session last? cached, for thousands of lines
+        held: dict[tuple[str, int], bool] = {}  # whether an owner's session lasts: cached, for thousands of lines
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)
@@ -111,20 +115,20 @@ def _ms(found: object) -> int | None:
     return found if type(found) is int else None
 
 
-EVERY_S = 1.0  # between reads
+EVERY_S = 1.0  # pause between two reads of the fleet
 
 
 class FleetWatch:
-    """The newest complete view of a fleet, its age, and why there is no newer one."""
+    """The newest complete view of a fleet, its age, and why a newer read failed."""
 
     def __init__(self, view: FleetView, clock: Callable[[], float] = time.monotonic) -> None:
         self._view = view
         self._clock = clock
         self._looked: float | None = None
-        self.trouble: str | None = None  # why the newest read failed
+        self.trouble: str | None = None  # why the newest read failed; None if it succeeded
 
     async def look(self) -> None:
-        """Read the fleet again. If that fails, set `trouble` and keep the last view, whose age increases."""
+        """Read the fleet again. If that fails, set `trouble` and keep the last view."""
         begun = self._clock()
         try:
             await self._view.look()
@@ -145,6 +149,6 @@ class FleetWatch:
         return None if self._looked is None else round(self._clock() - self._looked, 3)
 
     def state(self) -> dict[str, Any]:
-        """Return the view that `fleet watch --json` prints and the gateway's page shows."""
+        """Return the view of the fleet that `fleet watch --json` prints and the gateway's page shows."""
         about = {"at_ms": time.time_ns() // 1_000_000, "age_s": self.age_s, "trouble": self.trouble}
         return {**about, **self._view.fleet()}

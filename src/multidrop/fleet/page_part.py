@@ -1,6 +1,6 @@
-"""The part `fleet` of `multidrop serve`: shows a fleet on the page, and stops it with a commander's key.
+"""The part `fleet` of `multidrop serve`: shows a fleet on the page, and can stop it with a commander's key.
 
-`multidrop.gateway` imports this module by its name, like those of its other parts.
+`multidrop.gateway` imports this module by its name, as it imports its other parts.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
 EXAMPLE = "nats://127.0.0.1:4222"
-OLD_S = 5.0  # an older view makes the part unhealthy
-AGAIN_S = 1.0  # between attempts to connect as a commander
+OLD_S = 5.0  # a view of the fleet that is older makes the part unhealthy
+AGAIN_S = 1.0  # pause between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
 
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """The table `[serve.fleet]`: the servers of the fleet, and files as for `fleet watch`.
+    """The table `[serve.fleet]`: the addresses of the fleet's servers, and the same files as for `fleet watch`.
 
-    `commander` is the file of a commander's key: with it the page can stop the whole fleet.
+    `commander` is the file with a commander's key. With it, the page can stop the whole fleet.
     """
 
     nats: tuple[str, ...] = (EXAMPLE,)
@@ -51,10 +51,10 @@ Settings = FleetSettings
 
 
 class FleetPart:
-    """A part that reads a fleet once a second.
+    """A part that reads a fleet's state once a second.
 
-    `command` returns a new client for commands, not yet connected; it is None if this page may not stop the
-    fleet.
+    `command` returns a new client for commands, which is not connected yet. It is None if this page may not
+    stop the fleet.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class FleetPart:
         self._path = path
         self._watch = watch
         self._command = command
-        self._commands: FleetCommands | None = None  # while it is connected
+        self._commands: FleetCommands | None = None  # the client for commands while it is connected
         self._why = "no server of the fleet has answered yet"
 
     @property
@@ -72,7 +72,7 @@ class FleetPart:
         return self._command is not None
 
     def take(self, batch: object) -> None:
-        """Ignore the batch: it is from the gateway's own lines, not from the fleet."""
+        """Ignore the batch: its rows are from the gateway's own lines, not from the fleet."""
 
     async def run(self) -> None:
         works = [self._path.keep(), self._watch.run()]
@@ -107,7 +107,7 @@ class FleetPart:
         except (OSError, ValueError) as failure:
             return {"the fleet": (False, masked(str(failure)))}
         found = {name: (one.ok, one.text) for name, one in answer.drives.items()}
-        if not found or not answer.ok:  # the answer has no drives of a line without a master
+        if not found or not answer.ok:  # the answer for a line without a master lists no drives
             found["the fleet"] = answer.ok, answer.text
         return found
 
@@ -123,7 +123,7 @@ class FleetPart:
         return f"{seen}: {self._watch.trouble or 'the first read is in progress'}"
 
     def state(self) -> dict[str, Any]:
-        """Return the fleet for the page, with its age."""
+        """Return the fleet's state for the page, with its age."""
         return self._watch.state()
 
 
@@ -134,7 +134,7 @@ class HasFolder(Protocol):
 
 
 def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
-    """Return the part, which connects only in `run`.
+    """Return the part. It connects to the servers only when `run` is called.
 
     Raises ImportError without the NATS client, OSError or ValueError for invalid files.
     """

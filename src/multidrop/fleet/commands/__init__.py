@@ -1,1 +1,1 @@
-"""Commands and stops that reach drives through the gateway that polls them."""
+"""Commands and stops that are sent to drives through the gateway that polls them."""

@@ -1,8 +1,9 @@
-"""The desks of a gateway: they carry out commands, each once, and stops on the lines that it is master of.
+"""The two desks of a gateway: CommandDesk carries out each command once, StopDesk carries out stops.
 
-The gateway checks a command and offers to carry it out. It does so if the sender returns the offer's token
-within a second of this computer's CLOCK_BOOTTIME. The command is recorded on the disk before it is sent, and
-again at its end.
+Both act only on lines of which this gateway is the master. The command desk checks a command and sends the
+sender an offer with a token. If the sender returns the token within a second of this computer's
+CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent, and
+again when it has ended.
 
 A stop needs no offer and no permission in the plant's list, because a repeated stop is harmless, but a late
 one may do harm. It is sent first and recorded afterwards.
@@ -41,11 +42,11 @@ from multidrop.fleet.leases.lease import boottime_ns
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-HOLD_S = 0.5  # wait this long for the result before answering "under way"
-AWAITED_S = 3.0  # releasing a line waits this long for commands; most writes and read-backs are faster
-POLL_S = 0.01  # between checks whether these commands have ended
-MOST_WRITES = 8  # concurrent writes on one line; stops are not counted
-WAY = "fleet"  # the sender's way in the audit log
+HOLD_S = 0.5  # how long to wait for a command's end before answering "under way"
+AWAITED_S = 3.0  # time limit for commands when a line is released; most writes and read-backs are faster
+POLL_S = 0.01  # pause between checks whether the commands have ended
+MOST_WRITES = 8  # concurrent commands on one line; stops are not counted
+WAY = "fleet"  # how commands arrived, in the audit log
 STOPS_REMEMBERED = 1000  # limit of stops in memory; the oldest are removed
 CALLED = "a stop was called"
 
@@ -53,7 +54,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class CommandDesk:
-    """Offers and carries out commands on this gateway's lines; senders return tokens on `subject`."""
+    """Offers commands on this gateway's lines and carries them out; senders return tokens on `subject`."""
 
     def __init__(
         self,
@@ -75,7 +76,7 @@ class CommandDesk:
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         """Return an offer or a refusal; None unless this gateway is the line's master.
 
-        The sender uses the first answer, so only the master may give one.
+        The sender uses the first answer that it gets, so only the master may give one.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -90,10 +91,10 @@ class CommandDesk:
     # ---- carrying it out ----
 
     async def do(self, data: bytes) -> CommandAnswer:
-        """Carry out an offered command once; a copy of the message gets the same answer.
+        """Carry out an offered command once, and return its result, also for a copy of the message.
 
-        A message with `ask` instead of `do` asks for the result. If it comes before any `do`, the offer is
-        withdrawn, so that the answer "not sent" stays true.
+        A message with `ask` instead of `do` only asks for the result. If it comes before any `do`, the offer
+        is withdrawn, so that the answer "not sent" stays true.
         """
         try:
             message = read_json(data)
@@ -116,7 +117,7 @@ class CommandDesk:
     async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
         """Wait for the commands in progress on a line that is being released.
 
-        Wait for AWAITED_S at most, and only while `may_wait` returns True.
+        Wait for at most AWAITED_S, and only while `may_wait` returns True.
         """
         loop = asyncio.get_running_loop()
         ends = loop.time() + AWAITED_S
@@ -157,8 +158,8 @@ class CommandDesk:
         return answer
 
     def _limit_ns(self, offer: Offer) -> float:
-        """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 once its offer is void."""
-        now_ns = time.monotonic_ns()  # read first, so a pause before the next read shortens the limit
+        """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 if its offer is void."""
+        now_ns = time.monotonic_ns()  # read first: a pause between the two clocks' reads shortens the limit
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 
     def _refusal(self, offer: Offer) -> CommandResult | None:
@@ -185,7 +186,7 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Check a request, and return the command. Raises ValueError if the plant does not allow it."""
+    """Return the command for a request. Raises ValueError if the plant's list lacks it, and as `prepare`."""
     drive = held.drive(request.drive)
     if request.verb == "stop":
         raise ValueError("a stop needs no offer: it goes to the line's own subject of stops")
@@ -199,7 +200,7 @@ def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
 
 
 class StopDesk:
-    """Carries out stops on this gateway's lines; each makes earlier offers for its drives void."""
+    """Carries out stops on this gateway's lines. Each stop voids the earlier offers for its drives."""
 
     def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
         self.gateway = gateway
@@ -210,12 +211,12 @@ class StopDesk:
         self._repeated = RepeatedStops()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
-        """Stop drives of a line now; return None unless this gateway is its master.
+        """Stop drives of a line now; return None unless this gateway is the line's master.
 
-        A damaged message stops all drives. A copy of a message gets the answer of the same stop; a message
-        without an id is always a new stop. A stop that takes longer than HOLD_S is answered with "under way"
-        and its progress, and the sender asks again. If this gateway has lost or released the line since,
-        return None unless the motors have stopped: the next master answers.
+        A damaged message stops all drives of the line. A copy of a message gets the answer of the same stop;
+        a message without an id is always a new stop. A stop that takes longer than HOLD_S is answered with
+        "under way" and its progress; the sender then asks again. If this gateway has released or lost the
+        line since, and the motors have not stopped, return None: the next master answers.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -249,7 +250,7 @@ class StopDesk:
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop_or_report(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Carry out a stop. Log an unexpected exception, and return it as the answer."""
+        """Carry out a stop and return its answer, also if it fails with an unexpected exception."""
         try:
             return await self._stop(held, request)
         except Exception as failure:
@@ -258,7 +259,7 @@ class StopDesk:
             return CommandAnswer(CommandOutcome.UNKNOWN, text, self.gateway)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Stop the drives in parallel. If a drive's stop is being repeated already, send one more stop."""
+        """Stop the drives in parallel. If a drive's stop is already being repeated, send one more command."""
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
@@ -281,7 +282,7 @@ class StopDesk:
         return answer
 
     def _note(self, record: Mapping[str, Any]) -> None:
-        """Write a record in a task; records are in the order of the calls."""
+        """Write a record to the log in a task. Records keep the order of the calls."""
         supervisor().start("note of a stop", self._write(record))
 
     async def _write(self, record: Mapping[str, Any]) -> None:

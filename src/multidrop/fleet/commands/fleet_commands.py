@@ -1,4 +1,4 @@
-"""FleetCommands: send commands and stops to the present master of a line, and wait for their results."""
+"""FleetCommands: send commands and stops to the master of a drive's line, and wait for their results."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from multidrop.fleet.servers.setup import open_all
 from multidrop.plant import drive_meant
 from multidrop.supervisor import Ended, end_tasks, reason_of
 
-LOST_S = 6.0  # without any answer, until the result counts as unknown
+LOST_S = 6.0  # after this long without any answer, a command's result is reported as unknown
 AGAIN_S = 0.2
-NO_MASTER_S = 6.0  # retry a stop this long without a master; a line gets one within 1 s, 4 s after a death
+NO_MASTER_S = 6.0  # repeat a stop this long without a master; a line has one after 1 s, or 4 s after a death
 HARD_WIRED = "use the hard-wired stop"
 
 News = Callable[[CommandAnswer], object]
@@ -51,8 +51,8 @@ class FleetCommands:
     """A client that commands the drives of a fleet.
 
     `by` is the client's name in its own log and in the gateways' logs; `log` is the path of its own log. A
-    command is sent once; a stop is sent until a gateway answers. A command that cannot be noted in `log` is
-    not sent, but a stop is sent nevertheless. Raises FleetError if no server can be reached.
+    command is sent once, and only if it could be noted in `log`. A stop is sent until a gateway answers, even
+    if it cannot be noted. Raises FleetError if no server can be reached.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class FleetCommands:
     # ---- commands ----
 
     async def preview(self, request: CommandRequest) -> Offered | CommandAnswer:
-        """Return the line master's offer to carry out a command, or its refusal; do not carry it out."""
+        """Return the offer or refusal of the line's master for a command; the command is not carried out."""
         return await self._offer(await self._line_of(request.drive), request)
 
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
@@ -104,7 +104,7 @@ class FleetCommands:
         return await self.carry_out(self.request(drive, register=register, value=value))
 
     async def act(self, drive: str, verb: str, **options: object) -> CommandAnswer:
-        """Carry out a verb once, such as "start", direction="forward". Raises as `write`."""
+        """Carry out a verb once, such as "start" with direction="forward". Raises errors as `write` does."""
         return await self.carry_out(self.request(drive, verb=verb, options=options))
 
     def request(self, drive: str, **what: Any) -> CommandRequest:
@@ -112,10 +112,10 @@ class FleetCommands:
         return CommandRequest(uuid.uuid4().hex, self.by, drive, **what)
 
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
-        """Send a command once, and return its result. Raises as `write`.
+        """Send a command once, and return its result. Raises errors as `write` does.
 
-        `agreed` is the text of a preview that a person agreed to. If the text would be another one now, the
-        command is not sent.
+        `agreed` is the text of the preview that a person has confirmed. If the command's text has changed
+        since, the command is not sent.
         """
         line = await self._line_of(request.drive)
         record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
@@ -136,7 +136,8 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask for an offer on one path after another. An offer has no effect, so asking twice is harmless."""
+        """Ask for an offer on one path after another: an offer has no effect, so it may be requested twice.
+        """
         why = ""
         for path in self._paths:
             try:
@@ -153,7 +154,7 @@ class FleetCommands:
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
 
     async def _do(self, offered: Offered) -> CommandAnswer:
-        """Confirm the offer once, and return the result; if no answer comes, only ask for the result."""
+        """Confirm the offer once and return the result. If no answer comes, ask only for the result."""
         path = self._path()
         try:
             message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
@@ -161,7 +162,7 @@ class FleetCommands:
         except NotDelivered:
             why = f"{offered.text} was not sent: {offered.gateway} is gone since its offer"
             return CommandAnswer(CommandOutcome.NOT_SENT, why)
-        except (FleetError, ValueError):  # the confirmation may have been delivered
+        except (FleetError, ValueError):  # the gateway may have received the confirmation
             answer = CommandAnswer(CommandOutcome.UNDER_WAY, "")
         asked = json.dumps({"ask": offered.token}).encode()
         lost = f"{offered.text}: it is not known whether it was sent: {offered.gateway} no longer answers"
@@ -170,7 +171,8 @@ class FleetCommands:
     async def _end_of(
         self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _ignore
     ) -> CommandAnswer:
-        """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without answer."""
+        """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without an answer.
+        """
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
         reported = {""}
@@ -202,11 +204,13 @@ class FleetCommands:
     ) -> CommandAnswer:
         """Stop these drives, or all drives of the plant if None; the lines are stopped in parallel.
 
-        `by` replaces this object's `by` in the logs. With `line` the plant is not read, and the drives are
-        those of the line. `on_news` is called in the loop with the progress of a stop that takes longer than
-        half a second, and again at each change. A drive that is not in the plant gets the answer "refused";
-        the others are stopped. Raises ValueError if none is in the plant, and FleetError if the plant cannot
-        be read; in both cases no stop was sent.
+        With `line` the plant is not read, and the drives are those of the line. `by` replaces this object's
+        `by` in the logs. `on_news` is called in the loop with the progress of a stop that takes longer than
+        half a second, and at each change of it. A drive that is not in the plant gets the answer "refused";
+        the others are stopped.
+
+        Raises ValueError if none of the drives is in the plant, FleetError if the plant cannot be read. In
+        both cases no stop was sent.
         """
         drives = [drives] if isinstance(drives, str) else drives
         wanted, unknown = await self._lines_of(drives, line)
@@ -222,7 +226,7 @@ class FleetCommands:
     async def _lines_of(
         self, drives: Sequence[str] | None, line: str
     ) -> tuple[dict[str, list[str] | None], list[CommandAnswer]]:
-        """Return the drives to stop by line, and an answer for each drive that is not in the plant."""
+        """Return the drives to stop for each line, and an answer for each drive that is not in the plant."""
         if line:
             return {line: None if drives is None else list(drives)}, []
         await self._read_plant(f"the stop was NOT sent; {HARD_WIRED}")
@@ -245,7 +249,7 @@ class FleetCommands:
         return found, unknown
 
     async def _stop(self, line: str, drives: list[str] | None, on_news: News, by: str) -> CommandAnswer:
-        """Send a stop until a gateway answers, and return the result when the stop has ended."""
+        """Send a stop until a gateway answers; return the final result."""
         request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": by}
@@ -309,8 +313,8 @@ async def _first_answer(
 ) -> CommandAnswer:
     """Send a stop until a gateway answers or may have received it; return that answer or UNDER_WAY.
 
-    Return NOT_SENT if none can have received it within NO_MASTER_S, or if this client may not send it. Until
-    then, `on_news` reports that the stop was not sent yet.
+    Return NOT_SENT if no gateway can have received it within NO_MASTER_S, or if this client may not send it.
+    Until then, `on_news` reports that the stop was not sent yet.
     """
     loop = asyncio.get_running_loop()
     ends, reported = loop.time() + NO_MASTER_S, ""
@@ -330,10 +334,11 @@ async def _first_answer(
 
 
 async def _ask_all(paths: Sequence[ServerPath], line: str, request: StopRequest, what: str) -> CommandAnswer:
-    """Ask on all paths in parallel, and return the first answer.
+    """Send a stop on all paths in parallel, and return the first answer.
 
-    Return UNDER_WAY if a gateway may have received the stop. Raises NotDelivered if all paths report that it
-    was not delivered: NobodyThere if a path reports that the line has no master.
+    Return UNDER_WAY if a gateway may have received the stop without answering. Raises NobodyThere if no path
+    delivered the stop and one reports that the line has no master. Raises NotDelivered if no path delivered
+    it for other reasons.
     """
     subject, data = names.stop_subject(line), encode(request)
     asking = [asyncio.create_task(path.request(subject, data)) for path in paths]

@@ -1,4 +1,5 @@
-"""Held lines: the lines for which this gateway accepts commands, and the commands that each allows."""
+"""The lines for which this gateway accepts commands, and the commands that each line's plant record allows.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ LISTS = ("write", "verbs")  # keys of [fleet.may]
 
 
 class PolledBuses(Protocol):
-    """The part of a Poller that commands need."""
+    """The methods of a Poller that commands need."""
 
     def bus(self, line: str) -> Bus: ...
 
 
 class HeldLine:
-    """A line while this gateway polls it. It gets a new number each time this gateway takes it."""
+    """A line that this gateway polls. It gets a new number each time this gateway becomes its master."""
 
     _numbers = count(1)
 
@@ -42,7 +43,7 @@ class HeldLine:
 
 
 class HeldLines:
-    """The lines that accept commands.
+    """The lines for which this gateway accepts commands and stops.
 
     `may_stop` returns True while this gateway is the line's master. `may_command` returns True once no frame
     of the previous master can still be on the line. A stop that collides with such a frame is repeated; a
@@ -58,16 +59,16 @@ class HeldLines:
         self._held: dict[str, HeldLine] = {}
 
     def open(self, line: str, description: Mapping[str, Any]) -> None:
-        """Accept commands for a line that is polled from now on."""
+        """Accept commands and stops for a line from now on, because it is polled."""
         self._held[line] = HeldLine(line, self._buses.bus(line), lists_of(description))
 
     def leave(self, line: str) -> None:
-        """Accept only stops from now on."""
+        """Accept only stops for the line from now on."""
         if held := self._held.get(line):
             held.is_leaving = True
 
     def shut(self, line: str) -> None:
-        """Accept no commands or stops from now on."""
+        """Accept neither commands nor stops for the line from now on."""
         self._held.pop(line, None)
 
     def for_command(self, line: str) -> HeldLine | None:
@@ -81,7 +82,7 @@ class HeldLines:
 
 
 def lists_of(description: Mapping[str, Any]) -> dict[str, frozenset[str]]:
-    """Return the permission lists of a line's record; an invalid list counts as empty."""
+    """Return the registers and verbs that a line's record allows; an invalid list counts as empty."""
     may = description.get("may")
     given = may if isinstance(may, dict) else {}
     return {key: _entries(given.get(key)) for key in LISTS}

@@ -1,4 +1,4 @@
-"""CommandLog: a file with one line of JSON for each step of a command, written before the next step."""
+"""CommandLog: a file with one line of JSON for each step of a command. A step waits until it is logged."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 from multidrop.control import AuditLog
 from multidrop.supervisor import supervisor
 
-WRITING_S = 10.0  # a record that takes longer is reported as hanging
+WRITING_S = 10.0  # a record whose writing takes longer is reported as hanging
 CLOSING_S = 1.0  # closing waits this long for the record that is being written
 
 
 class CommandLog:
-    """The log in this file, which is only appended to.
+    """The command log in this file, to which records are only appended.
 
-    Each record is written in its own daemon thread, so a disk that hangs blocks neither the loop nor the
-    exit.
+    Each record is written in its own daemon thread, so a disk that hangs blocks neither the event loop nor
+    the exit of the process.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +31,7 @@ class CommandLog:
         self._is_closed = False
 
     def open(self) -> AuditLog:
-        """Open the file unless it is open. Raises OSError. `note` opens it too."""
+        """Open the file unless it is open; `note` calls this too. Raises OSError."""
         if self._log is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._log = AuditLog(self.path)
@@ -40,7 +40,7 @@ class CommandLog:
     async def note(self, record: Mapping[str, Any]) -> None:
         """Append a record with the time of day (UTC), and return once it is synced to the disk.
 
-        Raises OSError, also if the log is closed or the system has no thread left.
+        Raises OSError if that fails, if the log is closed, or if the system cannot start a thread.
         """
         now_ns = time.time_ns()
         async with self._turn:
@@ -60,7 +60,7 @@ class CommandLog:
             log.sync()
 
     def close(self) -> None:
-        """Close the file after the record that is being written; later records are refused."""
+        """Close the file when the record that is being written is done; later records are refused."""
         self._is_closed = True
         if self._writing.acquire(timeout=CLOSING_S):
             if self._log:

@@ -1,4 +1,4 @@
-"""Messages of commands: requests, offers and answers as JSON. Pure."""
+"""Messages of commands: requests, offers and answers, and their JSON. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 from multidrop.control import CommandOutcome as CommandOutcome
 from multidrop.control import CommandResult, with_name
 
-MOST_BYTES = 64 * 1024  # limit of a message
-MOST_CHARACTERS = 200  # limit of a name, an id or a value's text
-UNNAMED = "somebody"  # sender of a stop without a name
+MOST_BYTES = 64 * 1024  # limit of a message's size
+MOST_CHARACTERS = 200  # limit of a name's, an id's or a value's length
+UNNAMED = "somebody"  # the sender's name if a stop has none
 
 
 class CommandAnswer(NamedTuple):
@@ -23,7 +23,7 @@ class CommandAnswer(NamedTuple):
     """
 
     outcome: CommandOutcome
-    text: str  # one sentence for a person
+    text: str  # one sentence for users
     gateway: str = ""
     held: str = ""
     drives: Mapping[str, CommandAnswer] = {}
@@ -62,12 +62,12 @@ class CommandRequest(NamedTuple):
 
     @property
     def entry(self) -> str:
-        """Return the entry that the plant's list must have to allow this command."""
+        """Return the entry of the plant's list that allows this command, such as "pump.start"."""
         return f"{self.drive}.{self.verb or self.register}"
 
     @property
     def words(self) -> str:
-        """Return the request as text, for logs and answers."""
+        """Return the command as text, for logs and answers."""
         if self.register:
             return f"{self.entry} = {self.value}"
         options = ", ".join(f"{name} = {value}" for name, value in self.options.items())
@@ -75,7 +75,7 @@ class CommandRequest(NamedTuple):
 
 
 class StopRequest(NamedTuple):
-    """A stop of these drives of a line, or of all drives if None; each stop has its own `id`."""
+    """A stop of these drives of a line, or of all its drives if None. Each stop has its own `id`."""
 
     id: str
     by: str
@@ -86,7 +86,7 @@ class Offered(NamedTuple):
     """A gateway's offer to carry out a checked command once, if the sender returns its token soon."""
 
     token: str
-    subject: str  # to send the token to
+    subject: str  # the subject to which the sender returns the token
     text: str  # description of the command
     gateway: str
 
@@ -125,10 +125,10 @@ def read_command(data: bytes) -> CommandRequest:
 
 
 def read_stop(data: bytes) -> tuple[StopRequest, str]:
-    """Return the stop in a message. For a damaged message, stop all drives, and also return the reason.
+    """Return the stop in a message, and why the message is damaged ("" if it is not).
 
-    A stop is never refused: stopping too many drives does less harm than stopping none. Names are made
-    printable; a missing id is "".
+    A damaged message stops all drives of the line: stopping too many drives does less harm than stopping
+    none. Names are made printable; a missing id is "".
     """
     try:
         found = read_json(data)
@@ -144,7 +144,7 @@ def read_stop(data: bytes) -> tuple[StopRequest, str]:
 
 
 def spelt(given: object) -> str:
-    r"""Return any object, given as a name, as printable text; an escape character becomes `\x1b`."""
+    r"""Return a name as printable text, whatever its type; an escape character becomes `\x1b`."""
     text = str(given) if isinstance(given, (str, int, float)) else ""
     return (text if text.isprintable() else repr(text)[1:-1]).strip()[:MOST_CHARACTERS]
 
@@ -170,12 +170,12 @@ def _value(found: Mapping[str, Any]) -> float | str:
 def _is_finite(value: float) -> bool:
     try:
         return isfinite(value)
-    except OverflowError:  # an int that is too large for a float
+    except OverflowError:  # an int may be too large for a float
         return False
 
 
 def read_offer(data: bytes) -> Offered | CommandAnswer:
-    """Return a gateway's offer, or its answer if it refuses. Raises ValueError if the message is invalid."""
+    """Return a gateway's offer, or its answer if it refuses. Raises ValueError for an invalid message."""
     found = read_json(data)
     if "token" not in found:
         return read_answer(data)
@@ -183,7 +183,7 @@ def read_offer(data: bytes) -> Offered | CommandAnswer:
 
 
 def read_answer(data: bytes) -> CommandAnswer:
-    """Return a gateway's answer. Raises ValueError if the message is invalid."""
+    """Return a gateway's answer. Raises ValueError for an invalid message."""
     return _answer(read_json(data))
 
 
@@ -210,7 +210,7 @@ def _long_text(found: Mapping[str, Any], key: str) -> str:
 
 
 def worst(answers: Sequence[CommandAnswer]) -> CommandOutcome:
-    """Return the most serious outcome of several drives' commands."""
+    """Return the most serious outcome of the commands to several drives."""
     order = (
         CommandOutcome.UNKNOWN,
         CommandOutcome.NOT_SENT,

@@ -1,6 +1,7 @@
-"""Offers: commands that a line's master has checked and offered to carry out, each once within a second.
+"""Offers: commands that a line's master has checked and offers to carry out, each once within a second.
 
-Offers are only in memory: a restarted gateway never carries out an offer that it made before the restart.
+Offers are kept only in memory, so a restarted gateway never carries out an offer that it made before the
+restart.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from multidrop.fleet.commands.held_lines import HeldLine
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, CommandRequest
 from multidrop.fleet.leases.rules import SECOND
 
-LIMIT_NS = 1 * SECOND  # from the offer until the command's first frame
+LIMIT_NS = 1 * SECOND  # time from the offer to the command's first frame
 REMEMBERED = 10_000  # limit of offers in memory; the oldest are removed
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
 
@@ -41,9 +42,10 @@ def commands_of(drive: Drive) -> list[str]:
 
 
 def prepare(drive: Drive, request: CommandRequest) -> Prepared:
-    """Check a request, and return the command, without sending a frame.
+    """Return the checked command for a request, without sending a frame.
 
-    Raises ValueError (WriteForbidden is one), TypeError or Unsupported if the command must not be sent.
+    Raises ValueError, TypeError or Unsupported if the command must not be sent. WriteForbidden is a
+    ValueError.
     """
     return _prepare_write(drive, request) if request.register else _prepare_verb(drive, request)
 
@@ -56,7 +58,7 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     arguments = verb_arguments(verb, request.options)
     if verb in _MOVING:
         drive.check_confirmed(verb)
-    next(getattr(drive, verb).script(**arguments), None)  # raises if the family forbids the verb
+    next(getattr(drive, verb).script(**arguments), None)  # raises if the family does not allow the verb
     options = "".join(f", {name} = {getattr(value, 'value', value)}" for name, value in arguments.items())
     text = f"{drive.name}: {verb}{options}"
     if verb not in _MOVING:
@@ -79,9 +81,9 @@ def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
 
 @dataclass(eq=False)
 class Offer:
-    """One command that was offered for a held line.
+    """An offer to carry out one command on a held line.
 
-    `is_taken` is set when the sender returns the token; `answer` and `over` are set when the command has
+    `is_taken` is set when the sender returns the token. `answer` and `over` are set when the command has
     ended.
     """
 
@@ -101,7 +103,7 @@ class Offer:
 
 
 class Offers:
-    """The offers of one run of a gateway; `clock` is its CLOCK_BOOTTIME in ns."""
+    """The offers that this gateway process has made. `clock` returns its CLOCK_BOOTTIME in ns."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self._clock = clock
@@ -127,17 +129,17 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Return True at the first call for an offer; only then may the command be carried out."""
+        """Return True at the first call for an offer: only then may its command be carried out."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
 
     def left_ns(self, offer: Offer) -> int:
-        """Return for how many ns the command may still be sent; 0 or less if it is too late."""
+        """Return how many ns remain for sending the command; 0 or less if it is too late."""
         return offer.made_ns + LIMIT_NS - self._clock()
 
     def why_late(self, offer: Offer) -> str:
-        """Return why it is too late for an offer; "" if it is not."""
+        """Return why it is too late to carry out an offer; "" if it is not too late."""
         left = self.left_ns(offer)
         if left > 0:
             return ""
@@ -145,20 +147,20 @@ class Offers:
         return f"{age_s:.1f} s have passed since the offer, and {LIMIT_NS / SECOND:g} s is allowed"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
-        """Make unfinished offers for these drives of a line void; None means all drives."""
+        """Void the unfinished offers for these drives of a line; None means all its drives."""
         for offer in self._by_token.values():
             is_one = offer.held.name == line and (drives is None or offer.request.drive in drives)
             if is_one and offer.answer is None:
                 offer.why_void = offer.why_void or why
 
     def withdraw(self, offer: Offer, why: str) -> None:
-        """Withdraw an offer, unless its command was started already."""
+        """Withdraw an offer, unless its command has started already."""
         if self.take(offer):
             self.end(
                 offer, CommandAnswer(CommandOutcome.NOT_SENT, f"{offer.request.words} was not sent: {why}")
             )
 
     def end(self, offer: Offer, answer: CommandAnswer) -> None:
-        """Set an offer's answer, which later copies of the message get too."""
+        """Set the answer of an offer, which later copies of the message get too."""
         offer.answer = answer
         offer.over.set()

@@ -1,8 +1,9 @@
 """CommandSubjects: receive commands and stops from NATS on all paths of a gateway, and answer them.
 
-A gateway subscribes to a line's subjects only while it polls the line, so the server reports to a sender that
-a line has no master. Each message arrives once on each path; CommandDesk and StopDesk recognise copies by the
-id that the sender chose. No stream is used.
+A gateway subscribes to a line's subjects only while it polls the line. For a line without a master, the
+server therefore reports to a sender that there is no receiver. Each message arrives once on each path;
+CommandDesk and StopDesk recognise copies by the id that the sender chose. Messages are not stored in a
+stream.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class CommandSubjects:
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
 
     async def begin(self) -> None:
-        """Subscribe to the subject for the tokens of this run's offers."""
+        """Subscribe to the subject on which senders return this process's tokens."""
         await self._subscribe(self.desk.subject, self.desk.do)
 
     def open(self, line: str, description: Any) -> None:
@@ -66,7 +67,7 @@ class CommandSubjects:
 
     async def _subscribe(self, subject: str, heard: Heard) -> None:
         async def take(message: Msg) -> None:
-            supervisor().start("answer", _answer(message, heard))  # so no message waits for another
+            supervisor().start("answer", _answer(message, heard))  # so messages do not wait for each other
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
 
@@ -74,7 +75,7 @@ class CommandSubjects:
         await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
 
     def _change(self, work: Coroutine[Any, Any, None]) -> None:
-        """Change subscriptions in a task. A failure is fatal, because stops could get lost."""
+        """Change subscriptions in a task. A failure ends the gateway, because it could miss stops."""
 
         async def change() -> None:
             try:
@@ -94,14 +95,14 @@ async def _answer(message: Msg, heard: Heard) -> None:
     if answer is None or not names.is_inbox(message.reply):
         return
     data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
-    with suppress(Exception):  # the sender may be gone
+    with suppress(Exception):  # the sender may have disconnected
         await message.respond(data)
 
 
 class CommandedLines:
-    """Lines that accept commands as long as they are polled.
+    """Polls lines, and accepts commands for a line while it is polled.
 
-    `may_wait` returns True while the lease leaves time before a line must be closed.
+    `may_wait` returns True while the lease leaves time before the lines must be closed.
     """
 
     def __init__(
@@ -124,10 +125,10 @@ class CommandedLines:
         return self._lines.port_loss(line)
 
     async def let_go(self, line: str) -> None:
-        """Accept no more commands, stop polling the line, and close it.
+        """Accept no more commands for the line, stop polling it, and close it.
 
-        Closing waits for stops in progress, so that their senders get answers. Wait a short time for commands
-        in progress, whose results would otherwise stay unknown.
+        Closing waits for stops in progress, so that their senders get answers. It also waits a short time for
+        commands in progress, because their results would otherwise stay unknown.
         """
         self._subjects.leave(line)
         try:

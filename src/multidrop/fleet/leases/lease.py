@@ -1,4 +1,4 @@
-"""Lease: a gateway's own session, renewed on three paths, and the deadline of its right to send."""
+"""Lease: a gateway's own session, which is renewed on three paths, and the deadline for sending."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 
 _log = logging.getLogger("multidrop.fleet")
 
-JOIN_S = 0.25  # between attempts to start a session
-AGAIN_S = 0.1  # before a failed renewal is repeated
+JOIN_S = 0.25  # pause between attempts to start a session
+AGAIN_S = 0.1  # pause before a failed renewal is repeated
 
 
 def boottime_ns() -> int:
@@ -30,7 +30,7 @@ def boottime_ns() -> int:
 
 
 class MayPoll(Protocol):
-    """The engine's right to send; `multidrop.core.Mastership` is one."""
+    """The engine's right to send frames; `multidrop.core.Mastership` implements it."""
 
     def extend(self, until_ns: int) -> object:
         """Let the engine send until this time (CLOCK_BOOTTIME), and postpone the kernel's timer.
@@ -43,17 +43,17 @@ class MayPoll(Protocol):
 
 
 class Held(NamedTuple):
-    """Our record on one path: its revision, and the time right before its renewal was sent (ns)."""
+    """Our lease record on one path: its revision, and when its renewal was sent (CLOCK_BOOTTIME, ns)."""
 
     revision: int
     sent: int
 
 
 class Lease:
-    """The session of one gateway.
+    """The lease of one gateway: a session, recorded on three paths.
 
     `until` is the deadline for sending (CLOCK_BOOTTIME, ns). `note` returns further fields of the record, for
-    other gateways and people.
+    other gateways and for display.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Lease:
     ) -> None:
         self.name = name
         self.terms = terms
-        self.session = 0  # number of the present session; 0: none
+        self.session = 0  # number of the present session; 0 without one
         self.until = 0
         self.trouble = ""  # why the session cannot start
         self.began_ms = 0  # start of the session, UTC in ms
@@ -81,7 +81,7 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
-        self._newest = 0  # newest session of this process: no number is used twice, even if one is forged
+        self._newest = 0  # newest session number of this process; none is reused, whatever a record says
         self._ended: set[int] = set()  # paths on which others have ended this session's record
 
     # ---- state ----
@@ -92,33 +92,33 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return how long this gateway may still send (s); negative after the deadline."""
+        """Return how many seconds this gateway may still send; negative after the deadline."""
         return (self.until - self.clock()) / SECOND
 
     @property
     def best(self) -> int:
-        """Return the number of the path that was renewed last: its answers are the newest."""
+        """Return the number of the path that was renewed last: its server's answers are the newest."""
         return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
 
     @property
     def is_over(self) -> bool:
-        """Return True if this session holds too few records to be renewed."""
+        """Return True if we hold too few of the session's records to renew it."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property
     def is_weak(self) -> bool:
-        """Return True if others have ended one of our records: the loss of another one ends the session."""
+        """Return True if others have ended one of our three records: losing one more ends the session."""
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
-        """Return True if all paths answer, so that a new session would have three records."""
+        """Return True if all paths answer, so that a new session would hold all three records."""
         records = await asyncio.gather(*(self._read(path) for path in range(len(self._buckets))))
         return None not in records
 
     # ---- start ----
 
     async def begin(self) -> None:
-        """Start a session as soon as every earlier one of this gateway is over."""
+        """Start a session as soon as all earlier sessions of this gateway are over."""
         reported = ""
         while not await self.try_to_begin():
             if self.trouble != reported:
@@ -127,7 +127,7 @@ class Lease:
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:
-        """Start a session by taking the free records. Return False if too few are free: then call again."""
+        """Start a session by taking the free records. Return False if too few are free; call again later."""
         paths = range(len(self._buckets))
         records = await asyncio.gather(*(self._read(path) for path in paths))
         known = {path: record for path, record in enumerate(records) if record is not None}
@@ -160,7 +160,7 @@ class Lease:
             return None
 
     def _is_free(self, path: int, record: Record) -> bool:
-        """Return True if the session in this record has ended, or may be ended as stale or dead."""
+        """Return True if the record may be taken: its session was ended, its process died, or it is stale."""
         value = record.value
         if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
@@ -181,7 +181,7 @@ class Lease:
             revision = await self._buckets[path].put(self.name, self._value(), record.revision)
         except (Conflict, FleetError):
             return
-        if nonce == self._nonce:  # otherwise this was the answer to an earlier session
+        if nonce == self._nonce:  # otherwise the answer is for an earlier session
             self.held[path] = Held(revision, sent)
 
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
@@ -202,10 +202,10 @@ class Lease:
     # ---- renewal ----
 
     async def renew(self, path: int) -> None:
-        """Renew one path forever. Each path has its own task, so none waits for another.
+        """Renew one path forever. Each path has its own task, so no path waits for another.
 
-        A failed renewal is repeated soon: the bucket may get a leader at any moment, and two renewed paths
-        are enough to poll.
+        A failed renewal is repeated soon, because the bucket may get a leader at any moment. Two renewed
+        paths are enough to poll.
         """
         while True:
             begun, before = self.clock(), self.held[path]
@@ -216,7 +216,7 @@ class Lease:
             await asyncio.sleep(max(rest, AGAIN_S))
 
     async def renew_once(self, path: int) -> None:
-        """Renew one path. The lease counts from the moment before the request was sent."""
+        """Renew one path's record. The lease's time counts from the moment before the request is sent."""
         held, nonce, sent = self.held[path], self._nonce, self.clock()
         if held is None:
             if path not in self._ended:
@@ -230,18 +230,18 @@ class Lease:
             if isinstance(failure, Unsure):
                 await self._look_again(path, nonce, held)
         else:
-            if nonce == self._nonce:  # otherwise this was the answer to an earlier session
+            if nonce == self._nonce:  # otherwise the answer is for an earlier session
                 self.held[path] = Held(revision, sent)
                 self._extend()
 
     async def _look_again(self, path: int, nonce: str, held: Held) -> None:
-        """Read the record after a renewal that failed, or whose outcome is unknown."""
+        """Read the record again after a renewal that failed, or whose outcome is unknown."""
         record = await self._read(path)
         if record is None or nonce != self._nonce:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, held.sent)  # the earlier time is the safe one
+            self.held[path] = Held(record.revision, held.sent)  # of two possible times, the earlier one is safe
         elif record.revision > held.revision:
             self._lose(path)
 
@@ -253,10 +253,10 @@ class Lease:
         )
 
     async def _take_late(self, path: int) -> None:
-        """Take a path that was not available when the session started.
+        """Take the record on a path that was not available when the session started.
 
-        A record on this path belongs to a session that was ended when we took the other paths. Before we hold
-        those, another gateway of this name may still depend on this record.
+        The session in that record ended when we took the records on the other paths. While we hold too few of
+        those, do nothing: another gateway of this name may still need this record.
         """
         nonce = self._nonce
         record = await self._read(path)
@@ -274,14 +274,14 @@ class Lease:
     def _extend(self) -> None:
         until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
         if until > self.until and lease_rules.may_send(self.clock(), until):
-            with suppress(ValueError):  # this process was suspended since the clock was read
+            with suppress(ValueError):  # this process was suspended after the clock was read
                 self._mastership.extend(until)
                 self.until = until
 
     # ---- end ----
 
     async def end(self) -> None:
-        """Stop sending, and record the end of this session, so that other gateways need not wait for it."""
+        """Stop sending, and record the end of this session, so that other gateways need not wait."""
         self._mastership.end()
         self.until = 0
         held, value = self.held, self._value(ended=True)
@@ -304,7 +304,7 @@ def _least_session(record: Record) -> int:
 async def put_end(bucket: Bucket, end: Record) -> None:
     """Replace our own record by one that ends its session. Raises Conflict and FleetError as `put` does.
 
-    A renewal that was cancelled may have been stored in the meantime. Replace that one too.
+    If a cancelled renewal was stored in the meantime, replace that record too.
     """
     try:
         await bucket.put(end.key, end.value, end.revision)

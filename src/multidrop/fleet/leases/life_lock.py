@@ -1,4 +1,4 @@
-"""LifeLock: proves to a gateway that its predecessor on this computer is dead."""
+"""LifeLock: a file lock that shows a gateway that its previous process on this computer is dead."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
 
 class LifeLock:
-    """A lock on a local file, held until the process ends: its next holder knows that this process is dead.
+    """A lock on a local file, held until the process ends. Its next holder knows that this process is dead.
 
     The file holds a random id, because containers may share the machine id and the path. Raises FleetError if
     another process of this computer holds the lock.
@@ -39,7 +39,7 @@ class LifeLock:
                 os.fsync(file.fileno())
 
     def proves_death(self, value: Mapping[str, Any]) -> bool:
-        """Return True if the process that wrote this record held exactly this lock, and so is dead."""
+        """Return True if this record's process held exactly this lock file, and is dead therefore."""
         mine = (str(self.path), self.id, machine_id())
         return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
 
@@ -48,9 +48,9 @@ class LifeLock:
 
 
 def machine_id() -> str:
-    """Return an id of this computer's present boot; "" if unknown, which never proves a death.
+    """Return an id of this computer's present boot; "" if it is unknown, which never proves a death.
 
-    Computers with copies of one disk have the same machine id and the same lock file, but other boot ids.
+    Computers with copies of one disk have the same machine id and the same lock file, but different boot ids.
     After a reboot, a gateway waits until the lease in its earlier record has expired.
     """
     with suppress(OSError):

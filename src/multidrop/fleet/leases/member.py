@@ -1,15 +1,15 @@
 """Member: the state machine of one gateway of a fleet.
 
-    NO_LEASE  no session, or its lease expired: no line is polled. Ends when two of three records are renewed.
-    STARTING  the first 3 s: lines of dead gateways and released lines are taken, but no line that never had
-              a master, so that in a cold start each gateway takes its own share.
-    WORKING   every line of its share is claimed and polled.
-    DRAINING  every line is released and none is claimed.
+    NO_LEASE  No session, or its lease expired: no line is polled. Ends when two of three records are renewed.
+    STARTING  The first 3 s: the gateway takes lines that were released or whose master is dead. Lines that
+              never had a master wait, so that in a cold start each gateway takes only its own share.
+    WORKING   The gateway claims and polls every line of its share.
+    DRAINING  The gateway releases all lines and claims none.
 
-When the last line is closed before the lease expires, the kernel's timer is cancelled. (The engine sends
-nothing after the deadline, whether ports are open or closed. Closing discards unsent bytes in the system's
-buffers, so a process that is suspended before it has closed its ports must be killed.) A session continues if
-it is renewed before another gateway has ended it.
+When the last line is closed before the lease expires, the kernel's timer is cancelled. The engine sends
+nothing after the deadline, even if ports are open. But a port that is still open may hold unsent bytes in the
+system's buffers, and only closing discards them. So the timer kills a process that is suspended before it has
+closed its ports. A session continues if it is renewed before another gateway has ended it.
 """
 
 from __future__ import annotations
@@ -41,13 +41,14 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 _log = logging.getLogger("multidrop.fleet")
 
 WEAK_LOOK_S = 1.0
-WEAK_NS = 10 * SECOND  # a weak session is kept at least this long after its gateway has settled
+WEAK_NS = 10 * SECOND  # keep a weak session at least this long after the gateway has settled
 
 
 class IncompatibleGateways:
-    """Detects gateways with incompatible ownership rules; while one is alive, no line is claimed.
+    """Detects gateways with incompatible ownership rules. While one is alive, this gateway claims no line.
 
-    So no line has two masters while a fleet is updated: new gateways wait until the old ones are stopped.
+    So no line has two masters while a fleet is updated: gateways of the new version wait until those of the
+    old version are stopped.
     """
 
     def __init__(self, me: str, observer: Observer) -> None:
@@ -56,7 +57,7 @@ class IncompatibleGateways:
         self._observer = observer
 
     def look(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Update the set of incompatible gateways from these sessions.
+        """Update the set of incompatible gateways from the sessions in `present`.
 
         A gateway that no longer renews its lease does not count, even if its session was not ended yet.
         """
@@ -78,10 +79,10 @@ class IncompatibleGateways:
 GUARD_LOOK_S = 0.02
 STEP_S = 0.05  # time between steps if no record changes
 LEAST_STEP_S = 0.01  # least time between steps
-TIDY_NS = SECOND // 2  # between checks of all lines of the share if no change is known
+TIDY_NS = SECOND // 2  # between checks of all lines of the share when no change was reported
 SETTLE_S = 3.0
-# Other gateways' sessions are ended only with this much left of the own lease: with less, the servers may be
-# failing all gateways alike.
+# End other gateways' sessions only with this much left of our own lease. If less is left, the servers may be
+# failing for all gateways.
 SOUND_S = 1.0
 
 
@@ -95,7 +96,7 @@ class MemberState(StrEnum):
 
 
 class Member:
-    """One gateway: its lease, its share of the lines, and its view of the other gateways."""
+    """One gateway of a fleet: its lease, its share of the lines, and what it knows of the other gateways."""
 
     def __init__(
         self,
@@ -119,7 +120,7 @@ class Member:
         self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self._shares = Shares()
-        self._share: set[str] = set()  # the lines that should be ours
+        self._share: set[str] = set()  # the lines that this gateway should be the master of
         self._releases = Releases(self.best, self._mark_dirty)
         self._settled_at = 0
         self._is_dirty = True
@@ -142,13 +143,13 @@ class Member:
 
     @property
     def trouble(self) -> str:
-        """Return why the lease is missing or at risk; "" if it is fine."""
+        """Return why the lease is missing or at risk; "" if neither is the case."""
         weak = "another gateway ended one of its three lease records; a new lease starts soon"
         return self._incompatible.trouble or self.lease.trouble or (weak if self.lease.is_weak else "")
 
     @property
     def polled(self) -> Mapping[str, TakenLine]:
-        """Return the lines that are polled."""
+        """Return the lines that this gateway polls, by name."""
         return self.keeper.polled
 
     @property
@@ -161,7 +162,7 @@ class Member:
         return self.lease.clock() >= self._settled_at
 
     def best(self) -> ServerPath:
-        """Return the path whose lease was renewed last; before there is a lease, any open path."""
+        """Return the path whose lease was renewed last; without a lease, any open path."""
         path = self.paths[self.lease.best]
         return path if path.is_open else next((one for one in self.paths if one.is_open), path)
 
@@ -169,12 +170,12 @@ class Member:
         self._is_dirty = True
 
     def _wake(self) -> None:
-        """Take the next step immediately."""
+        """Take the next step immediately instead of waiting."""
         self._is_dirty = True
         self._woken.set()
 
     def drain(self) -> None:
-        """Release all lines, and take none from now on."""
+        """Release all lines, and take no more."""
         self.is_draining = self._is_dirty = True
 
     def _is_mine(self, record: Record) -> bool:
@@ -217,7 +218,7 @@ class Member:
         self._over.set()
 
     def _works(self) -> dict[str, Coroutine[Any, Any, None]]:
-        """Return the tasks that must not end, by name."""
+        """Return the tasks that must run as long as the member, by name."""
         records = {f"records {at}": work for at, work in enumerate(self.records.works(), 1)}
         return {
             **{f"path {at}": path.keep() for at, path in enumerate(self.paths, 1)},
@@ -232,7 +233,7 @@ class Member:
         }
 
     async def _leave(self) -> None:
-        """Release all lines, and end the session, so that others take over immediately."""
+        """Release all lines and end the session, so that other gateways take over immediately."""
         await self.keeper.let_all_go()
         await self.lease.end()
 
@@ -257,9 +258,9 @@ class Member:
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _prepare(self) -> None:
-        """Wait until all records were read, which for a large plant takes longer than a lease lasts.
+        """Wait until all records were read, which takes longer than a lease lasts in a large plant.
 
-        Also wait until incompatible gateways have ended.
+        Also wait until no incompatible gateway is alive.
         """
         while True:
             self._see(self.records.observer.sessions())
@@ -284,11 +285,11 @@ class Member:
             await asyncio.sleep(GUARD_LOOK_S)
 
     async def _watch_weakness(self) -> None:
-        """Decide when to give up this session after others ended one of its three records.
+        """Decide when to give up this session after others have ended one of its three records.
 
-        If it were kept, it would end as soon as one more server fails. Giving up leaves the lines without a
-        master for a moment. So one gateway at a time does so, and only when all paths answer and lines can be
-        claimed.
+        If the session were kept, it would end as soon as one more server fails. Giving it up leaves the lines
+        without a master for a moment. So only one gateway at a time does so, when all paths answer and lines
+        can be claimed.
         """
         while True:
             await asyncio.sleep(WEAK_LOOK_S)
@@ -299,13 +300,13 @@ class Member:
                 self._is_too_weak = await have_leaders(self.best()) and await lease.could_be_whole()
 
     def _keeps_leaders(self) -> bool:
-        """Return True if this gateway manages the buckets' leaders: the first gateway by name does."""
+        """Return True if this gateway manages the buckets' leaders: the first living gateway by name does."""
         return self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name
 
     # ---- one step ----
 
     async def step(self) -> None:
-        """Do the work that is due. Only ending the sessions of dead gateways waits for a server."""
+        """Do the work that is due. The only wait for a server is for ending the sessions of dead gateways."""
         observer = self.records.observer
         present = observer.sessions()
         if not self.lease.is_valid:
@@ -334,7 +335,7 @@ class Member:
         return others
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Assign the lines again if gateways or lines came or went."""
+        """Assign the lines to gateways again if gateways or lines came or went."""
         sharing = self._see(present)
         if not self.is_draining and self.lease.session:
             sharing.add(self.name)
@@ -353,7 +354,7 @@ class Member:
     ) -> tuple[tuple[str, frozenset[str]], ...]:
         """Return the lines that each gateway could not open.
 
-        A gateway whose record has no list of them is left out.
+        Gateways whose record lacks that list are left out.
         """
         unopened = {name: value.get("unopened") for name, value in present.items()}
         unopened[self.name] = list(self.keeper.unopened.named())

@@ -1,9 +1,9 @@
 """Observer: watches the sessions of all gateways, and ends those that are no longer renewed.
 
-An end written by the gateway itself counts immediately. An end written by another gateway counts only when
-the last renewal that this process read is older than a lease by its own clock: a hasty gateway or a wrong
-clock cannot create a second master. A malicious gateway could create one, if a session is renewed after a
-long silence and the malicious end is stored before this process has read that renewal.
+If a gateway itself ends its session, the end counts immediately. If another gateway ended it, the end counts
+only when the last renewal that this process has read is older than a lease, by its own clock. So neither a
+hasty gateway nor a wrong clock can create a second master. A malicious gateway could, if a session is renewed
+after a long silence and the malicious end is stored before this process has read that renewal.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from multidrop.supervisor import end_tasks
 
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for viewers: every end counts immediately
 
-LOOK_S = 0.1  # between reads of a path; lines of a dead gateway are not polled for that much longer
-ENDING_S = 0.1  # wait for answers when a session is ended; later ones are seen as records
+LOOK_S = 0.1  # pause between reads of a path; a takeover takes up to this much longer
+ENDING_S = 0.1  # time limit for answers when sessions are ended; later outcomes are seen at the next read
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -38,25 +38,25 @@ class Observer:
         self.me = me
         self.terms = terms
         self.paths = [Follower(bucket) for bucket in buckets]
-        self.ended = 0  # number of sessions that this gateway ended
+        self.ended = 0  # number of sessions that this process ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
-        self._looked = [0] * len(self.paths)  # when the newest answered read started
-        self._over: dict[str, int] = {}  # newest session that is certainly over, by gateway
+        self._looked = [0] * len(self.paths)  # start of the newest read that was answered, by path (ns)
+        self._over: dict[str, int] = {}  # newest session number that is certainly over, by gateway
         self._clock = clock
 
     def restart_waits(self) -> None:
-        """Restart all waiting times, because this gateway saw no renewals while it was cut off.
+        """Restart all waiting times, because this gateway was cut off and may have missed renewals.
 
-        A session that was over already stays over, because it cannot be renewed.
+        A session that was over stays over, because it cannot be renewed.
         """
         now = self._clock()
         for seen in self._watched:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
 
     async def look(self, path: int) -> bool:
-        """Read the changes on a path. Raises FleetError if it cannot be reached.
+        """Read the changes on a path; return True if a session has ended, or may be ended now.
 
-        Return True if a session has ended, or may be ended now.
+        Raises FleetError if the path's servers cannot be reached.
         """
         begun = self._clock()
         found = await self.paths[path].look()
@@ -74,7 +74,7 @@ class Observer:
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
         before = watched.get(record.key)
-        if before is not None and is_ended_by_another(record):  # the waiting time continues
+        if before is not None and is_ended_by_another(record):  # its waiting time continues
             watched[record.key] = before._replace(revision=record.revision)
         else:
             watched[record.key] = lease_rules.watch(before, record.revision, self._clock())
@@ -107,7 +107,10 @@ class Observer:
         return found
 
     def missing(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway that did not end its session itself, but others did, with its record."""
+        """Return each gateway whose session others had to end, with its record.
+
+        A gateway that ended its session on any path itself is not missing.
+        """
         present = self.sessions()
         found = {}
         for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
@@ -152,9 +155,9 @@ class Observer:
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
         """Return the gateways whose sessions may be ended, each with its stale records by path.
 
-        A record must be stale at the last read that was answered: while a server answers no reads, the record
-        may be renewed unseen.
-        `present` are the names in `sessions`, if the caller already has them.
+        A record counts as stale only if it was stale at the last read that was answered. While a server
+        answers no reads, the record may be renewed unseen. `present` are the names in `sessions`, if the
+        caller already has them.
         """
         found = {}
         for name in self.sessions() if present is None else present:
@@ -168,7 +171,7 @@ class Observer:
                 and not record.value["ended"]
                 and self._is_stale(path, record, self._looked[path])
             }
-            if lease_rules.is_over(len(stale), self.terms):  # with fewer, the gateway is alive
+            if lease_rules.is_over(len(stale), self.terms):  # with fewer stale records, the gateway is alive
                 found[name] = stale
         return found
 
@@ -183,7 +186,7 @@ class Observer:
     async def end_the_dead(self, present: Iterable[str] | None = None) -> bool:
         """End the sessions that are no longer renewed; return True if one was ended.
 
-        A record is replaced only if it still has the revision that was found stale.
+        A record is replaced only if it still has the revision that was found to be stale.
         """
         before = self.ended
         self._keep_what_is_over()
@@ -195,7 +198,7 @@ class Observer:
         return self.ended > before
 
     def _keep_what_is_over(self) -> None:
-        """Remember which sessions are over, as long as this process has read all records without a gap."""
+        """Remember which sessions are over: they stay over after `restart_waits`."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):
@@ -204,7 +207,8 @@ class Observer:
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
         """End these records concurrently, and wait for as many answers as needed: a path may have no leader.
 
-        Return True if any was ended. Another gateway may have ended the others; the next read shows it.
+        Return True if any record was ended. Another gateway may have ended the others; the next read shows
+        that.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []
@@ -215,13 +219,13 @@ class Observer:
                 if len(answers) >= self.terms.ended:
                     break
         except TimeoutError:
-            pass  # the next step judges the rest by newer records
+            pass  # the next step decides again, with newer records
         finally:
-            await end_tasks(*ends)  # a request in flight may still be stored, and is read later
+            await end_tasks(*ends)  # a cancelled request may still be stored; the next read shows it
         return any(answers)
 
     async def _end(self, path: int, record: Record) -> bool:
-        """End a record unless it has changed. Raises FleetError if the outcome is unknown."""
+        """End a record; return False if it has changed since. Raises FleetError if the outcome is unknown."""
         value = {**record.value, "ended": True, "by": self.me}
         try:
             revision = await self.paths[path].bucket.put(record.key, value, record.revision)

@@ -1,11 +1,11 @@
-"""Lease rules: until when a gateway may send, and when another may end its session. Pure.
+"""Lease rules: until when a gateway may send, and when another may end its session. No I/O.
 
-A session has one record on each of three paths. Its holder renews all three; a gateway that takes over ends
-them. `needed` and `ended` are each more than half of the paths. So the paths that the holder renews and those
-that another gateway ends have one in common, and the server of that path decides. The holder counts the lease
-from the moment before it sent a renewal. An observer counts from the moment at which it first saw a revision,
-by its own clock, and after the time of a lease it ends exactly that revision. So clocks of different
-computers are never compared. An ended path stays ended for its session.
+A session has one record on each of three paths. Its holder renews all three records; a gateway that takes
+over ends them. `needed` and `ended` are each more than half of the paths. So at least one of the paths that
+the holder must renew is also one that the other gateway must end. The server of that path decides. The holder
+counts the lease from the moment before it sent a renewal. An observer counts from the moment at which it
+first saw a revision, by its own clock. After the time of a lease it ends exactly that revision. So clocks of
+different computers are never compared. An ended path stays ended for its session.
 
 Once a session is over, its lines are claimed and opened immediately. The guard starts then: the engine
 listens for at least that long before the first request on a line (csrc/listen.c).
@@ -20,12 +20,12 @@ from typing import NamedTuple
 
 SECOND = 1_000_000_000  # ns
 PATHS = 3
-RENEW_S = 0.5  # between renewals of a path
+RENEW_S = 0.5  # time between renewals of a path
 RULES = 2  # version of the ownership rules (ownership.py): increment it with each change
 
 
 class Terms(NamedTuple):
-    """The terms of a lease, the same for all gateways of a fleet. Times in ns."""
+    """The times and quorums of a lease, the same for all gateways of a fleet. Times are in ns."""
 
     lease: int = 2_300_000_000
     guard: int = 700_000_000  # from the end of a session to the first request of the next master
@@ -37,16 +37,16 @@ USUAL = Terms()
 
 
 class SeenRevision(NamedTuple):
-    """A revision of a record, and when this observer first saw it (its own CLOCK_BOOTTIME, ns)."""
+    """A revision of a record, and when this observer first saw it (by its own CLOCK_BOOTTIME, in ns)."""
 
     revision: int
     since: int
 
 
 def deadline(sent: Iterable[int | None], terms: Terms) -> int:
-    """Return the time (ns) until which the holder may send; 0 if too few paths are renewed.
+    """Return the time (ns) until which the holder may send; 0 if too few paths were renewed.
 
-    `sent` has one time for each path: the moment before its newest acknowledged renewal was sent.
+    `sent` has an entry for each path: when its newest acknowledged renewal was sent, or None.
     """
     latest = sorted((moment for moment in sent if moment is not None), reverse=True)
     return latest[terms.needed - 1] + terms.lease if len(latest) >= terms.needed else 0
@@ -63,10 +63,10 @@ def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
 
 
 def is_stale(watched: SeenRevision, now: int, terms: Terms) -> bool:
-    """Return True if this revision may be ended: it has not changed for the time of a lease."""
+    """Return True if this revision may be ended, because no newer one was seen for the time of a lease."""
     return now - watched.since >= terms.lease
 
 
 def is_over(ended: int, terms: Terms) -> bool:
-    """Return True if a session with this many ended paths no longer has a master."""
+    """Return True if a session with this many ended paths is over, so that its lines have no master."""
     return ended >= terms.ended

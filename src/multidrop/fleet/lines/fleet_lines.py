@@ -1,4 +1,4 @@
-"""Fleet lines: the lines that a gateway polls, in one Poller that sends only while the lease is valid."""
+"""FleetLines: the lines that a gateway polls, in one Poller that sends only while the lease is valid."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
 from multidrop.supervisor import supervisor
 
-THREADS = 32  # concurrent openings and closings
+THREADS = 32  # limit of lines that are opened or closed at the same time
 
 
 class FleetLines:
-    """Adds lines to a poller and removes them, in threads, because both wait for ports."""
+    """Adds lines to a poller and removes them. Both wait for ports, so they run in threads."""
 
     def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
         self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
@@ -51,7 +51,7 @@ class FleetLines:
         before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)
-        except BaseException:  # the line may be half open, and another gateway may soon be its master
+        except BaseException:  # a half-open line must be closed: another gateway may soon be its master
             if self.poller.buses.get(line.name) is not before:
                 self.poller.remove_line(line.name)
             raise
@@ -63,14 +63,14 @@ class FleetLines:
     def _let_go(self, line: str) -> None:
         try:
             self.poller.remove_line(line)
-        except PollingFailed:  # polling of all lines has ended: only the port must be closed
+        except PollingFailed:  # polling of all lines has ended; closing the port is enough
             self.poller.bus(line).close()
 
     def bus(self, line: str) -> Bus:
         return self.poller.bus(line)
 
     def port_loss(self, line: str) -> PortLoss | None:
-        """Return how the port of a polled line is lost; None if it is open."""
+        """Return how the port of a polled line was lost; None if it is open."""
         bus = self.poller.bus(line)
         if not bus.line.is_lost:
             return None

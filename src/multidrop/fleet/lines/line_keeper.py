@@ -1,7 +1,7 @@
-"""Line keeper: claims, polls, closes and releases a gateway's lines, one task at a time for each line.
+"""LineKeeper: claims, polls, closes and releases a gateway's lines, with one task at a time for each line.
 
 A line is polled only while its records name our present session and the lease is valid. Half a second before
-the lease expires all lines are closed.
+the lease expires, all lines are closed.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from multidrop.fleet.lines.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")
 
-REPORTED_NS = 2_000_000_000  # report a lost port whose newest reply is older, before an attempt has failed
-SILENT_S = 0.5  # close lines this long before the lease expires; the kernel's timer adds guard / 2
-TAKE_AGAIN_S = 2.0  # between attempts to open a line
-WRITTEN_AT_ONCE = 64  # records written together; more would delay renewals of the lease
+REPORTED_NS = 2_000_000_000  # report a lost port immediately if the newest reply is older
+SILENT_S = 0.5  # close lines this long before the lease expires; the kernel's timer fires guard / 2 after
+TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
+WRITTEN_AT_ONCE = 64  # number of records written together; more would delay renewals of the lease
 LINES_AT_ONCE = 32
 
 
@@ -38,16 +38,17 @@ class Lines(Protocol):
         """
 
     async def let_go(self, line: str) -> None:
-        """Stop polling the line and close it: no request is sent on it afterwards."""
+        """Stop polling the line and close it. After this call, no request is sent on it."""
 
     def port_loss(self, line: str) -> PortLoss | None:
-        """Return how the port of a polled line is lost; None if it is open."""
+        """Return how the port of a polled line was lost; None if it is open."""
 
 
 class PortLoss(NamedTuple):
-    """A polled line's lost port: why it could not be reopened, and how old the newest reply is (ns).
+    """The loss of a polled line's port: why it could not be reopened, and how old the newest reply is (ns).
 
-    `why` is None before the first attempt has failed. `silent_ns` is None if no drive ever replied.
+    `why` is None until the first attempt to reopen it has failed. `silent_ns` is None if no drive ever
+    replied.
     """
 
     why: str | None
@@ -55,7 +56,7 @@ class PortLoss(NamedTuple):
 
 
 class TakenLine(NamedTuple):
-    """A polled line: the revision of its description, and since when it is polled (CLOCK_BOOTTIME, ns)."""
+    """A polled line: the revision of its plant record, and when polling started (CLOCK_BOOTTIME, ns)."""
 
     revision: int
     since: int
@@ -64,7 +65,7 @@ class TakenLine(NamedTuple):
 class LineKeeper:
     """The lines that one gateway polls, and the task in progress on each.
 
-    `on_change` is called when the next step is due.
+    `on_change` is called when the member's next step should be taken.
     """
 
     def __init__(
@@ -76,17 +77,17 @@ class LineKeeper:
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
-        self.troubles: dict[str, str] = {}  # why lines could not be opened
-        self.lost: dict[str, str] = {}  # why lines are not polled: their ports are lost
+        self.troubles: dict[str, str] = {}  # why lines could not be opened, by line
+        self.lost: dict[str, str] = {}  # why lines are not polled: their ports failed
         self.unopened = UnopenedLines(lambda: lease.clock())
-        self.releasing: set[str] = set()  # our lines that must be released
+        self.releasing: set[str] = set()  # our lines that must be released to other gateways
         self.may_claim = True  # False while a gateway of an incompatible version is alive
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
         self._is_leaving = False
-        self._at_work: dict[str, asyncio.Task[None]] = {}  # opening, closing or claim in progress, by line
+        self._at_work: dict[str, asyncio.Task[None]] = {}  # task that opens, closes or claims, by line
         self._tasks: set[asyncio.Task[None]] = set()
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
@@ -95,21 +96,21 @@ class LineKeeper:
 
     @property
     def may_poll(self) -> bool:
-        """Return True if the lease leaves time to close lines before it expires."""
+        """Return True if the lease leaves enough time to close all lines before it expires."""
         return bool(self._lease.session) and self._lease.left_s > SILENT_S and not self._is_leaving
 
     @property
     def is_silent(self) -> bool:
-        """Return True if no line is open or being opened."""
+        """Return True if no line is open and no task on a line is in progress."""
         return not self.polled and not self._at_work
 
     @property
     def moves(self) -> int:
-        """Return how many lines were claimed and released."""
+        """Return how often lines were claimed and released by this gateway."""
         return self._owners.moves
 
     def is_mine(self, line: str) -> bool:
-        """Return True if the line's records name us and it was not released."""
+        """Return True if the line's records name us, and we have not sent its release."""
         return self._owners.is_mine(line)
 
     def claim_of(self, line: str) -> Claim | None:
@@ -117,17 +118,17 @@ class LineKeeper:
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
-        """Return True if this gateway is the line's master now, even during the guard of `may_command`."""
+        """Return True if this gateway is the line's master now, even if `may_command` must still wait."""
         return self._lease.is_valid and self.is_mine(line) and line in self.polled
 
     def may_command(self, line: str) -> bool:
-        """Return True if this gateway is the line's master, and the guard after the last master is over."""
+        """Return True if this gateway is the line's master, and has been for the time of the guard."""
         if not self.may_stop(line):
             return False
         return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
-        """Wait forever; if a line cannot be closed, raise its error, so that the process ends."""
+        """Wait until a line cannot be closed, and raise its error, so that the process ends."""
         await self._has_failed.wait()
         assert self._failure is not None
         raise self._failure
@@ -135,7 +136,7 @@ class LineKeeper:
     # ---- all lines ----
 
     def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Claim lines whose records still have the revisions in `claims`."""
+        """Write the records that claim these lines, if the records still have the revisions in `claims`."""
         free = claims.keys() - self._at_work.keys() if self.may_claim else ()
         for lines in _some_at_once(free):
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
@@ -143,7 +144,8 @@ class LineKeeper:
     def reconcile(self) -> None:
         """Close lines that are no longer ours, open those that are, and release those that are closed.
 
-        If a line should stay ours after all, but its release may have been stored, claim it again.
+        If a line should stay ours after its release was sent, claim it again, because the release may have
+        been stored.
         """
         valid = self.may_poll
         kept = {
@@ -170,7 +172,7 @@ class LineKeeper:
             self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
 
     def _look_at_ports(self) -> None:
-        """Note which ports of polled lines are lost, because other gateways should take such lines later."""
+        """Note which polled lines lost their ports, so that other gateways can take such lines later."""
         for line in self.polled.keys() - self._at_work.keys():
             if loss := self.lines.port_loss(line):
                 why = loss.why or ("it is being reopened" if (loss.silent_ns or 0) > REPORTED_NS else "")
@@ -214,12 +216,12 @@ class LineKeeper:
     def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         for line in lines:
-            if self._at_work.get(line) is task:  # otherwise the line's next task has started
+            if self._at_work.get(line) is task:  # otherwise the line's next task has started already
                 del self._at_work[line]
         self._on_change()
         failure = None if task.cancelled() else task.exception()
         if failure and not self._failure:
-            self._failure = failure  # this line may still be open
+            self._failure = failure  # the line may still be open: `fail` ends the process
             self._has_failed.set()
 
     def _take_new(self, line: str) -> None:
@@ -233,7 +235,7 @@ class LineKeeper:
                 return
             try:
                 await self.lines.take(line, record.value)
-            except Exception as failure:  # such as in a user's own class: other lines continue
+            except Exception as failure:  # such as an exception in a user's own class: other lines continue
                 is_foreseen = isinstance(failure, (OSError, ValueError))
                 why = str(failure) if is_foreseen else f"{type(failure).__name__}: {failure}"
                 reported, self.troubles[line] = self.troubles.get(line), why
