@@ -93,7 +93,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # whether an owner's session lasts: cached, for thousands of lines
+        held: dict[tuple[str, int], bool] = {}  # whether an owner's session lasts (cached)
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)

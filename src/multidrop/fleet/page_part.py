@@ -27,7 +27,7 @@ LOG = "fleet-commands.jsonl"
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """The table `[serve.fleet]`: the addresses of the fleet's servers, and the same files as for `fleet watch`.
+    """The table `[serve.fleet]`: the URLs of the fleet's servers, and the same files as for `fleet watch`.
 
     `commander` is the file with a commander's key. With it, the page can stop the whole fleet.
     """

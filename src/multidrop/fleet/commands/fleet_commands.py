@@ -136,8 +136,7 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask for an offer on one path after another: an offer has no effect, so it may be requested twice.
-        """
+        """Ask for an offer on one path after another: an offer has no effect, so two are harmless."""
         why = ""
         for path in self._paths:
             try:
@@ -171,8 +170,7 @@ class FleetCommands:
     async def _end_of(
         self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _ignore
     ) -> CommandAnswer:
-        """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without an answer.
-        """
+        """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without answers."""
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
         reported = {""}

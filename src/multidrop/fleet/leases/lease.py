@@ -241,7 +241,7 @@ class Lease:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, held.sent)  # of two possible times, the earlier one is safe
+            self.held[path] = Held(record.revision, held.sent)  # the earlier time is the safe one
         elif record.revision > held.revision:
             self._lose(path)
 

@@ -1,4 +1,4 @@
-"""Moves: the latest changes of masters, from the records of lines. Pure."""
+"""Moves: the latest changes of lines' masters, derived from the lines' records. No I/O."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 from multidrop.fleet.lines.ownership import NOBODY
 
 MOST = 100
-MOST_REPORTED = 20  # number of moves in a gateway's answer about its state
+MOST_REPORTED = 20  # limit of the moves that a gateway reports with its state
 
 
 class Move(NamedTuple):
-    """A line's change from one gateway to another; "" means no gateway, None an unknown one."""
+    """A line's move from one gateway to another. A gateway's name is "" for none, None if unknown."""
 
     line: str
-    turn: int  # number of the change: the same for every observer of a move
-    at_ms: int  # UTC, by the clock of the gateway that wrote the record: only for display
+    turn: int  # number of the move: all observers of a move see the same number
+    at_ms: int  # UTC by the clock of the gateway that wrote the record; only for display
     before: str | None
     after: str
 
@@ -45,7 +45,7 @@ def move_of(sent: Any) -> Move:
 
 
 class Moves:
-    """The latest moves. A line that was released and then taken has moved once."""
+    """The latest moves. A line that was released and then claimed has moved once."""
 
     def __init__(self, most: int = MOST) -> None:
         self._most = most
@@ -65,8 +65,8 @@ class Moves:
     def newest(self, number: int) -> list[Move]:
         """Return at most this many moves, newest first.
 
-        A gateway that releases a line does not see which gateway takes it, and that gateway may not know the
-        previous one. Such two reports are joined into one move.
+        A gateway that releases a line does not see which gateway claims it, and that gateway may not know the
+        previous master. The two gateways' reports are joined into one move.
         """
         moves = dict(self._moves)
         for (line, turn), move in self._moves.items():

@@ -1,7 +1,7 @@
-"""Owner records: which lines are ours, and the records to write to claim and release them.
+"""OwnerRecords: which lines are ours, and which records to write to claim and release lines.
 
-A line stops being ours right before its release is sent: the release may be stored at any later time, even
-without an answer. The line is ours again once newer records say so.
+A line stops being ours right before its release is sent, because the release may be stored at any later time,
+even without an answer. The line is ours again once newer records name us.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
 from multidrop.supervisor import end_tasks
 
-WRITERS = 2  # concurrent batches in each bucket
-LAG_NS = SECOND  # two renewals; if our lease on a path lags by more, a bucket may have no leader
-SPARE_S = 0.15  # wait after the first bucket's answer before the spare one is used
+WRITERS = 2  # concurrent batches of writes in each bucket
+LAG_NS = SECOND  # two renewal periods; if our lease on a path lags by more, its bucket may have no leader
+SPARE_S = 0.15  # how long to wait after the first bucket's answer before the spare bucket is used
 
 
 class OwnerRecords:
-    """The records of lines that name our present session.
+    """The records of lines that name our present session as the master.
 
-    Records are written only if `may_write()` returns True. `on_mine` is called with each line that becomes
+    Records are written only while `may_write()` returns True. `on_mine` is called with each line that becomes
     ours.
     """
 
@@ -53,7 +53,7 @@ class OwnerRecords:
         self._records = records
         self._may_write = may_write
         self._on_mine = on_mine
-        self._offered: dict[tuple[str, str], int] = {}  # revision released last, by line and bucket
+        self._offered: dict[tuple[str, str], int] = {}  # revision when last released, by line and bucket
         self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
 
     @property
@@ -61,7 +61,7 @@ class OwnerRecords:
         return self._lease.name, self._lease.session
 
     def is_mine(self, line: str) -> bool:
-        """Return True if we have enough votes, not counting records whose release was sent."""
+        """Return True if records with enough votes name us, not counting records whose release was sent."""
         me, votes = self._me, 0
         for bucket, record in self._records.of(line).items():
             if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
@@ -69,7 +69,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets in which the line's release was sent, and its outcome is unknown."""
+        """Return the buckets in which this line's release was sent, but its outcome is unknown."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -83,25 +83,25 @@ class OwnerRecords:
         }
 
     def owned(self) -> set[str]:
-        """Return the lines with at least one record that names our session."""
+        """Return the lines for which at least one record names our session."""
         return self._records.owned_by(*self._me)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return the records to write in order to claim the line; None if it cannot be claimed."""
+        """Return the records to write to claim the line; None if it cannot be claimed, or is ours already."""
         is_over = self._records.observer.is_over
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the bucket that may have no leader: our lease is not being renewed on its home server."""
+        """Return the bucket that may have no leader: our lease on the same path is not being renewed."""
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the first records of claims, and the spare ones if a bucket takes much longer than another.
+        """Write the first records of these claims; write the spare ones if a bucket's answer comes late.
 
-        After a refused claim, do not wait for a bucket that may have no leader, nor for other answers that no
-        longer matter: the claim is repeated soon with newer records.
+        If a claim is refused, it is repeated soon with newer records. So then do not wait for a bucket that
+        may have no leader, nor for other answers that no longer matter.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -127,7 +127,7 @@ class OwnerRecords:
         late = await self._decide(claims, (late - vain).union(spare.values()), refused)
         if refused:
             late, vain = set(), late | vain
-        await end_tasks(*vain)  # a request in flight may still be stored, and is read later
+        await end_tasks(*vain)  # a cancelled request may still be stored; the next read shows it
         await asyncio.gather(*late)
 
     async def _decide(
@@ -137,7 +137,7 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is ours or refused; fill `refused`, and return the unanswered writes."""
+        """Wait until each line is ours or refused. Add to `refused`; return the unanswered writes."""
         late = set(writes)
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
@@ -149,8 +149,8 @@ class OwnerRecords:
     async def give_away(self, lines: Sequence[str]) -> None:
         """Release these lines: replace each record that names us by one that names no gateway.
 
-        `is_mine` is False for all lines before the first write is sent, so the answer to a late claim cannot
-        make a line ours.
+        `is_mine` returns False for all of them before the first write is sent, so a late answer to a claim
+        cannot make a line ours.
         """
         now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
         given: list[tuple[str, Record]] = []
@@ -164,7 +164,7 @@ class OwnerRecords:
         self.moves += sum(not self._naming_us(line) for line in lines)
 
     def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
-        """Start a task for each bucket that replaces its records and returns the refused lines."""
+        """Start a task for each bucket that replaces the bucket's records; each returns the refused lines."""
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)
@@ -173,7 +173,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace records whose revisions are unchanged; return the refused lines. Report lines now ours."""
+        """Replace records whose revision is unchanged; return the refused lines, report those now ours."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

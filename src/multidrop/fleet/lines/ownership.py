@@ -1,15 +1,15 @@
-"""Ownership: the records that name a line's master, and who may write them when. Pure.
+"""Ownership: the records that name a line's master, and which gateway may write them when. No I/O.
 
-A line has one record in each of three buckets, with one vote each. Its master is the session that two of them
-name, so no line waits for one bucket without a leader. A record that names a living session is replaced only
-by that session, and only at the revision that the session has read. So two sessions never have two votes
+A line has one record in each of three buckets, with one vote each. Its master is the session that at least
+two votes name, so no line waits for a bucket without a leader. A record that names a living session is
+replaced only by that session, and only at the revision that it has read. So two sessions never have two votes
 each.
 
-The very first record of a line has two votes, which saves a large fleet's cold start a second. It is written
-in the line's first bucket, where the server stores only one first record. A gateway that has not read it
-writes nothing in the other buckets.
+The very first record of a line has two votes, which shortens the cold start of a large fleet by a second. It
+is written in the line's first bucket, where the server accepts only one first record. A gateway that has not
+read this record writes nothing in the other buckets.
 
-Records are written only when a line changes hands. A record becomes void when its session is over.
+Records are written only when a line changes its master. A record becomes void when its session is over.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from typing import Any, NamedTuple
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 NOBODY = ""
-NEEDED = 2  # votes of a master
+NEEDED = 2  # votes that a master needs
 
 Owner = tuple[str, int]  # a gateway and its session
 LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: not read yet
 
 
 class Claim(NamedTuple):
-    """The records to write in order to become master of a line: their present revisions, by bucket.
+    """The records to write to become master of a line: their present revisions, by bucket.
 
-    `spare` ones are written if one of the `first` gets no answer. Each record will have this many `votes`.
+    The `spare` records are written if a `first` one gets no answer. Each record will have this many `votes`.
     """
 
     first: dict[str, int]
@@ -53,27 +53,31 @@ def owner_of(record: Record | None) -> Owner:
 
 
 def owner_value(owner: Owner, turn: int, now_ms: int, votes: int = 1) -> dict[str, Any]:
-    """Return the content of a line's record.
+    """Return the content of a line's record that names this owner.
 
-    `turn` counts how often the line was claimed and released. It and `now_ms` (UTC) are only for display.
+    `turn` is the number of claims and releases of the line so far. `turn` and `now_ms` (UTC) are only for
+    display.
     """
     return {"gateway": owner[0], "session": owner[1], "votes": votes, "turn": turn, "since": now_ms}
 
 
 def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
-    """Return how many votes an owner has in these records."""
+    """Return how many votes these records give to an owner."""
     return sum(record.value["votes"] for record in records if record and owner_of(record) == owner)
 
 
 def owner_by(records: LineRecords) -> Record | None:
-    """Return the newest record whose owner (NOBODY for a free line) has enough votes; None without one."""
+    """Return the newest record of the owner with enough votes; None if no owner has enough.
+
+    The owner of a free line is NOBODY.
+    """
     known = [record for record in records.values() if record and record.value]
     decided = [record for record in known if votes_of(owner_of(record), known) >= NEEDED]
     return max(decided, key=lambda record: record.value["turn"], default=None)
 
 
 def turn_of(records: LineRecords) -> int:
-    """Return the newest turn in the records; 0 if the line never had a master."""
+    """Return the highest turn in the records; 0 if the line never had a master."""
     turn = 0
     for record in records.values():
         if record and record.value and record.value["turn"] > turn:
@@ -88,14 +92,14 @@ def claim_of(
     doubted: Collection[str] = (),
     leaderless: Collection[str] = (),
 ) -> Claim | None:
-    """Return the records to write to get enough votes; None if we have enough, or cannot get them.
+    """Return the records to write to get enough votes; None if we have enough, or cannot get enough.
 
-    In the `doubted` buckets we released the line without a known outcome. Buckets that may be `leaderless`
-    are written last.
+    In the `doubted` buckets our release of the line was sent, but its outcome is unknown. Buckets that may be
+    `leaderless` are written last.
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None  # the first record, still unread, may have two votes
+        return None  # the first record may have two votes, and was not read yet
     if first.revision == NONE_YET:
         return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}
@@ -107,7 +111,7 @@ def claim_of(
         elif record and (owner == me or owner[0] == NOBODY or is_over(*owner)):
             free[bucket] = record.revision
         elif record and record.value["votes"] >= NEEDED:
-            return None  # a living master has both votes
+            return None  # the record's living master has both votes
     if not 0 < needed <= len(free):
         return None
     wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}

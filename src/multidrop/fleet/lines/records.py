@@ -1,8 +1,8 @@
-"""Records that a gateway or viewer reads about its fleet: sessions, masters of lines, the plant.
+"""The records that a gateway or viewer reads about its fleet: sessions, masters of lines, the plant.
 
-A large fleet has thousands of lines. A gateway reads only the masters of the lines that it should have but
-does not have yet: no other gateway takes its own lines while its session lasts. So a gateway whose lines do
-not change reads no masters at all.
+A large fleet has thousands of lines. A gateway reads master records only for those lines of its share of
+which it is not the master yet. It need not read those of its own lines: no other gateway takes them while its
+session lasts. So a gateway whose lines do not change reads no master records.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _UNREAD: LineRecords = {}
 class FleetRecords:
     """The records of all buckets, as far as they were read.
 
-    `on_change` is called when lines or masters have changed, or when a session has ended or may be ended.
+    `on_change` is called when lines or masters have changed, when a session has ended, and when one may be
+    ended.
     """
 
     def __init__(
@@ -41,15 +42,15 @@ class FleetRecords:
             bucket: self._owner_follower(Bucket(bucket, path), partial(self._note_owner, bucket))
             for bucket in names.OWNERS
         }
-        self._of: dict[str, dict[str, Record | None]] = {}  # records of masters by line and bucket
-        self._owned: dict[Owner, set[str]] = {}  # by session: lines with at least one record that names it
-        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the number of its turn
+        self._of: dict[str, dict[str, Record | None]] = {}  # records that name masters, by line and bucket
+        self._owned: dict[Owner, set[str]] = {}  # lines with a record that names the session, by session
+        self._masters: dict[str, tuple[str, int]] = {}  # the line's master and turn, by line
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
-        self.is_complete = False  # each bucket was read once
+        self.is_complete = False  # True once each bucket was read
         self._looks: dict[str, Callable[[], Awaitable[Any]]] = {
             names.PLANT: self._look_at_plant,
             **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
@@ -57,19 +58,19 @@ class FleetRecords:
         }
 
     def _owner_follower(self, bucket: Bucket, on_take: OnTake) -> Follower:
-        """Return the follower of one bucket of masters. In this class it reads the records of all lines."""
+        """Return the follower of one bucket of master records. This class reads the records of all lines."""
         return Follower(bucket, on_take)
 
     def of(self, line: str) -> LineRecords:
-        """Return the records of a line's master; an empty mapping if none was read."""
+        """Return the records that name a line's master, by bucket; an empty mapping if none was read."""
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return a record that names the line's master, or no one; None if neither has enough votes."""
+        """Return a record with enough votes that names the line's master or no gateway; None without one."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
-        """Return the plant's lines in order of name; the same tuple until a line is added or removed."""
+        """Return the plant's lines, sorted by name: the same tuple until lines are added or removed."""
         return self._lines
 
     def is_in_plant(self, line: str) -> bool:
@@ -77,11 +78,11 @@ class FleetRecords:
         return bool(record and record.value and "line" in record.value)
 
     def owned_by(self, gateway: str, session: int) -> set[str]:
-        """Return the lines with at least one record that names this session."""
+        """Return the lines for which at least one record names this session."""
         return set(self._owned.get((gateway, session), ()))
 
     async def look(self) -> None:
-        """Read the changes in each bucket once. Raises FleetError if that fails."""
+        """Read the changes in each bucket once. Raises FleetError if a read fails."""
         done = await asyncio.gather(*map(self._look, self._looks), return_exceptions=True)
         for failure in done:
             if failure is not None:
@@ -108,7 +109,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         try:
             return bool(await self.plant.look())
-        finally:  # also after a failure: records read before it are not read again
+        finally:  # also after a failure: records that were read before it are not read again
             if self._has_plant_changed:
                 self._has_plant_changed = False
                 self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
@@ -125,12 +126,12 @@ class FleetRecords:
             if former in self._owned and former not in map(owner_of, records.values()):
                 self._owned[former].discard(line)
                 if not self._owned[former]:
-                    del self._owned[former]  # sessions would accumulate for years
+                    del self._owned[former]  # otherwise sessions would accumulate over years
         if record.value:
             self._note_move(line)
 
     def _note_move(self, line: str) -> None:
-        """Note a change of the line's master; the former one is known if the turn has increased by one."""
+        """Note a move of the line. The former master is known only if the turn has increased by one."""
         record = self.owner(line)
         if not record:
             return
@@ -139,18 +140,19 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            if known != master:  # equal: a gateway claimed its line again after an uncertain release
+            if known != master:  # equal if a gateway claimed its line again after an uncertain release
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
-ASKED_AT_ONCE = 500  # lines in one read; servers allow 1024
-DOUBT_S = 30.0  # longer than an election: an unanswered write may be stored after one
+ASKED_AT_ONCE = 500  # lines in one request; servers allow 1024
+DOUBT_S = 30.0  # longer than an election, after which an unanswered write may still be stored
 
 
 class ShareFollower(Follower):
-    """The records of a share's lines in one bucket; revision 0 means that the line never had a master.
+    """The master records of this gateway's share of lines, in one bucket.
 
-    `is_mine` returns True for a record of our present session, `has` for a line that we poll.
+    Revision 0 means that the line never had a master. `is_mine` returns True for a record that names our
+    present session, `has` for a line that we are the master of.
     """
 
     def __init__(
@@ -160,23 +162,23 @@ class ShareFollower(Follower):
         self._is_mine = is_mine
         self._has = has
         self._share: frozenset[str] = frozenset()
-        self._asked: frozenset[str] | None = frozenset()  # lines of the share that may change; None: unknown
-        self._doubted: dict[str, float] = {}  # lines with an unanswered write, and since when
+        self._asked: frozenset[str] | None = frozenset()  # lines whose record may change; None: recompute
+        self._doubted: dict[str, float] = {}  # lines with an unanswered write, and when it was sent
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
-        """Follow these lines from now on."""
+        """Follow the records of exactly these lines from now on."""
         self._share = frozenset(lines)
         self._asked = None
         self._is_urgent.set()
 
     def doubt(self, lines: Iterable[str]) -> None:
-        """Read these lines again for a while, because the outcome of a write to their records is unknown."""
+        """Read these lines again for DOUBT_S, because the outcome of a write to their records is unknown."""
         self._doubted |= dict.fromkeys(lines, time.monotonic())
         self._is_urgent.set()
 
     def recompute(self) -> None:
-        """Recompute which lines may change, because a record in this or another bucket has changed."""
+        """Recompute at the next read which lines' records may change."""
         self._asked = None
 
     async def look(self) -> list[Record]:
@@ -199,20 +201,23 @@ class ShareFollower(Follower):
         return sorted(self._doubted.keys() | self._asked)
 
     def _may_change(self, line: str) -> bool:
-        """Return True if the record is unknown or names another gateway. A claim shows if a line is free."""
+        """Return True if the record must be read: it is unknown, or names another gateway.
+
+        A record that names no gateway need not be read again: a claim shows whether the line is still free.
+        """
         record = self.records.get(line)
         if record is None:
             return True
         return owner_of(record)[0] != NOBODY and not self._is_mine(record) and not self._has(line)
 
     async def rest(self) -> None:
-        """Wait until the next read is due; `want` and `doubt` make it due immediately."""
+        """Wait until the next read is due. `want` and `doubt` make it due immediately."""
         with suppress(TimeoutError):
             await asyncio.wait_for(self._is_urgent.wait(), FOLLOW_S)
 
 
 class ShareRecords(FleetRecords):
-    """The records that a gateway needs."""
+    """The records that a gateway needs: all sessions, the plant, and the masters of its share of lines."""
 
     def __init__(
         self,
@@ -240,11 +245,11 @@ class ShareRecords(FleetRecords):
             share.recompute()
 
     def want(self, lines: Iterable[str]) -> None:
-        """Follow the masters of exactly these lines from now on."""
+        """Follow the master records of exactly these lines from now on."""
         wanted = frozenset(lines)
         for share in self._shares.values():
             share.want(wanted)
 
     def doubt(self, bucket: str, lines: Iterable[str]) -> None:
-        """Read these lines of this bucket again for a while."""
+        """Read these lines of this bucket again for DOUBT_S."""
         self._shares[bucket].doubt(lines)

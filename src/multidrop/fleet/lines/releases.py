@@ -1,9 +1,9 @@
-"""Releases: which lines may be closed for another gateway now, so that it can claim them immediately.
+"""Releases: which lines may be closed now so that another gateway can claim them immediately.
 
-A line is closed before it is released, and has no master until the release is stored and the other gateway
-has claimed it. While too few buckets have a leader, a release cannot be stored, so this gateway continues to
-poll the line. It also does while a server is silent: when a server that was cut off returns, buckets may lose
-their leaders for seconds, between release and claim.
+A line is closed before it is released. It has no master until the release is stored and the other gateway has
+claimed it. If too few buckets have a leader, a release cannot be stored, so this gateway continues to poll
+the line. It also continues while a server is silent. When a server that was cut off returns, buckets may lose
+their leaders for seconds, and so between release and claim.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import known_cluster
 
-LOOK_S = 0.05  # between checks
+LOOK_S = 0.05  # pause between checks of the servers
 WAIT_S = 60.0  # a server that is silent for longer is ignored
 
 
 class Releases:
     """Decides which lines may be closed for other gateways, from the latest state of the servers.
 
-    `on_change` is called when that state has changed.
+    `on_change` is called when the servers' state has changed.
     """
 
     def __init__(
@@ -37,14 +37,14 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # Buckets that have a leader, and since when one of their servers is silent (s); None: none is silent.
+        # By bucket that has a leader: since when (s) one of the bucket's servers is silent; None if none is.
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
-        """Return the lines that may be closed now; the others must wait.
+        """Return those of these lines that may be closed now; the other lines must wait.
 
-        At least two buckets must be ready, among them the line's first one, whose record may have two votes.
-        A server that is silent for longer than `wait_s` is ignored.
+        At least two buckets must be ready. One of them must be the line's first bucket, whose record may have
+        two votes. A server that is silent for longer than `wait_s` seconds is ignored.
         """
         self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
@@ -60,7 +60,7 @@ class Releases:
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
-        """Check the servers once if any line waits for its release."""
+        """Check the servers once, if any line waits for its release."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}

@@ -1,8 +1,8 @@
-"""Shares: which gateway each line is assigned to, by rendezvous hashing with a bound.
+"""Shares: assigns each line to a gateway, by rendezvous hashing with bounded loads.
 
-Each pair of line and gateway has a weight. A line goes to the gateway with the highest weight that is not
-full; a gateway with 110 % of the mean number of lines is full. So when a gateway comes or goes, its own share
-moves, and few other lines.
+Each pair of line and gateway has a weight. A gateway is full when it has 110 % of the mean number of lines. A
+line goes to the gateway with the highest weight among those that are not full. So when a gateway comes or
+goes, its own share moves, and few other lines.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import pyarrow.compute as pc
 
 from multidrop.fleet.leases.rules import SECOND
 
-BOUND = 110  # percent of the mean
+BOUND = 110  # limit of a gateway's lines, in percent of the mean
 NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number
 
 
 def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
-    """Return the gateway of each line; empty without gateways.
+    """Return the gateway of each line; an empty dict without gateways.
 
-    20 gateways and 10,000 lines take 20 ms, so do not call it in an event loop.
+    Assigning 10,000 lines to 20 gateways takes 20 ms, so do not call this in an event loop.
     """
     if not gateways:
         return {}
@@ -48,8 +48,8 @@ def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
 def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]) -> dict[str, str]:
     """Return each line's gateway after moving lines away from gateways that cannot open them.
 
-    `unopened` has such lines by gateway. A line that no gateway can open stays. Gateways that are not listed
-    get no lines.
+    `unopened` maps a gateway to the lines that it cannot open. A line that no gateway can open stays where it
+    is. Gateways that are not keys of `unopened` get no further lines.
     """
     found = dict(wanted)
     for line in {line for lines in unopened.values() for line in lines} & wanted.keys():
@@ -60,14 +60,17 @@ def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]
 
 
 def _words(values: Iterable[int]) -> pa.UInt64Array:
-    """Return the values as an array; `pa.array` would import pandas if installed, which takes far longer."""
+    """Return the values as an array of 64-bit words.
+
+    `pa.array` would import pandas if it is installed, which takes far longer.
+    """
     words = array("Q", values)
     return pa.Array.from_buffers(pa.uint64(), len(words), [None, pa.py_buffer(words)])
 
 
 _NUMBER = (1 << NUMBER_BITS) - 1
 _WEIGHT = _words([(1 << 64) - 1 - _NUMBER])[0]
-# An odd factor: the upper bits of a product depend on all bits of the other factor.
+# An odd factor spreads every bit of a number into the upper bits of the product.
 _MIXER = _words([0x9E3779B97F4A7C15])[0]
 
 
@@ -82,7 +85,7 @@ def _hash(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
-QUIET_NS = SECOND // 2  # while settling, assign lines only after this time without a change of gateways
+QUIET_NS = SECOND // 2  # while settling, assign lines only after this time without new or lost gateways
 
 
 class Sharers(NamedTuple):
@@ -90,33 +93,34 @@ class Sharers(NamedTuple):
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
-    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # gateway, and the lines it could not open
+    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # gateway, and the lines that it could not open
 
 
 class Shares:
-    """The gateway assigned to each line, for the latest set of sharers."""
+    """The gateway that each line is assigned to, for the latest set of sharers."""
 
     def __init__(self) -> None:
         self.wanted: dict[str, str] = {}  # each line's gateway
-        self.home: dict[str, str] = {}  # each line's gateway if every gateway could open every line
+        self.home: dict[str, str] = {}  # the assignment if every gateway could open every line
         self._made: Sharers | None = None
         self._others: frozenset[str] = frozenset()
         self._seen_at = 0
 
     def reset(self) -> None:
-        """Force a new assignment: a new session started."""
+        """Force a new assignment at the next `make`, because a new session has started."""
         self._made = None
 
     def see(self, others: frozenset[str], now: int) -> None:
-        """Note the other gateways that take lines; `now` is in ns."""
+        """Note the other gateways that take lines now; `now` is in ns."""
         if others != self._others:
             self._others, self._seen_at = others, now
 
     async def make(self, sharers: Sharers, now: int, *, is_settled: bool) -> bool:
-        """Assign the lines to gateways if anything changed; return True if they were assigned now.
+        """Assign the lines to gateways if anything has changed; return True if they were assigned now.
 
-        A thread does the work, because it takes long. Until `is_settled`, do not assign lines while other
-        gateways still appear, as in a cold start: the first gateway would read the records of all lines.
+        The work is done in a thread, because it takes long. Until `is_settled`, lines are not assigned while
+        further gateways appear, as in a cold start. Otherwise the first gateway would read the records of all
+        lines.
         """
         is_early = not is_settled and now - self._seen_at < QUIET_NS
         if sharers == self._made or is_early:

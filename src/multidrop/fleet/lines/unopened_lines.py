@@ -1,10 +1,10 @@
-"""Unopened lines: lines whose port this gateway cannot open, so that others may try. Pure.
+"""UnopenedLines: lines whose port this gateway cannot open, so that other gateways may try. No I/O.
 
-A gateway that is cut off from a line, but not from the servers, reports the line in its lease after some
-failures. The line then goes to a gateway that has not reported it. Sometimes the first gateway withdraws the
-report of one line, as a trial: the line comes back, and is not polled while its port cannot be opened. So
-trials become rarer, except for a line that all gateways have reported, because no gateway polls that one
-anyway.
+A gateway that is cut off from a line, but not from the servers, reports the line in its lease record after
+some failures. The line is then assigned to a gateway that has not reported it. From time to time, the first
+gateway withdraws the report of one line, as a trial. The line comes back, but is not polled if its port still
+cannot be opened. So after each failed trial, the wait for the next one is longer. If all gateways have
+reported a line, its trials cost nothing, because no gateway polls it, and they stay frequent.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from collections.abc import Callable
 from multidrop.fleet.leases.rules import SECOND
 
 OPENINGS = 3  # failed attempts to open a line before it is reported
-LOST_NS = 6 * SECOND  # a line whose port is lost is reported this long after its last reply
-REPLY_NS = 3 * SECOND  # an older reply does not show when the port was lost
-FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait for a trial
-TRIAL_NS = 60 * SECOND  # the trial of a line that did not come back ends after this time
-MOST_BYTES = 8_000  # limit of line names in a lease record
+LOST_NS = 6 * SECOND  # a lost port is reported this long after the last reply
+REPLY_NS = 3 * SECOND  # a reply that is older does not show when the port was lost
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait before a trial
+TRIAL_NS = 60 * SECOND  # if the line does not come back, its trial ends after this time
+MOST_BYTES = 8_000  # limit of all line names in a lease record
 
 
 class UnopenedLines:
     """The lines that other gateways should take. `clock` returns ns.
 
-    No more lines are reported than fit into a lease record; the others are retried here.
+    Only as many lines are reported as fit into a lease record. This gateway retries the others itself.
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
@@ -33,24 +33,24 @@ class UnopenedLines:
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
-        self._named: dict[str, None] = {}  # reported lines, in the order of their trials
+        self._named: dict[str, None] = {}  # reported lines, in the order in which they will be tried
         self._wait_ns = FIRST_WAIT_NS
         self._trial_at = 0
         self._tried = ""
         self._tried_since = 0
 
     def failed(self, line: str) -> None:
-        """Note that the line's port could not be opened."""
+        """Count a failed attempt to open the line's port; report the line after OPENINGS of them."""
         self._failures[line] = self._failures.get(line, 0) + 1
         if self._failures[line] >= OPENINGS:
             self._name(line)
 
     def lost(self, line: str, silent_ns: int | None = None) -> None:
-        """Note that the port of a polled line is lost. The newest reply on the line is `silent_ns` old.
+        """Note that the port of a polled line is lost; report the line when LOST_NS have passed.
 
-        The time counts from that reply, because a network that drops everything delays both the failure of a
-        write and that of a connection attempt by seconds. If `silent_ns` is None or large, it counts from the
-        first call.
+        `silent_ns` is the age of the newest reply on the line. The time counts from that reply, because a
+        network that drops everything delays the failures of writes and connection attempts by seconds. If
+        `silent_ns` is None or large, the time counts from the first call.
         """
         now = self._clock()
         since = now - silent_ns if silent_ns is not None and silent_ns <= REPLY_NS else now
@@ -58,22 +58,22 @@ class UnopenedLines:
             self._name(line)
 
     def opened(self, line: str) -> None:
-        """Note that the line's port is open."""
+        """Note that the line's port is open; withdraw its report."""
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
         self._named.pop(line, None)
-        if line == self._tried:  # the network is back: try the other lines immediately
+        if line == self._tried:  # the network is back: try the other reported lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                del self._named[other]  # not in this gateway's share: a trial would not bring the line back
+                del self._named[other]  # assigned to another gateway: a trial would not bring the line back
 
     def gone(self, line: str) -> None:
-        """Note that the line is no longer ours: forget its failures."""
+        """Forget the line's failures, because it is no longer ours."""
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
 
     def named(self) -> frozenset[str]:
-        """Return the lines that others should take. Call this often, because it also starts trials."""
+        """Return the lines that other gateways should take. Call this often: it also starts trials."""
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:
             self._tried = ""

@@ -1,1 +1,1 @@
-"""Samples on their way from gateways to the stores: spool, stream, hub and sinks."""
+"""Samples on their way from the gateways to a store: spool, stream, hub and sinks."""

@@ -1,9 +1,9 @@
-"""Forwarder: sends a spool's messages into the stream, in order, each once.
+"""Forwarder: sends a spool's messages to the stream, in order, each exactly once.
 
-One message is in flight at a time. It names the position that the last message of its subject must have, and
-the stream stores it only if that is true. At the start, and after a timeout or refusal, the forwarder asks
-the stream for the last message, and continues after that one. There is no offset file, and no time window
-after which duplicates could appear.
+One message is in flight at a time. Each names the stream position of the previous message of its subject, and
+the stream stores it only if that is right. At the start, and after a timeout or refusal, the forwarder asks
+the stream for the last message of the subject, and continues with the next one. So there is no file with an
+offset, and no time after which a duplicate could be stored.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from multidrop.fleet.samples.samples_stream import (
 from multidrop.fleet.samples.spool import Spool, StoredMessage
 from multidrop.fleet.servers.connections import ServerPath
 
-AGAIN_S = 0.25  # between attempts after a failure
-LOOKING_S = 1.0  # between checks for a message that the spool did not announce
+AGAIN_S = 0.25  # pause after a failure
+LOOKING_S = 1.0  # between checks for messages that the spool did not announce
 SET_BACK = (
     "the servers have message {} of the log {}, and the spool has {}: its folder was copied or set back; "
     "move it away to start a new log"
@@ -39,36 +39,39 @@ _log = logging.getLogger("multidrop.fleet.samples.forwarder")
 
 
 class NotOurLog(Exception):
-    """The stream has a different message under a number of this log: the folder was copied, or set back."""
+    """The stream has another message under a sequence number of this log.
+
+    The spool's folder was copied, or restored from an older state.
+    """
 
 
 class Forwarder:
-    """Sends the messages of a spool over this path until cancelled: `await forwarder.run()`."""
+    """Sends the messages of a spool over this path: `await forwarder.run()` runs until it is cancelled."""
 
     def __init__(self, spool: Spool, path: ServerPath) -> None:
         self._spool, self._path = spool, path
         self._subject = subject_of(spool.gateway, spool.log)
         self._news = asyncio.Event()
-        self.sent = 0  # messages since the start
-        self.last: int | None = None  # the last sequence in the stream; None: unknown so far
+        self.sent = 0  # messages sent since the start
+        self.last: int | None = None  # number of the stream's last message of this log; None: unknown so far
         self.trouble: str | None = None
 
     def lag_s(self) -> float | None:
         """Return the age (s, by the system's clock) of the oldest message that the stream lacks.
 
-        Return 0 if the stream lacks none; None if that is still unknown, or the message was removed.
+        Return 0 if the stream has all messages; None if that is not known yet, or the message was removed.
         """
         if self.last is None:
             return None
         stored = self._spool.following(self.last)
         if stored is None:
             return 0.0
-        with suppress(OSError):  # the spool may have just removed the file
+        with suppress(OSError):  # the spool may have removed the file just now
             return max(0.0, time.time() - stored.path.stat().st_mtime)
         return None
 
     async def run(self) -> None:
-        """Forward until cancelled. Each failure is logged once and retried."""
+        """Forward until cancelled. Each failure is logged once, and retried."""
         loop = asyncio.get_running_loop()
 
         def announce() -> None:
@@ -81,7 +84,7 @@ class Forwarder:
                 await self._forward()
             except (NotOurLog, OSError) as failure:
                 self._note(str(failure))
-            except Exception as failure:  # such as a bug here, or MemoryError
+            except Exception as failure:  # a bug here, or MemoryError
                 self._note(f"{type(failure).__name__}: {failure}", failure)
             await asyncio.sleep(AGAIN_S)
 
@@ -102,7 +105,7 @@ class Forwarder:
                 continue
             found = await publish(self._path, self._subject, data, self._headers(stored, data, place))
             end_if_cancelled()
-            if found is None:  # refused because an earlier attempt of ours succeeded
+            if found is None:  # None: refused, because an earlier attempt of ours was stored
                 return
             place, sequence = found, stored.sequence
             self.sent += 1
@@ -110,10 +113,10 @@ class Forwarder:
             self._note(None)
 
     async def _ask(self) -> tuple[int, int]:
-        """Return position and sequence of the last message of this log in the stream."""
+        """Return the position and the sequence number of this log's last message in the stream."""
         last = await last_of(self._path, self._subject)
         end_if_cancelled()
-        if last is None or last.sequence == 0:  # none is stored any longer, or the last one is forged
+        if last is None or last.sequence == 0:  # none is stored now, or the last one is forged
             sequence = self.last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence

@@ -1,6 +1,6 @@
-"""Hub: reads the stream into a sink, which stores the last message's position in the same commit as the rows.
+"""Hub: reads the stream into a sink, which stores rows and their position in the stream in one commit.
 
-The hub uses no consumer of NATS, and acknowledges no messages. After a failure it asks the sink for its
+The hub uses no NATS consumer and acknowledges no messages. After a failure it asks the sink for the stored
 position, and reads the stream from there.
 """
 
@@ -27,14 +27,14 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 class SourceCheck:
-    """Checks that no message of a log is missing or repeated; alarms are logged as errors and counted."""
+    """Checks that no message of a log is missing or repeated. Alarms are logged as errors and counted."""
 
     def __init__(self, last: Mapping[str, int]) -> None:
-        self.last = dict(last)  # sequence of the last message, by "gateway.log id"
+        self.last = dict(last)  # sequence number of the last message, by "gateway.log id"
         self.alarms = 0
         self.missing = 0  # number of missing messages
         self.doubled = 0  # number of repeated messages, which are ignored
-        self._lost: dict[str, int] = {}  # rows that each gateway has lost, as it reports
+        self._lost: dict[str, int] = {}  # rows lost by each gateway's spool, as the gateway reports
 
     def take(self, message: StreamMessage) -> bool:
         """Return True if the message is new and must be stored."""
@@ -62,11 +62,11 @@ class SourceCheck:
         _log.error("%s", sentence)
 
 
-MOST_READ = 64  # messages in one answer
+MOST_READ = 64  # limit of messages in one answer
 MOST_READ_BYTES = 8 << 20
-MOST_ROWS = 1_000_000  # limit of one commit: 50 MB
-MOST_BYTES = 256 << 20  # limit of one commit, messages and rows; one answer may exceed it
-LOOKING_S = 0.2  # between reads without a new message
+MOST_ROWS = 1_000_000  # limit of rows in one commit: 50 MB
+MOST_BYTES = 256 << 20  # limit of messages and rows in one commit; a single answer may exceed it
+LOOKING_S = 0.2  # pause before the next read if there is no new message
 AGAIN_S = 1.0  # pause after a failure
 BEHIND_S = 5.0  # how long to wait for a server that lacks messages of its leader
 
@@ -82,16 +82,16 @@ class NotThisHubs(SinkError):
 
 
 class KeptPlace(NamedTuple):
-    """The position of the last stored message, and the last sequence of each log."""
+    """The stream position of the last stored message, and the last sequence number of each log."""
 
     place: int
     sources: Mapping[str, int]
 
 
 class Commit(NamedTuple):
-    """Rows and the position after them, which a sink must store together."""
+    """Rows, and the position of their last message, which a sink must store together."""
 
-    stream: str  # identity of the stream
+    stream: str  # identity of the stream: when it was created
     first: int  # position of the first message in the stream
     last: int
     sources: Mapping[str, int]
@@ -100,13 +100,13 @@ class Commit(NamedTuple):
 
 
 class SampleSink(Protocol):
-    """A store of rows. Its methods run in a thread and raise SinkError."""
+    """A store of rows. Its methods are called in a thread, and raise SinkError."""
 
     def begin(self, stream: str) -> KeptPlace:
-        """Return the stored position of this stream; called at the start and after each failure."""
+        """Return the stored position in this stream. Called at the start and after each failure."""
 
     def write(self, commit: Commit) -> None:
-        """Store the whole commit, or leave the sink unchanged."""
+        """Store the whole commit; if that fails, leave the sink unchanged."""
 
     def close(self) -> None:
         """Release open resources."""
@@ -123,10 +123,10 @@ async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
 
 
 class HubState(NamedTuple):
-    """Positions in the stream, counts since the start, and the present problem or None."""
+    """Positions in the stream, counts since the start, and the present problem (None without one)."""
 
     place: int  # position of the last stored message
-    behind: int  # messages in the stream that are not stored
+    behind: int  # messages in the stream that are not stored yet
     rows: int
     alarms: int
     missing: int  # number of missing messages
@@ -135,7 +135,7 @@ class HubState(NamedTuple):
 
 
 class SampleHub:
-    """Reads a stream into a sink, with one commit each `every` seconds or million rows."""
+    """Reads a stream into a sink, with one commit every `every` seconds or million rows."""
 
     def __init__(self, path: ServerPath, sink: SampleSink, *, every: float = 10.0) -> None:
         self._path, self._sink, self._every = path, sink, every
@@ -149,9 +149,9 @@ class SampleHub:
         return HubState(self._place, max(0, self._end - self._place), *counts, self._trouble)
 
     async def run(self, *, once: bool = False) -> None:
-        """Read until cancelled, or with `once` until all present messages are stored.
+        """Read until cancelled, or with `once` until all messages that are in the stream now are stored.
 
-        A failure of the stream or sink is logged and retried each second. Raises NotThisHubs.
+        A failure of the stream or the sink is logged and retried each second. Raises NotThisHubs.
         """
         while True:
             try:
@@ -189,7 +189,7 @@ class SampleHub:
             )
 
     async def _commit(self, once: bool) -> bool:
-        """Collect messages and store them; return True if `once` and all up to `_end` are stored."""
+        """Collect messages and store them; return True if `once` and all messages up to `_end` are stored."""
         messages: list[StreamMessage] = []
         tables: list[Any] = []
         rows, size, ends = 0, 0, None
@@ -227,7 +227,7 @@ class SampleHub:
         return is_end
 
     def _tables(self, messages: Sequence[StreamMessage]) -> list[Any]:
-        """Return the rows of the messages to store."""
+        """Return the rows of those messages that are new and valid, one table for each."""
         found = []
         for message in messages:
             if self._sources.take(message):

@@ -50,7 +50,7 @@ _NOT_COMPRESSED = -1  # marks a buffer that compression would not shrink
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
-    """Return the unpacked size of all buffers. Raises ValueError or pa.ArrowException if they are invalid."""
+    """Return the unpacked size of all buffers in bytes. Raises ValueError or pa.ArrowException."""
     size = 0
     for number, message in enumerate(pa.ipc.MessageReader.open_stream(data)):
         if number == MOST_MESSAGES:
@@ -94,7 +94,7 @@ class _Table:
         self._length: int = _U16.unpack_from(data, self._fields)[0]
 
     def _field(self, number: int) -> int:
-        """Return the offset of a field, 0 if it is missing."""
+        """Return the offset of a field; 0 if the field is missing."""
         entry = 4 + 2 * number
         offset = _U16.unpack_from(self._data, self._fields + entry)[0] if entry < self._length else 0
         return self._place + offset if offset else 0
@@ -118,14 +118,14 @@ class _Table:
         return _BUFFER.iter_unpack(self._data[begin : begin + count * _BUFFER.size])
 
 
-MOST_BYTES = 900_000  # of a message: NATS accepts 1 MiB by default, its headers included
+MOST_BYTES = 900_000  # limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
-MOST_UNPACKED = 4 << 20  # bytes: 2.4 MB of rows, and names
-MOST_NAME = 1000  # bytes of a name, status or unit; PostgreSQL indexes names
-MOST_SAID = 300  # limit of the characters of an error's text
+MOST_UNPACKED = 4 << 20  # bytes; allows 2.4 MB of rows, and their names
+MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes names
+MOST_SAID = 300  # limit of characters of an error's text
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-NAMED = pa.dictionary(pa.int32(), pa.utf8())  # codes are wide enough for the names of many messages together
+NAMED = pa.dictionary(pa.int32(), pa.utf8())  # codes wide enough for the names of many messages in one table
 TIMES = pa.timestamp("ns", "UTC")
 ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
     [
@@ -139,7 +139,7 @@ ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
         pa.field("unit", NAMED),
     ]
 )
-_TYPES: Mapping[str, Sequence[Any]] = {  # of a message's columns; names are dictionaries of utf8
+_TYPES: Mapping[str, Sequence[Any]] = {  # types of a message's columns; names are dictionaries of utf8
     "time": [TIMES],
     "clock_ns": [pa.int64()],
     "uncertainty_us": [pa.int32(), pa.int64()],
@@ -150,7 +150,7 @@ _KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(),
 
 
 class MessageError(ValueError):
-    """Raised for bytes that are not a valid message."""
+    """These bytes are not a valid message."""
 
 
 class Packed(NamedTuple):
@@ -161,7 +161,7 @@ class Packed(NamedTuple):
 
 
 class RowBuffer:
-    """Copies of the rows of many batches of one poller, so the batches' memory can be reused."""
+    """Copies the rows of many batches of one poller, so that the batches' memory can be reused."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -169,7 +169,7 @@ class RowBuffer:
         self._columns = {name: bytearray() for name in _KINDS}
 
     def add(self, columns: BatchColumns) -> bool:
-        """Copy the rows; return False if they are of another poller, whose codes have other meanings."""
+        """Copy the rows; return False if they are from another poller, whose name codes differ."""
         names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
         if any(not _continues(names[of], known) for of, known in self._names.items()):
             return False
@@ -242,7 +242,7 @@ def unpack(data: bytes | memoryview) -> Any:
 
 
 def _table(data: bytes | memoryview) -> Any:
-    """Return the table in a stream. Raises ValueError if the stream is too large or has other types."""
+    """Return the table in an Arrow stream. Raises ValueError if it is too large or has other column types."""
     size = unpacked_size(data)
     if size > MOST_UNPACKED:
         raise ValueError(f"{size} bytes unpacked; the limit is {MOST_UNPACKED}")
@@ -267,7 +267,7 @@ def _is_ours(field: Any) -> bool:
 
 
 def _check(rows: Any) -> None:
-    """Raise ValueError for rows that no sink accepts: such a message would block all later ones."""
+    """Raise ValueError for rows that no sink accepts, because such a message would block all later ones."""
     for field, column in zip(rows.schema, rows.columns, strict=True):
         if not field.nullable and column.null_count:
             raise ValueError(f"its {field.name} is missing in some rows")

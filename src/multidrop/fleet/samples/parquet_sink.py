@@ -35,10 +35,10 @@ from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkErro
 from multidrop.fleet.samples.message import ROWS
 from multidrop.recording import FileLock
 
-KEY = "multidrop"  # key of the files' metadata, as in all recordings
+KEY = "multidrop"  # key under which the files' metadata are stored, as in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"
-WRITTEN = {  # names are dictionary-encoded in the file, and plain texts for readers
+WRITTEN = {  # names are dictionary-encoded in the file; readers get plain texts
     "compression": "zstd",
     "compression_level": 1,
     "store_schema": False,
@@ -49,7 +49,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class ParquetSink:
-    """Writes each commit as a file. Raises SinkError if the folder cannot be written or is another hub's."""
+    """Writes each commit as one file.
+
+    Raises SinkError if the folder cannot be written, or belongs to another hub.
+    """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
@@ -74,7 +77,7 @@ class ParquetSink:
         self._lock.close()
 
     def begin(self, stream: str) -> KeptPlace:
-        """Return the position that the newest file has, and remove unfinished files."""
+        """Return the position that the newest file contains, and remove unfinished files."""
         try:
             for part in self._rows.glob(".*.writing"):
                 part.unlink()
@@ -119,14 +122,16 @@ class ParquetSink:
 
 
 def _joined(commit: Commit) -> Any:
-    """Return all rows, ordered by drive and time."""
+    """Return all rows of the commit, sorted by drive and time."""
     if not commit.rows:
         return ROWS.empty_table()
     table = pa.concat_tables(commit.tables).unify_dictionaries().combine_chunks()
     drives = table.column("drive").chunk(0)
     ranks = pc.rank(drives.dictionary).cast(pa.int32()).take(drives.indices)
     by_time = pc.array_sort_indices(table.column("time").chunk(0).cast(pa.int64()))
-    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # the second sort is stable
+    return table.take(
+        by_time.take(pc.array_sort_indices(ranks.take(by_time)))
+    )  # this sort keeps the order of times
 
 
 def _about(commit: Commit) -> dict[str, Any]:
@@ -177,7 +182,7 @@ async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
         await asyncio.sleep(every)
         try:
             await _compact(words)
-        except Exception as failure:  # such as a process that cannot start: retry
+        except Exception as failure:  # such as a process that cannot start; retried
             _log.error("merging files failed; retrying", exc_info=failure)
 
 

@@ -1,4 +1,4 @@
-"""Polled units: the units of a gateway's rows, from the description that each row was polled by."""
+"""PolledUnits: the units of a gateway's rows, from the description under which each row was polled."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pyarrow as pa
 
 from multidrop import Drive, PlantLine, Register
 
-RAW = "raw count"  # the same text as in a history
+RAW = "raw count"  # same text as in a `History`
 
 
 class Change(NamedTuple):
-    """The unit code that a series had until a monotonic time in ns."""
+    """A change of a series' unit: the code that it had until this monotonic time in ns."""
 
     until_ns: int
     series: int
@@ -22,15 +22,15 @@ class Change(NamedTuple):
 
 
 class UnitTable(NamedTuple):
-    """Unit codes by series; a series has the number drive * len(registers) + register."""
+    """Unit codes by series: the series of a drive's register is drive * len(registers) + register."""
 
-    newest: Any  # pa.Array; null if unknown
-    changes: Sequence[Change]  # latest first
-    texts: Sequence[str]  # units by code
+    newest: Any  # pa.Array of the present unit codes; null if unknown
+    changes: Sequence[Change]  # newest change first
+    texts: Sequence[str]  # unit texts by code
 
 
 class PolledUnits:
-    """The unit of each register, and since when. Thread-safe."""
+    """The unit of each register, and since when it has this unit. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -38,7 +38,7 @@ class PolledUnits:
         self._made: tuple[Sequence[str], Sequence[str], UnitTable] | None = None
 
     def note(self, line: PlantLine, since_ns: int) -> None:
-        """Note the units of this line's rows that are requested from `since_ns` (monotonic) on."""
+        """Note the units of this line for rows that are requested from `since_ns` (monotonic) on."""
         with self._lock:
             for polled in line.drives:
                 for poll in polled.polls:
@@ -49,10 +49,10 @@ class PolledUnits:
             self._made = None
 
     def table(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
-        """Return the units of the drives' registers. The table is rebuilt after changes of lines or names.
+        """Return the units of the drives' registers. The table is cached until lines or names change.
 
-        Messages have nearly as many series as rows, so a lookup per series would cost more than all other
-        work on a row.
+        A message has nearly as many series as rows, so a lookup for each series would cost more than all
+        other work on a row.
         """
         with self._lock:
             if self._made is None or self._made[:2] != (drives, registers):
@@ -76,7 +76,7 @@ class PolledUnits:
 
 
 def unit_of(drive: Drive, register: Register[Any]) -> str:
-    """Return a unit: "" for a number without one, "names of yd1000" for named values of that family."""
+    """Return a register's unit: "" for a number without one, "names of yd1000" for its named values."""
     if register.values:
         return f"names of {drive.model or type(drive).__name__}"
     return RAW if register.step is None else register.unit

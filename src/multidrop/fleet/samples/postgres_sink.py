@@ -36,23 +36,23 @@ from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkErro
 HEAD = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 END = b"\xff\xff"
 EPOCH_US = 946_684_800_000_000  # 2000-01-01, the epoch of PostgreSQL
-FLOAT8, TEXT = 701, 25  # oids of these types in PostgreSQL
+FLOAT8, TEXT = 701, 25  # PostgreSQL's type ids (oids)
 NULL = b"\xff\xff\xff\xff"
-PIECE = 1 << 18  # approximate bytes of a piece of a COPY
+PIECE = 1 << 18  # approximate size of one piece of COPY data, in bytes
 _FIRST = Struct(">hiqiq")  # number of columns; then time and time_ns, each after its length
 _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
 
 
 class RegisterSet(NamedTuple):
-    """The names and units of the registers that one request reads; a unit is None if it is unknown."""
+    """The names and units of the registers that one request reads. A unit is None if it is unknown."""
 
     names: tuple[str, ...]
     units: tuple[str | None, ...]
 
 
 class ExchangeRow(NamedTuple):
-    """Rows of one drive that were requested together."""
+    """The values of one drive that were requested together."""
 
     time_ns: int
     uncertainty_ns: int | None
@@ -63,7 +63,7 @@ class ExchangeRow(NamedTuple):
 
 
 class ExchangeRows(NamedTuple):
-    """The exchanges of a message, and the names in them."""
+    """The exchanges of a message, and the names that occur in them."""
 
     exchanges: list[ExchangeRow]
     drives: frozenset[str]
@@ -71,7 +71,7 @@ class ExchangeRows(NamedTuple):
 
 
 def exchanges_of(table: Any) -> ExchangeRows:
-    """Return the exchanges in a table of `message.ROWS`, in order of time and drive."""
+    """Return the exchanges in a table of `message.ROWS`, sorted by time and drive."""
     table = table.combine_chunks()
     if not len(table):
         return ExchangeRows([], frozenset(), frozenset())
@@ -110,7 +110,7 @@ def exchanges_of(table: Any) -> ExchangeRows:
 
 
 def _numbers(column: Any, kind: str) -> list[Any]:
-    """Return a column's numbers, with None for nulls; ten times as fast as to_pylist."""
+    """Return a column's numbers, with None for nulls. Ten times as fast as `to_pylist`."""
     data: Any = memoryview(column.buffers()[1]).cast("B")
     found: list[Any] = data.cast(kind)[column.offset :][: len(column)].tolist()
     if column.null_count:
@@ -120,7 +120,7 @@ def _numbers(column: Any, kind: str) -> list[Any]:
 
 
 def _changes(first: Any, second: Any) -> list[int]:
-    """Return the numbers of the rows in which either column differs from the row before, and of row 0."""
+    """Return the numbers of the rows that differ from the row before in either column; includes row 0."""
     changed = [pc.not_equal(column[1:], column[:-1]) for column in (first, second)]
     either = pc.or_(*changed)
     return [0, *(at + 1 for at in pc.indices_nonzero(either).to_pylist())]
@@ -129,7 +129,7 @@ def _changes(first: Any, second: Any) -> list[int]:
 def copied(
     found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[RegisterSet, int]
 ) -> Iterator[bytes]:
-    """Yield the data of a COPY in pieces; its columns are those of `COPY`."""
+    """Yield the data of a COPY in pieces. Its columns are those of `COPY`."""
     piece = [HEAD]
     size = 0
     for one in found:
@@ -207,7 +207,8 @@ COPY = (
     "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
     " from stdin (format binary)"
 )
-# One hub locks the database while its connection lasts; the server drops a dead connection after 25 s.
+# One hub at a time locks the database, for as long as its connection lasts. The server drops a dead
+# connection after 25 s.
 TAKEN = """
 set tcp_keepalives_idle = 10; set tcp_keepalives_interval = 5; set tcp_keepalives_count = 3;
 set lock_timeout = '3s'; select pg_advisory_lock(hashtext('multidrop hub that writes')); set lock_timeout = 0
@@ -265,7 +266,7 @@ class PostgresSink:
         return KeptPlace(found[1], found[2])
 
     def write(self, commit: Commit) -> None:
-        """Advance the position and copy the rows, in one transaction."""
+        """Store the rows and their position in one transaction."""
         assert self._connection is not None
         try:
             with self._connection.transaction():
@@ -286,7 +287,7 @@ class PostgresSink:
                 copy.write(piece)
 
     def _name(self, connection: psycopg.Connection[Any], found: Sequence[ExchangeRows]) -> None:
-        """Insert names that have no id yet."""
+        """Insert those names that have no id in the database yet."""
         drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
         query = "insert into multidrop.families (name) select unnest(%s::text[]) returning name, id"
         if drives:

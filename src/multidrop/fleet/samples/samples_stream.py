@@ -1,7 +1,7 @@
-"""The stream of all gateways' samples, through JetStream's own API (ADR-31 for direct gets).
+"""The stream of all gateways' samples, through JetStream's own API (direct gets: ADR-31).
 
-A message has the subject `samples.<gateway>.<log id>`, its number in that log in the header
-`Multidrop-Sequence`, and a digest of its bytes. This module keeps no state: it asks the stream.
+A message has the subject `samples.<gateway>.<log id>`. Its headers contain its number in that log
+(`Multidrop-Sequence`) and a digest of its bytes. This module keeps no state: it always asks the stream.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from multidrop.supervisor import end_tasks, supervisor
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
-BY_SERVER = "Nats-Stream"  # a header of each message that a server returns from a stream
+BY_SERVER = "Nats-Stream"  # header of each message that a server returns from a stream
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
-ANSWER_S = 5.0  # for an answer; an election takes 4 to 9 s, so requests are retried
+ANSWER_S = 5.0  # time limit of an answer; an election takes 4 to 9 s, so requests are retried
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
-SENTENCES = {  # error messages by code
+SENTENCES = {  # messages of FleetError, by JetStream's error code
     NO_STREAM: f"there is no stream {STREAM!r}: create it with `multidrop fleet init`",
     **dict.fromkeys(
         (10005, 10047),
@@ -44,7 +44,7 @@ SENTENCES = {  # error messages by code
 
 
 class StreamAbout(NamedTuple):
-    """A stream's identity (when it was created), and its first and last positions."""
+    """A stream's identity (the time of its creation), and its first and last positions."""
 
     created: str
     first: int
@@ -54,7 +54,7 @@ class StreamAbout(NamedTuple):
 class LastMessage(NamedTuple):
     """The newest message of a subject: its position in the stream, its number in the log, its digest.
 
-    The number is 0 if the message is not a gateway's, but a server's answer that was directed to this
+    The number is 0 if the message is not from a gateway, but is a server's answer that was directed to this
     subject.
     """
 
@@ -72,9 +72,9 @@ def digest_of(data: bytes) -> str:
 
 
 def end_if_cancelled() -> None:
-    """Raise CancelledError again if `asyncio.wait_for` has swallowed it.
+    """Raise CancelledError if this task was cancelled, but `asyncio.wait_for` has swallowed the exception.
 
-    In Python 3.11, it does so if the cancellation coincides with an answer.
+    Python 3.11 does so if the cancellation coincides with an answer.
     """
     task = asyncio.current_task()
     if task and task.cancelling():
@@ -85,7 +85,7 @@ def end_if_cancelled() -> None:
 async def samples_path(
     urls: Sequence[str], options: Mapping[str, Any] | None = None
 ) -> AsyncIterator[ServerPath]:
-    """Stay connected to one of these servers. Raises FleetError if none can be used."""
+    """Yield a path that stays connected to one of these servers. Raises FleetError if none can be used."""
     path = ServerPath(urls, options, ANSWER_S)
     try:
         await path.open()
@@ -100,10 +100,10 @@ async def samples_path(
 
 
 async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int = -1) -> int:
-    """Create the stream if it is missing, and return its size limit in bytes; -1 for none.
+    """Create the stream if it is missing; return its size limit in bytes, -1 for none.
 
-    The oldest messages are removed above `most_bytes`, which the servers reserve: a stream without a limit
-    fills their disks, and then no lease can be renewed. An existing stream stays as it is.
+    Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream without
+    a limit fills their disks, and then no lease can be renewed. An existing stream stays as it is.
     """
     config = {
         "name": STREAM,
@@ -124,7 +124,7 @@ async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int 
 
 
 async def about(path: ServerPath) -> StreamAbout:
-    """Return the stream's identity and extent. Raises FleetError."""
+    """Return the stream's identity, and its first and last positions. Raises FleetError."""
     found = await _ask(path, f"STREAM.INFO.{STREAM}", {})
     with _as_wanted():
         config, state = found["config"], found["state"]
@@ -147,9 +147,9 @@ async def last_of(path: ServerPath, subject: str) -> LastMessage | None:
 
 
 async def publish(path: ServerPath, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
-    """Store a message, and return its position; None if the subject's last message is not the expected one.
+    """Store a message and return its position; None if the subject's last message is not the expected one.
 
-    After a FleetError, the message may have been stored or not.
+    After a FleetError, the outcome is unknown: the message may have been stored.
     """
     try:
         answer = await path.request(subject, data, headers, ANSWER_S)
@@ -170,7 +170,7 @@ def number_of(text: str | None) -> int:
 
 
 async def _ask(path: ServerPath, subject: str, what: Mapping[str, Any], *none: int) -> Any:
-    """Return the answer of JetStream's API; None for an error whose code is in `none`."""
+    """Return the answer of JetStream's API to a request; None for an error whose code is in `none`."""
     try:
         return await ask(path, subject, what, ANSWER_S)
     except NobodyThere as failure:
@@ -183,7 +183,7 @@ async def _ask(path: ServerPath, subject: str, what: Mapping[str, Any], *none: i
 
 @contextmanager
 def _as_wanted() -> Iterator[None]:
-    """Raise FleetError if an answer lacks a field."""
+    """Raise FleetError if an answer lacks a field or has a wrong type."""
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -194,31 +194,31 @@ SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 
 
 class StreamMessage(NamedTuple):
-    """A message as the hub reads it; `sequence` is 0 if the header is missing or invalid.
+    """A message as the hub reads it. `sequence` is 0 if the header is missing or invalid.
 
-    It is also 0 for a message that a server returned from a stream. A client that may read stored messages
-    can have the server send one to any subject, and so into the stream in another gateway's name.
+    `sequence` is also 0 if a server has returned this message from a stream. A client that may read stored
+    messages can direct such an answer to any subject, and so into the stream in another gateway's name.
     """
 
     place: int
     gateway: str
     log: str
     sequence: int
-    lost: int  # rows that the gateway's spool had lost by then
+    lost: int  # rows that the gateway's spool had lost when it sent the message
     data: bytes
 
 
 async def read_after(path: ServerPath, place: int, messages: int, size: int) -> list[StreamMessage]:
-    """Return the next messages after this position, without a gap, within the limits of number and bytes.
+    """Return the next messages after this position, without a gap: at most `messages`, and `size` bytes.
 
-    An empty list means that there is none now. Any replica may answer. Raises FleetError.
+    An empty list means that there are none now. Any replica may answer. Raises FleetError.
     """
     wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
     get = SampleGet()
     try:
         await path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
     except FleetError as failure:
-        if get.found or get.has_hole:  # each message is complete; the next call continues after the last
+        if get.found or get.has_hole:  # the messages in it are complete; the next call reads the rest
             return get.found
         raise _refused(get.end_line) if get.last.done() else failure from failure
     return get.found
@@ -227,8 +227,8 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
 class SampleGet(DirectGet):
     """The messages that one direct get returns, parsed from raw headers.
 
-    A sender may write any headers into a message, and the server's headers come last. A parser that stops at
-    an invalid header would take the sender's claim about the origin for the server's.
+    A sender may write any headers into a message, and the server appends its own headers. A parser that stops
+    at an invalid header would trust the sender about the message's origin.
     """
 
     def __init__(self) -> None:

@@ -44,7 +44,7 @@ class SpoolError(ValueError):
 
 
 class StoredMessage(NamedTuple):
-    """A message in the spool's folder, and its file."""
+    """A message in the spool's folder: its sequence number, rows, size in bytes, and file."""
 
     sequence: int
     rows: int
@@ -53,7 +53,7 @@ class StoredMessage(NamedTuple):
 
 
 class SpoolFolder:
-    """The files of one log, owned by one process at a time.
+    """The files of one log. Only one process at a time may use the folder.
 
     Raises SpoolError if the folder holds other files, belongs to another gateway, is in use by another
     process, or cannot be written.
@@ -61,7 +61,7 @@ class SpoolFolder:
 
     def __init__(self, path: Path, gateway: str) -> None:
         self.path = path
-        self.damage: str | None = None  # a sentence about an incomplete newest message
+        self.damage: str | None = None  # sentence about a newest message that the disk stored only in part
         with ExitStack() as stack:
             try:
                 path.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ class SpoolFolder:
         return str(found["log"])
 
     def _listed(self) -> dict[int, StoredMessage]:
-        """Return the messages by sequence, and remove files that a killed process left unfinished."""
+        """Return the messages by sequence number, and remove files that a killed process left unfinished."""
         found = {}
         self.newest = 0
         for path in self.path.iterdir():
@@ -106,7 +106,7 @@ class SpoolFolder:
                 path.unlink()
             elif match := _NAME.fullmatch(path.name):
                 number = int(match[1])
-                self.newest = max(self.newest, number)  # a damaged message's number is not reused either
+                self.newest = max(self.newest, number)  # the number of a damaged message is not reused either
                 if match[3] == "arrows":
                     found[number] = StoredMessage(number, int(match[2]), path.stat().st_size, path)
         return dict(sorted(found.items()))
@@ -128,17 +128,17 @@ class SpoolFolder:
         return StoredMessage(number, rows, len(data), path)
 
     def add(self, stored: StoredMessage) -> None:
-        """Add a message that was written to `messages`."""
+        """Add a message that `write` has written to `messages`."""
         self.messages[stored.sequence] = stored
         self.newest = stored.sequence
 
     def remove(self, message: StoredMessage) -> None:
-        """Remove a message other than the newest. Raises OSError."""
+        """Remove the file of a message other than the newest. Raises OSError."""
         message.path.unlink(missing_ok=True)
         del self.messages[message.sequence]
 
     def _store(self, path: Path, data: bytes) -> None:
-        """Write and sync a temporary file, then rename it to `path`; remove it if that fails."""
+        """Write and sync a temporary file, then rename it to `path`. Remove it if that fails."""
         part = path.with_name(f".{path.name}.tmp")
         try:
             file = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
@@ -180,28 +180,28 @@ def _parsed(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-ENOUGH_ROWS = 1 << 14  # a message is written as soon as this many rows wait
-ENOUGH_S = 1.0  # or as soon as the oldest waiting row is this old
-MOST_WAITING = 1_000_000  # limit of rows in memory while the disk is slow or full: 38 MB
-AGAIN_S = 1.0  # between attempts after a disk error
-TELLING_S = 60.0  # between log lines about lost rows
-ENDING_S = 10.0  # `close` waits this long for the disk
+ENOUGH_ROWS = 1 << 14  # number of waiting rows at which a message is written
+ENOUGH_S = 1.0  # age of the oldest waiting row at which a message is written
+MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
+AGAIN_S = 1.0  # pause after a disk error
+TELLING_S = 60.0  # time between log lines about lost rows
+ENDING_S = 10.0  # time limit of `close` for the disk
 
 _log = logging.getLogger("multidrop.fleet.samples.spool")
 
 
 class SpoolState(NamedTuple):
-    """The state of a spool. Rows are counted since the spool was opened."""
+    """The state of a spool. Rows are counted from the opening of the spool."""
 
-    log: str  # id of the log
+    log: str  # id of the log, from `spool.json`
     written: int  # rows that reached the disk
-    lost: int  # rows dropped before they reached the disk, or removed before they were sent
-    waiting: int  # rows in memory
-    oldest: int  # sequence of the oldest message, 0 without one
+    lost: int  # rows dropped before they reached the disk, or removed from it before they were sent
+    waiting: int  # rows that wait in memory
+    oldest: int  # sequence number of the oldest message; 0 without one
     newest: int
-    acknowledged: int | None  # the stream has all messages up to this sequence; None: unknown so far
+    acknowledged: int | None  # the stream has all messages up to this one; None: not known yet
     stored: int  # size of all stored messages in bytes
-    trouble: str | None  # the disk's present error
+    trouble: str | None  # the disk's present error; None without one
 
 
 class Spool:
@@ -226,7 +226,7 @@ class Spool:
         self.gateway = checked_name("gateway", gateway)
         self._folder = SpoolFolder(Path(folder), gateway)
         self.log = self._folder.log
-        self.on_message: Callable[[], object] = lambda: None  # called in the thread, per message
+        self.on_message: Callable[[], object] = lambda: None  # called in the spool's thread, per message
         self._most = most
         self._units = units or PolledUnits()
         self._stored = sum(message.size for message in self._folder.messages.values())
@@ -236,10 +236,10 @@ class Spool:
         self._first_s: float | None = None  # when the oldest waiting row arrived
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
-        self._undecided: dict[int, int] = {}  # by sequence: rows removed before `acknowledge` was called
+        self._undecided: dict[int, int] = {}  # rows removed before `acknowledge` was called, by sequence
         self._trouble: str | None = None
         self._logged_s: float | None = None
-        self._wanted = 0  # rows that `sync` waits for
+        self._wanted = 0  # number of rows that `sync` waits for
         self._over = False
         if self._folder.damage:
             _log.error("%s", self._folder.damage)
@@ -249,7 +249,7 @@ class Spool:
     # ---- for the poller: any thread ----
 
     def append(self, batch: Batch) -> None:
-        """Copy the rows for the thread to write. It takes microseconds, whatever the disk does."""
+        """Copy the rows, which the spool's thread will write. Takes microseconds, whatever the disk does."""
         columns = batch.columns()
         with self._changing:
             rows = len(columns.time)
@@ -272,7 +272,7 @@ class Spool:
             return self._changing.wait_for(lambda: self._written >= wanted, timeout)
 
     def is_alive(self) -> bool:
-        """Return True until the writing thread has ended."""
+        """Return True while the spool's thread is running."""
         return self._thread.is_alive()
 
     def state(self) -> SpoolState:
@@ -294,7 +294,7 @@ class Spool:
     # ---- for the forwarder: any thread ----
 
     def following(self, sequence: int) -> StoredMessage | None:
-        """Return the first stored message after this sequence; None if there is none."""
+        """Return the first stored message with a sequence number above this one; None if there is none."""
         with self._changing:
             messages = self._folder.messages
             first = max(sequence + 1, next(iter(messages), sequence + 1))
@@ -303,12 +303,12 @@ class Spool:
             )
 
     def stored(self, sequence: int) -> StoredMessage | None:
-        """Return the message with this sequence; None if it was removed."""
+        """Return the message with this sequence number; None if it was removed."""
         with self._changing:
             return self._folder.messages.get(sequence)
 
     def acknowledge(self, sequence: int) -> None:
-        """Note that the stream has all messages up to this sequence: removing these loses no rows."""
+        """Note that the stream has all messages up to this sequence number. Removing these loses no rows."""
         with self._changing:
             self._acknowledged = sequence
             for removed, rows in self._undecided.items():
@@ -316,7 +316,7 @@ class Spool:
                     self._lose(rows, f"the spool is full at {self._most} bytes")
             self._undecided.clear()
 
-    # ---- the thread ----
+    # ---- for the spool's own thread ----
 
     def _run(self) -> None:
         is_over = False
@@ -328,7 +328,7 @@ class Spool:
                 time.sleep(AGAIN_S)
 
     def _write_what_is_due(self) -> bool:
-        """Wait until rows are due, and write them; return True if the thread is to end."""
+        """Wait until rows are due, and write them; return True if the thread must end."""
         with self._changing:
             if not self._is_due():
                 self._changing.wait(self._patience())
@@ -376,7 +376,7 @@ class Spool:
     def _write(self, packed: Packed) -> bool:
         try:
             stored = self._folder.write(packed.data, packed.rows)
-        except Exception as failure:  # polling must continue in any case
+        except Exception as failure:  # whatever fails, polling must continue
             self._note(str(failure))
             return False
         with self._changing:

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
-STATUS = slice(9, 12)  # place of the status in headers such as "NATS/1.0 404 No Messages"
-PROCESSED = 4  # number of arguments of Client._process_msg after the subscription's number
-WHOLE = ("204", "404")  # final statuses: after the last message, and if there are none
+STATUS = slice(9, 12)  # position of the status in headers such as "NATS/1.0 404 No Messages"
+PROCESSED = 4  # number of arguments of Client._process_msg after the subscription id
+WHOLE = ("204", "404")  # statuses that end an answer: after its last message, and without any message
 
 
 class DirectMessage(NamedTuple):
-    """A message of a stream, as a direct get returns it."""
+    """A message in a stream, as a direct get returns it."""
 
     subject: str
     sequence: int
@@ -39,7 +39,7 @@ class Request(NamedTuple):
 
 
 class Gathered:
-    """Collects answers that arrive one by one; `last` gets the status of the final answer."""
+    """Collects answers that arrive one by one; `last` is called with the status of the final answer."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -50,7 +50,7 @@ class Gathered:
             self.last.set_result(status)
 
     async def wait(self, silence_s: float) -> None:
-        """Wait for the final answer, or until no answer has arrived for `silence_s` seconds."""
+        """Wait for the final answer; return earlier if no answer has arrived for `silence_s` seconds."""
         before = -1
         while not self.last.done() and self.count > before:
             before = self.count
@@ -75,14 +75,14 @@ class DirectGet(Gathered):
 
 
 class Replies(Gathered):
-    """The answers to a number of requests, in their order; None for a missing answer."""
+    """The answers to several requests, in the order of the requests; None for a missing answer."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self.found: list[bytes | None] = [None] * number
 
     def take(self, place: int, headers: bytes, data: bytes) -> None:
-        """Keep the first answer to a request."""
+        """Keep the first answer to request number `place`."""
         if self.found[place] is None:
             self.found[place] = data
             self.count += 1
@@ -91,17 +91,17 @@ class Replies(Gathered):
 
 
 class BatchClient(Client):
-    """A nats-py client with an extra subscription for the answers to batches."""
+    """A nats-py client with an additional subscription for the answers to batches."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # function for the answers, by inbox
+        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # takes answers, by inbox
         self._inboxes = ""
         self._batch_sid = 0
         self._subscribing = asyncio.Lock()
 
     async def batch(self, request: Request, get: DirectGet, silence_s: float) -> None:
-        """Collect the result of a direct get. Raises OSError if it is incomplete, and errors of nats-py."""
+        """Collect the answer to a direct get. Raises OSError if it is incomplete, and nats-py's errors."""
         await self._ask([request], [get.take], get, silence_s)
         if not get.last.done():
             raise TimeoutError(f"nothing came for {silence_s:g} s")
@@ -109,7 +109,7 @@ class BatchClient(Client):
             raise OSError(f"it ended with {get.last.result() or 'no status'}")
 
     async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
-        """Send all requests together, and return their answers; None for each late answer."""
+        """Send all requests together and return their answers; None for each answer that is late."""
         replies = Replies(len(requests))
         takers = [partial(replies.take, place) for place in range(len(requests))]
         await self._ask(requests, takers, replies, silence_s)
@@ -142,17 +142,20 @@ class BatchClient(Client):
 
     @property
     def is_reading(self) -> bool:
-        """Return True while nats-py reads. After an internal error it does not, but flushes still work."""
+        """Return True while nats-py reads the connection.
+
+        After an internal error, nats-py stops reading, but its flushes still succeed.
+        """
         return self._reading_task is not None and not self._reading_task.done()
 
     async def _process_pong(self) -> None:
-        """Accept a pong after its flush has timed out: nats-py would fail, and stop reading."""
+        """Accept a pong that arrives after its flush has timed out. nats-py would fail and stop reading."""
         if self._pongs and self._pongs[0].done():
             self._pongs[0] = asyncio.get_running_loop().create_future()
         await super()._process_pong()
 
     async def _process_msg(self, sid: int, *rest: Any) -> None:
-        """Handle an answer without nats-py's queue. `rest` is subject, reply, data and headers."""
+        """Handle an answer without nats-py's queue. `rest` is subject, reply subject, data and headers."""
         if sid != self._batch_sid or len(rest) != PROCESSED:
             await super()._process_msg(sid, *rest)
             return
@@ -174,7 +177,7 @@ class BatchClient(Client):
 def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
     """Return the message with these headers; None if they mark the end of an answer.
 
-    The writer's own headers come first and may have any name; the server's come last.
+    The writer's own headers come first and may have any name. The server's headers come last.
     """
     subject, sequence = last_header(headers, "Nats-Subject"), last_header(headers, "Nats-Sequence")
     if not subject or not (sequence.isascii() and sequence.isdigit()):

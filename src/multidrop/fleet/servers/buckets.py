@@ -1,4 +1,4 @@
-"""Buckets: records by key, replaced only at a known revision, and read without a consumer."""
+"""Buckets: records by key, which are replaced only at a known revision and read without a NATS consumer."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from multidrop.fleet.servers.batch_client import Request
 from multidrop.fleet.servers.connections import ANSWER_S, ServerPath
 from multidrop.fleet.servers.record_shapes import largest, parsed
 
-NONE_YET = 0  # revision of a key without a record
-BATCH = 1000  # records in one read
-FOLLOW_S = 0.2  # between reads of a bucket
-MOST_STRANGE = 1000  # at most this many invalid records of a bucket are logged
+NONE_YET = 0  # revision of a key that has no record
+BATCH = 1000  # limit of records in one read
+FOLLOW_S = 0.2  # time between reads of a bucket
+MOST_STRANGE = 1000  # limit of the invalid records of a bucket that are logged
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
-_UNAVAILABLE = 10008  # no leader, and none can be elected
+_UNAVAILABLE = 10008  # JetStream's error code: no leader, and none can be elected
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -39,9 +39,9 @@ class Record(NamedTuple):
 
 
 class WriteAnswers(NamedTuple):
-    """The records that were replaced, with their new revisions, and the keys of the refused ones.
+    """The records that were replaced, with their new revisions, and the keys of the refused records.
 
-    For any other record the outcome is unknown: read it.
+    The outcome for any other record is unknown, until it is read.
     """
 
     stored: list[Record]
@@ -91,7 +91,7 @@ async def ask(
 
 
 def parsed_answer(data: bytes) -> dict[str, Any]:
-    """Parse an answer that must be a JSON object. Raises Unsure for anything else: the outcome is unknown."""
+    """Return the JSON object in an answer. Raises Unsure for anything else: the outcome is unknown."""
     with suppress(ValueError, RecursionError):
         found = json.loads(data)
         if isinstance(found, dict) and isinstance(found.get("error") or {}, dict):
@@ -108,7 +108,7 @@ def _revision(said: Mapping[str, Any]) -> int:
 
 
 class ServerError(FleetError):
-    """An error reported by JetStream, with its code."""
+    """An error reported by JetStream, with its error code."""
 
     def __init__(self, error: Mapping[str, Any]) -> None:
         super().__init__(f"NATS refuses: {error.get('description', error)}")
@@ -120,15 +120,15 @@ class ServerError(FleetError):
 
 
 class Bucket:
-    """A bucket of records; `path` returns the connection for each request."""
+    """A bucket of records. `path` returns the connection to use for each request."""
 
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
         self.path = path
-        self._strange: set[str] = set()  # keys whose invalid record was logged
+        self._strange: set[str] = set()  # keys whose invalid record was already logged
 
     async def put(self, key: str, value: Any, revision: int) -> int:
-        """Replace the record if it has exactly this revision, and return the new revision.
+        """Replace the record if it has exactly this revision, and return its new revision.
 
         Raises Conflict if it has another revision, Unsure if the outcome is unknown.
         """
@@ -142,9 +142,9 @@ class Bucket:
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
-        """Replace records, each at its given revision.
+        """Replace each record if it still has its given revision.
 
-        All requests are sent together; the server decides on each separately.
+        All requests are sent together. The server decides on each record separately.
         """
         answers = await self.path().request_all([self._put(record) for record in records])
         written = WriteAnswers([], set())
@@ -169,7 +169,7 @@ class Bucket:
         )
 
     async def get(self, key: str) -> Record:
-        """Return the record as the bucket's leader has it; revision 0 if there is none."""
+        """Return the record from the bucket's leader; its revision is 0 if there is none."""
         wanted = {"last_by_subj": self._all_of(key)}
         try:
             said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)
@@ -185,7 +185,7 @@ class Bucket:
         return self._record(subject, _revision(found), data)
 
     async def changes(self, after: int) -> list[Record]:
-        """Return at most 1000 records with a revision above `after`, in order.
+        """Return at most 1000 records whose revision is above `after`, in the order of revisions.
 
         Any server may answer, so some records may be out of date. The server keeps no state between calls.
         """
@@ -195,7 +195,7 @@ class Bucket:
         return [self._record(*message) for message in messages]
 
     async def newest(self, keys: Sequence[str]) -> list[Record]:
-        """Return the records of at most 1000 keys. Any server may answer: some may be out of date."""
+        """Return the records of at most 1000 keys. Any server may answer, so some may be out of date."""
         wanted = {"multi_last": [self._all_of(key) for key in keys]}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
         messages = await self.path().collect(subject, json.dumps(wanted).encode())
@@ -206,7 +206,7 @@ class Bucket:
         return f"$KV.{self.name}.{key}"
 
     def _all_of(self, key: str) -> str:
-        """Return the pattern of all subjects of a key; the newest message among them is its record."""
+        """Return the pattern of all subjects of a key. The newest message among them is its record."""
         return self._subject(key)
 
     def _record(self, subject: str, revision: int, data: bytes) -> Record:
@@ -214,7 +214,7 @@ class Bucket:
         return Record(key, revision, self._value(key, data))
 
     def _value(self, key: str, data: bytes) -> Any:
-        """Return the value; None for an invalid record, which is logged once."""
+        """Return a record's value; None for an invalid record, which is logged once."""
         value, mistake = parsed(self.name, key, data)
         if not mistake:
             self._strange.discard(key)
@@ -230,7 +230,7 @@ OnTake = Callable[[Record | None, Record], object]
 class Follower:
     """The records of a bucket by key, as far as they were read.
 
-    `on_take` is called with the former and the new record whenever a newer one was read.
+    `on_take` is called with the former and the new record whenever a newer record was read.
     """
 
     def __init__(self, bucket: Bucket, on_take: OnTake = lambda *_: None) -> None:
@@ -255,7 +255,7 @@ class Follower:
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
-        """Keep a record unless a newer one is known."""
+        """Keep a record unless a newer one is known; return True if it was kept."""
         before = self.records.get(record.key)
         if before is not None and before.revision >= record.revision:
             return False
@@ -265,10 +265,10 @@ class Follower:
 
 
 class LeaseBucket(Bucket):
-    """A bucket of leases, written in the name of `writer`.
+    """A bucket of leases, to which records are written in the name of `writer`.
 
-    The subject of a record is `<gateway>.<writer>`, so servers can check who writes. The newest record of all
-    writers counts, and each is replaced only at its revision. A gateway may write only in its own name. So a
+    A record's subject is `<gateway>.<writer>`, so servers can check which user writes. The newest record of
+    all writers counts, and is replaced only at its revision. A gateway may write only in its own name. So a
     record that another gateway has written is the end of a session, whatever it contains.
     """
 

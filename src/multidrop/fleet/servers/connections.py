@@ -1,4 +1,4 @@
-"""Connections to NATS: three paths, each to its home server while that one answers."""
+"""Connections to NATS: three paths. Each uses its own home server while that server answers."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectM
 from multidrop.fleet.servers.direct_gets import Spare, first_answer
 from multidrop.printable import masked
 
-OLDEST = (2, 12)  # version; 2.9.10 grants one revision to several claimants (nats-server issue 4320)
+OLDEST = (2, 12)  # minimum version; 2.9.10 grants one revision to several claimants (nats-server issue 4320)
 CONNECT_S = 1.0
-ANSWER_S = 1.0  # time limit of an answer; a lease is renewed twice a second
-PONG_S = 0.7  # time limit of a ping; a slower server is left for another one
+ANSWER_S = 1.0  # time limit of an answer; leases are renewed twice a second
+PONG_S = 0.7  # time limit of a ping; the path leaves a slower server
 KEEP_S = 1.0  # between checks of a connection
-# If the limit of attempts were 0, nats-py would retry a closed port until our own timeout.
+# With a limit of 0 attempts, nats-py would retry a closed port until our own timeout.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class ServerPath:
-    """One connection: to its home server while that one answers, otherwise to any other."""
+    """One connection: to its home server while that server answers, otherwise to any other server."""
 
     def __init__(
         self, urls: Sequence[str], options: Mapping[str, Any] | None = None, pong_s: float = PONG_S
     ) -> None:
         self.urls = [masked(url) for url in urls]  # the first is the home server
-        self._full = dict(zip(self.urls, urls, strict=True))  # the same URLs with users and passwords
+        self._full = dict(zip(self.urls, urls, strict=True))  # URLs with users and passwords, by masked URL
         self.url = ""  # URL of the present server
-        self.others: Sequence[ServerPath] = ()  # the other paths of this process
-        self.spare = Spare()  # shared by all paths of this process
+        self.others: Sequence[ServerPath] = ()  # the other paths of this process, for repeated reads
+        self.spare = Spare()  # budget for repeated reads, shared by all paths of this process
         self._options = options or {}
         self._pong_s = pong_s
         self._client: BatchClient | None = None
         self._denials = Denials()
-        self._trouble = ""  # the failure that was logged last
+        self._trouble = ""  # the failure that was logged last; "" after a success
         self._leaving: set[asyncio.Task[None]] = set()
-        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # function to call, by subject
-        self._standing: dict[str, Subscription] = {}  # subscriptions at the present server, by subject
+        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # the function to call with messages, by subject
+        self._standing: dict[str, Subscription] = {}  # subscriptions at the present server
         self._changing = asyncio.Lock()
 
     @property
@@ -66,7 +66,7 @@ class ServerPath:
 
     @property
     def server_name(self) -> str:
-        """Return the name of the present server; "" if there is none."""
+        """Return the name of the present server; "" if there is no connection."""
         return str(self._client._server_info.get("server_name", "")) if self._client else ""
 
     @property
@@ -77,7 +77,7 @@ class ServerPath:
         return f"{found.major}.{found.minor}"
 
     async def open(self) -> None:
-        """Connect to the first server that answers. Raises FleetError if none does."""
+        """Connect to the first server that answers. Raises FleetError if no server does."""
         failures = []
         for url in self.urls:
             try:
@@ -142,7 +142,7 @@ class ServerPath:
             self._client, self.url = None, ""
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Call a coroutine function with each message of a subject, even after a move to another server."""
+        """Call a coroutine function with each message of a subject, also after a move to another server."""
         self._wanted[subject] = called
         await self._follow_wanted()
 
@@ -154,12 +154,15 @@ class ServerPath:
     async def _follow_wanted(self) -> None:
         async with self._changing:
             if self._client is not None:
-                # If this fails, the path moves to another server soon, which gets all subscriptions.
+                # If this fails, the path soon moves to another server, where it subscribes again.
                 with suppress(NatsError, OSError):
                     await self._bring(self._client, self._standing)
 
     async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
-        """Subscribe a client to the wanted subjects, and end its other subscriptions in `standing`."""
+        """Subscribe a client to the wanted subjects, and end its subscriptions to other subjects.
+
+        `standing` has the client's subscriptions by subject, and is updated.
+        """
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
                 if called := self._wanted.get(subject):  # `unsubscribe` may have removed it
@@ -168,7 +171,7 @@ class ServerPath:
                 await standing.pop(subject).unsubscribe()
 
     async def subscribe_or_raise(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Subscribe. Raises NoRight if these credentials do not allow it."""
+        """Subscribe to a subject. Raises NoRight if our credentials do not allow it."""
         with self._denials.raising(subject):
             await self.subscribe(subject, called)
             client = self._connected()
@@ -185,8 +188,9 @@ class ServerPath:
     ) -> Msg:
         """Send a request, and return the answer.
 
-        Raises Unsure if none comes in time, NoRight if the request or its answer is not allowed, NotDelivered
-        if the request certainly reached no one, and NobodyThere if the server reports that.
+        Raises Unsure if no answer comes in time, NoRight if our credentials do not allow the request or its
+        answer, NotDelivered if the request certainly reached no receiver, and NobodyThere if the server
+        reports that.
         """
         client, denials = self._connected(), self._denials
         before = denials.of_request(subject)
@@ -199,15 +203,15 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages of a direct get; repeat it on the other paths if this one is slow.
+        """Return all messages of a direct get. If this path is slow, repeat the request on the other paths.
 
-        Raises Unsure as `request` does.
+        Raises FleetError as `request` does.
         """
         ways = [self, *(other for other in self.others if other.is_open)]
         return await first_answer(ways, Request(subject, data), self.spare)
 
     async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
-        """Collect the messages of a direct get on this path only. Raises Unsure as `request` does."""
+        """Collect the messages of a direct get on this path only. Raises FleetError as `request` does."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:
@@ -217,7 +221,7 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
 
     async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
-        """Return the answer to each request; None if its outcome is unknown."""
+        """Send all requests together and return the answer to each; None if an outcome is unknown."""
         try:
             return await self._connected().replies(requests, ANSWER_S)
         except (NatsError, OSError) as failure:
@@ -235,7 +239,7 @@ class ServerPath:
 
 
 async def connect(url: str, options: Mapping[str, Any], denials: Denials | None = None) -> BatchClient:
-    """Connect to this server, and to no other of its cluster. Raises FleetError with one sentence."""
+    """Connect to this server only, not to others of its cluster. Raises FleetError with one sentence."""
     refusals: list[Exception] = []
     noted = denials or Denials()
 
@@ -273,9 +277,9 @@ async def _close(client: BatchClient) -> None:
 
 
 def _cut(client: BatchClient) -> None:
-    """Close the socket and end the subscription tasks that nats-py may leave behind.
+    """Close the socket, and end the tasks that nats-py may leave behind.
 
-    nats-py leaves some if it is cancelled or the server is gone. The error of its reading task is ignored.
+    nats-py leaves tasks if it is cancelled or the server is gone. The error of its reading task is ignored.
     """
     for subscription in client._subs.values():
         subscription._stop_processing()
@@ -288,7 +292,7 @@ def _cut(client: BatchClient) -> None:
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
-    """Return three paths. Each has a different home server if there are three URLs."""
+    """Return three paths. With three URLs, each path has a different home server."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
         path.others, path.spare = [other for other in paths if other is not path], paths[0].spare

@@ -1,7 +1,8 @@
-"""Credentials: the identity of a connection, and the servers that it trusts.
+"""Credentials: the identity of a NATS connection, and the servers that it trusts.
 
-A key is an Ed25519 pair (an "nkey"). The secret key is in a file that only its user has; servers have the
-public key. A user's answers go to an inbox named after the public key, which no other user may read.
+A key is an Ed25519 key pair (an "nkey"). The secret key is in a file that only its user has; servers know the
+public key. Answers to a user go to an inbox that is named after its public key, and which no other user may
+read.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ def inbox_of(public: str) -> str:
 def connect_options(
     urls: Sequence[str], credentials: Path | None = None, ca: Path | None = None
 ) -> dict[str, Any]:
-    """Return the options of a connection to these servers.
+    """Return nats-py's options for connecting to these servers.
 
-    `credentials` is a file with a user's secret key, or a .creds file; `ca` is the certificate that signed
-    the servers'. With it, or with tls:// in a URL, TLS starts before anything else is sent. Raises ValueError
-    for an invalid file.
+    `credentials` is a file with a user's secret key, or a .creds file. `ca` is the certificate that has
+    signed the servers' certificates. With `ca`, or with tls:// in a URL, TLS starts before anything else is
+    sent. Raises ValueError for an invalid file.
     """
     options: dict[str, Any] = {}
     if ca is not None or any(url.startswith("tls://") for url in urls):

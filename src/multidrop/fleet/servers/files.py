@@ -24,14 +24,16 @@ from multidrop.fleet.servers.rights import accounts, rights_of
 from multidrop.printable import masked
 
 CLUSTER = "multidrop"
-ROUTE_PORTS = 2000  # added to a server's port for the port of its routes, as in 4222 and 6222
+ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
 MOST_PORTS = 65535
 STORE = Path("/var/lib/nats")
-PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: detect a dead route after 3 s instead of 60 to 90 s
+PINGS = (
+    'ping_interval: "1s", ping_max: 2'  # for routes: a dead one is noticed after 3 s, not after 60 to 90 s
+)
 
 
 class TlsFiles(NamedTuple):
-    """Paths on a server: its certificate, its key, and the certificate that signed those of all servers."""
+    """Paths on a server: its certificate, its key, and the issuer's certificate for all servers."""
 
     cert: Path
     key: Path
@@ -47,12 +49,12 @@ class ServerAddress(NamedTuple):
 
     @property
     def routes(self) -> int:
-        """Return the port for the other servers."""
+        """Return the port on which this server accepts routes from the others."""
         return self.port + ROUTE_PORTS
 
 
 def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
-    """Return the servers at these URLs. Raises ValueError for a URL without a usable port."""
+    """Return the servers at these URLs. Raises ValueError for a URL without a valid port."""
     found = []
     for number, url in enumerate(urls, 1):
         parts = urlsplit(url)
@@ -71,7 +73,7 @@ def write_files(
 ) -> list[Path]:
     """Write all files, and return their paths. Secrets are readable only by their owner (mode 0600).
 
-    Raises ValueError for a mistake before anything is written.
+    Raises ValueError for an invalid argument, before any file is written.
     """
     servers = addresses_of(urls)
     rights = rights_of(gateways)
@@ -101,7 +103,7 @@ def _public(path: Path, seed: str) -> str:
 
 
 def _write_secret(path: Path, text: str) -> None:
-    """Write a file that is never readable by others, not even for a moment."""
+    """Write a file that other users can never read, not even for a moment."""
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -1,11 +1,11 @@
 """Leaders of buckets: each bucket is led by another server, so that one failed server stops only one path.
 
-A server that is cut off from the others starts an election every 4 to 9 s, each time in a newer term, though
-the others do not hear it. When it returns, a leader with an older term steps down, and the bucket has no
-leader for 4 to 9 s. If that happens to two of the lease buckets, no line is polled. Handing over a leadership
-also starts a newer term, and takes an instant. So while a server is silent, leadership of the lease buckets
-is handed over more often than that server starts elections, and its term stays older. Which gateway may poll
-depends only on revisions, whichever server leads.
+A server that is cut off starts an election every 4 to 9 s, each in a newer term of Raft, although the others
+do not hear it. When it returns, a leader with an older term steps down, and its bucket has no leader for 4 to
+9 s. If that happens to two lease buckets, no line is polled. A hand-over of the leadership also starts a
+newer term, but takes only an instant. So while a server is silent, the lease buckets are handed over more
+often than that server starts elections. Its terms then stay older. Which server leads has no influence on
+which gateway may poll: only revisions decide that.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from multidrop.fleet.servers.buckets import ask
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.supervisor import end_tasks
 
-SILENT_NS = 2_000_000_000  # without an answer; a follower answers its leader once a second
+SILENT_NS = 2_000_000_000  # time without contact; a follower contacts its leader once a second
 
 
 class Replica(NamedTuple):
@@ -32,27 +32,30 @@ class Replica(NamedTuple):
     name: str
     is_current: bool
     is_offline: bool
-    active_ns: int  # time since the leader heard from it; 0 for never
+    active_ns: int  # ns since the leader last heard from this server; 0 for never
 
     @property
     def is_ready(self) -> bool:
-        """Return True if this server could lead now."""
+        """Return True if this server could become leader now."""
         return self.is_current and not self.is_offline
 
     @property
     def is_silent(self) -> bool:
-        """Return True if the leader never heard this server, or not for 2 s. A lagging server is heard."""
+        """Return True if the leader never heard from this server, or not for 2 s.
+
+        A server that lags, but was heard, is not silent.
+        """
         return not self.is_current and not 0 < self.active_ns < SILENT_NS
 
 
 class Cluster(NamedTuple):
-    """A bucket's leader, "" for none, and its followers."""
+    """A bucket's leader ("" for none) and its followers."""
 
     leader: str = ""
     followers: tuple[Replica, ...] = ()
 
     def home_of(self, place: int) -> str:
-        """Return the server that should lead bucket number `place`; servers take turns in order of name."""
+        """Return the server that should lead bucket number `place`: servers take turns, sorted by name."""
         servers = sorted([self.leader, *(follower.name for follower in self.followers)])
         return servers[place % len(servers)]
 
@@ -63,14 +66,14 @@ class Cluster(NamedTuple):
 
     @property
     def ready(self) -> list[str]:
-        """Return the followers that could lead now."""
+        """Return the followers that could become leader now."""
         return [follower.name for follower in self.followers if follower.is_ready]
 
 
 def cluster_of(info: Mapping[str, Any], path: ServerPath) -> Cluster:
-    """Return the cluster in a stream's state: the present server alone if the stream is not replicated.
+    """Return the leader and the followers of a stream, from its state in `info`.
 
-    Raises Unsure for an invalid state.
+    If the stream is not replicated, the present server is the leader. Raises Unsure for an invalid state.
     """
     if "cluster" not in info:
         return Cluster(path.server_name)
@@ -94,20 +97,20 @@ SOON_S = 0.4  # time limit for leaders' answers, which usually take some millise
 
 
 async def known_cluster(path: ServerPath, bucket: str) -> Cluster:
-    """Return the servers of a bucket; a cluster without a leader if none answers."""
+    """Return a bucket's leader and followers; a cluster without a leader if no server answers."""
     with suppress(FleetError):
         return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"), path)
     return Cluster()
 
 
 async def have_leaders(path: ServerPath) -> bool:
-    """Return True if lines can be claimed: enough buckets of masters have a leader that answers."""
+    """Return True if lines can be claimed: two of the three master buckets have a leader."""
     clusters = await asyncio.gather(*(known_cluster(path, bucket) for bucket in names.OWNERS))
     return sum(bool(cluster.leader) for cluster in clusters) >= NEEDED
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
-    """Return the servers of those lease and master buckets whose leader answers within SOON_S."""
+    """Return the clusters of those lease and master buckets whose leader answers within SOON_S."""
     buckets = (*names.LEASES, *names.OWNERS)
     looks = [asyncio.create_task(known_cluster(path, bucket)) for bucket in buckets]
     try:
@@ -122,7 +125,7 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Ask each leader other than the home server to step down in its favour; return how many were asked."""
+    """Hand each bucket over to its home server if that is a ready follower; return how many."""
     moved = 0
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):
@@ -135,20 +138,20 @@ async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) 
 
 
 async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
-    """Ask the leader of a bucket to step down in favour of this server."""
+    """Ask the leader of a bucket to step down in favour of this server. Failures are ignored."""
     with suppress(FleetError):
         wanted = {"placement": {"preferred": server}}
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
 
 
-HAND_OVER_S = 3.0  # time between hand-overs of a bucket: less than the shortest time between two elections
+HAND_OVER_S = 3.0  # time between hand-overs of a bucket: shorter than between two elections
 SILENT_FOR_S = 60.0  # a server that is silent for longer is ignored
-HANDED_S = 1.0  # time limit of a hand-over, which takes 0.03 to 0.3 s
+HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
 
 
 class LeaseTerms:
-    """Keeps the terms of the lease buckets newer than a silent server's, by hand-overs."""
+    """Keeps the Raft terms of the lease buckets newer than those of a silent server, by hand-overs."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -156,7 +159,7 @@ class LeaseTerms:
         self._handed_at: dict[str, float] = {}  # time of the last hand-over, by bucket
 
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
-        """Hand over the lease buckets that are due, and return True if any was.
+        """Hand over the lease buckets that are due, and return True if any was due.
 
         Stop after a hand-over that fails, so that at most one bucket waits for an election because of this.
         """
@@ -196,13 +199,13 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
     return False
 
 
-KEEP_S = 0.4  # leaders report a silent server after 2 s; that server starts elections after 4 s
+KEEP_S = 0.4  # leaders notice a silent server after 2 s; it starts elections after 4 s
 
 
 async def keep_leaders(
     path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
 ) -> None:
-    """Manage the buckets' leaders forever, as long as `is_ours()` returns True."""
+    """Manage the buckets' leaders forever, whenever `is_ours()` returns True."""
     terms = LeaseTerms(clock)
     while True:
         await asyncio.sleep(KEEP_S)

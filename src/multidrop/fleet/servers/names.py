@@ -1,4 +1,4 @@
-"""Names in NATS: buckets and subjects, and the gateways and lines in them."""
+"""Names in NATS: of buckets and subjects, and of the gateways and lines in them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def checked_name(kind: str, name: str) -> str:
-    """Return the name. Raises ValueError if it cannot be part of a subject."""
+    """Return this name. Raises ValueError if it cannot be one token of a NATS subject."""
     if not isinstance(name, str) or not is_name(name):
         suggestion = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name)).strip("-") or f"{kind}-1"
         raise ValueError(
@@ -24,38 +24,38 @@ def checked_name(kind: str, name: str) -> str:
 
 
 def is_name(text: str) -> bool:
-    """Return True if the text can be one part of a subject."""
+    """Return True if the text can be one token of a NATS subject."""
     return _NAME.fullmatch(text) is not None
 
 
 @functools.lru_cache(1 << 16)
 def owner_buckets(line: str) -> tuple[str, ...]:
-    """Return the buckets with the records of a line's master, in writing order."""
+    """Return the buckets that have the records of a line's master, in the order of writing."""
     first = zlib.crc32(line.encode()) % len(OWNERS)
     return OWNERS[first:] + OWNERS[:first]
 
 
 def is_inbox(subject: str) -> bool:
-    """Return True if a requester may wait for an answer on this subject, because it is an inbox.
+    """Return True if this is an inbox, on which a requester may wait for an answer.
 
-    Servers let a responder answer on any subject that the requester names, even one that the requester has no
-    right to, such as the subject of a plant's record. So answer only on inboxes.
+    Servers let a responder answer on any subject that the requester names. That may be a subject to which the
+    requester itself may not publish, such as that of a plant's record. So answer only on inboxes.
     """
     return subject.startswith(("_INBOX.", "_INBOX_"))
 
 
 def command_subject(line: str) -> str:
-    """Return the subject for asking a line's master for an offer."""
+    """Return the subject on which a line's master accepts requests for offers."""
     return f"cmd.{line}"
 
 
 def do_subject(gateway: str, run: str) -> str:
-    """Return the subject for the tokens of offers that one run of a gateway's process has made."""
+    """Return the subject for the tokens of offers that this process (`run`) of the gateway has made."""
     return f"do.{gateway}.{run}"
 
 
 def stop_subject(line: str) -> str:
-    """Return the subject for stops to a line's master."""
+    """Return the subject on which a line's master accepts stops."""
     return f"stop.{line}"
 
 

@@ -1,7 +1,7 @@
-"""Plant store: the plant's lines in the bucket `plant`, by name, with their family files.
+"""Plant store: the plant's lines, with their family files, in the bucket `plant`, by line name.
 
-A line's record holds its table of the plant file and the text of the family files that it uses, so a gateway
-needs only the records of the lines that it polls.
+A line's record holds the line's table of the plant file, and the text of the family files that it uses. So a
+gateway needs only the records of the lines that it polls.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _FLEET = {"may": Key(dict, "[fleet.may], a table")}
 def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     """Return the plant in a file, and the record of each line by name.
 
-    Raises PlantError for mistakes in the file, and ValueError for a plant that a fleet cannot poll: a port
-    that is not at a network address, a line's name that cannot be part of a subject, or a family in Python.
+    Raises PlantError for mistakes in the file, and ValueError for a plant that a fleet cannot poll. A port
+    must be a network address, a line's name must be valid in a subject, and no family may be a Python file.
     """
     plant = Plant.load(path)
     document = tomllib.loads(path.read_text("utf-8"))
@@ -48,7 +48,7 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
 
 
 def _lists(table: Any, plant: Plant) -> dict[str, list[str]]:
-    """Return the lists of [fleet.may]: registers and verbs that may be commanded through the fleet."""
+    """Return the entries of [fleet.may]: registers and verbs that may be commanded through the fleet."""
     place = TomlPlace(plant.path, ("[fleet]",))
     may = place.check(table, _FLEET).get("may", {})
     inner = place.of_file(plant.path, "[fleet.may]")
@@ -81,7 +81,7 @@ def _description(table: Mapping[str, Any], folder: Path, may: Mapping[str, Seque
 
 
 def _family_files(folder: Path, model: str) -> dict[str, str]:
-    """Return a family's file, and the CSV tables beside it that it names."""
+    """Return the text of a family's file, and of the CSV tables beside it that it names, by file name."""
     family = (folder / model).resolve()
     text = family.read_text("utf-8")
     found = {model: text}
@@ -94,9 +94,9 @@ def _family_files(folder: Path, model: str) -> dict[str, str]:
 
 
 async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
-    """Store these lines as the plant, and return how many are new, changed, removed and kept.
+    """Store these lines as the plant, and return how many are new, changed, removed and unchanged.
 
-    An unchanged line keeps its revision, so polling it continues without a break.
+    An unchanged line keeps its record's revision, so it is polled without a break.
     """
     follower = Follower(bucket)
     await follower.look()
@@ -117,7 +117,7 @@ async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
 
 
 def line_of(record: Record, folder: Path) -> PlantLine:
-    """Return the line that a record describes. Write its files into the line's own folder in `folder`.
+    """Return the line that a record describes. Its files are written into the line's own folder in `folder`.
 
     Raises ValueError for an invalid record.
     """
@@ -129,13 +129,13 @@ def line_of(record: Record, folder: Path) -> PlantLine:
             raise ValueError(f"line {record.key}: a file {name!r} outside of its folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).write_text(text, "utf-8")
-    plant = home / "line.plant"  # no family file has this suffix
+    plant = home / "line.plant"  # a suffix that no family file has
     plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
     return Plant.load(plant).lines[0]
 
 
 def _toml(value: Any) -> str:
-    """Return a value as TOML on one line."""
+    """Return a value in TOML's notation, on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_toml(str(key))} = {_toml(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list):

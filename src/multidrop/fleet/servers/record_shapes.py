@@ -1,6 +1,7 @@
-"""Shapes of a fleet's records: what each must contain before it is used. Pure.
+"""Shapes of a fleet's records: what a record must contain before it is used. No I/O.
 
-Any user with write access to a bucket can write any bytes. Invalid records are ignored, and affect no others.
+Any user with write access to a bucket can write any bytes. An invalid record is ignored, and does not affect
+other records.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
     **dict.fromkeys(names.OWNERS, OWNER),
     names.PLANT: LINE,
 }
-SMALL, LARGE = 1 << 14, 1 << 20  # bytes of a record; a line's record has its family files
+SMALL, LARGE = 1 << 14, 1 << 20  # limits of a record's bytes; a line's record contains its family files
 _KINDS: Mapping[Any, str] = {
     **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
     **{int | None: "a whole number or null", float | None: "a number or null", str | None: "a text or null"},
@@ -31,12 +32,12 @@ _KINDS: Mapping[Any, str] = {
 
 
 def largest(bucket: str) -> int:
-    """Return the size limit of a record of this bucket in bytes."""
+    """Return the limit of a record's size in this bucket, in bytes."""
     return LARGE if bucket == names.PLANT else SMALL
 
 
 def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
-    """Return the value of a record and "", or None and why it is invalid. A removed record is None and ""."""
+    """Return a record's value and "", or None and why it is invalid. A removed record is None and ""."""
     if not data:
         return None, ""
     if not names.is_name(key):
@@ -44,7 +45,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
     if len(data) > largest(bucket):
         return None, f"it has {len(data)} bytes, and {largest(bucket)} are the most"
     try:
-        value = json.loads(data.decode())  # faster than json.loads, which detects the encoding
+        value = json.loads(data.decode())  # faster than loads(data), which detects the encoding
     except (ValueError, RecursionError):
         return None, "not JSON"
     mistake = misshapen(value, SHAPES.get(bucket, {})) or _CHECKS.get(bucket, _nothing)(key, value)
@@ -52,7 +53,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
 
 
 def misshapen(value: Any, shape: Mapping[str, Any]) -> str:
-    """Return how a value differs from a shape; "" if it fits. It may have further entries."""
+    """Return how a value differs from a shape; "" if it fits. Further entries are allowed."""
     if not isinstance(value, dict):
         return "not a table"
     for name, kind in shape.items():

@@ -41,11 +41,11 @@ API = "$JS.API"
 
 
 class UserRights(NamedTuple):
-    """Subjects that a user may publish and subscribe to, besides its inbox."""
+    """The subjects that a user may publish and subscribe to, besides its inbox."""
 
     publish: Sequence[str]
     subscribe: Sequence[str] = ()
-    answers: bool = False  # may answer requests on the requester's inbox
+    answers: bool = False  # may answer requests, on the requester's inbox
 
 
 def _api(request: str, *buckets: str) -> list[str]:
@@ -118,7 +118,7 @@ OTHERS: Mapping[str, Callable[[str], UserRights]] = {
 
 
 def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
-    """Return the rights of each user of a fleet with these gateways, by name.
+    """Return the rights of each user of a fleet with these gateways, by user name.
 
     Raises ValueError for a name that is invalid or used twice.
     """
@@ -133,10 +133,10 @@ def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
 
 
 STORE = "multidrop"
-LAST_ANSWER = "10s"  # the server forwards several answers of a request for this long
-ANSWER = '{ max: 1, expires: "1m" }'  # a stop of many drives may take long
+LAST_ANSWER = "10s"  # the server forwards further answers to a request for this long
+ANSWER = '{ max: 1, expires: "1m" }'  # limits of an answer; a stop of many drives may take long
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
-_MANY = "$JS.API.DIRECT.GET."  # requests with several answers
+_MANY = "$JS.API.DIRECT.GET."  # requests that get several answers
 # Without this import, a server answers every JetStream request in a user's account with "not enabled".
 # No user has the right to send this request.
 _INFO = "$JS.API.INFO"
@@ -172,7 +172,7 @@ def accounts(rights: Mapping[str, UserRights], public: Mapping[str, str]) -> Ite
 
 
 def account_of(user: str) -> str:
-    """Return the name of a user's account, which always differs from the store's."""
+    """Return the name of a user's NATS account, which always differs from the store's."""
     return f"{STORE}-{user}"
 
 
@@ -190,7 +190,7 @@ def _import(kind: str, account: str, subject: str) -> str:
 
 
 def _shared(some: Iterable[str], others: Iterable[str]) -> Iterator[str]:
-    """Yield each subject that matches an entry of both lists; * matches one word."""
+    """Yield each subject that matches an entry of both lists. A * matches one token."""
     for one in some:
         for other in others:
             words = list(zip(one.split("."), other.split("."), strict=False))

@@ -1,4 +1,4 @@
-"""Setup: creates a fleet's buckets and streams after testing the servers."""
+"""Setup: tests a fleet's servers, then creates its buckets and streams."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
-ROUNDS = 40  # of `_contest`; nats-server 2.9.10 fails in the first few
+ROUNDS = 40  # rounds of `_contest`; nats-server 2.9.10 fails in the first few
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
@@ -29,9 +29,9 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
-    """Create missing buckets, and return a summary. Raises FleetError with one sentence.
+    """Create the missing buckets, and return a summary. Raises FleetError with one sentence.
 
-    Existing buckets stay as they are. Creating some requires all servers to answer.
+    Existing buckets stay as they are. Creating a bucket requires answers of all servers.
     """
     await open_all(paths)
     reached = min(MOST_REPLICAS, len({path.server_name for path in paths}))
@@ -54,7 +54,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
 
 
 async def open_all(paths: Sequence[ServerPath]) -> None:
-    """Connect all paths. Raises FleetError if no server answers, or one is too old."""
+    """Connect all paths. Raises FleetError if no server answers, or if a server is too old."""
     results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
     failures = [result for result in results if isinstance(result, Exception)]
     too_old = [failure for failure in failures if isinstance(failure, TooOld)]
@@ -63,7 +63,7 @@ async def open_all(paths: Sequence[ServerPath]) -> None:
 
 
 async def check_buckets(path: ServerPath) -> None:
-    """Raise FleetError if these servers have no fleet or no quorum. Waits for an election in progress."""
+    """Raise FleetError if these servers have no fleet, or no quorum. Waits for an election in progress."""
     info = None
     for bucket in names.BUCKETS:
         info = await _retried(path, partial(_info, path, f"KV_{bucket}"))
@@ -73,9 +73,9 @@ async def check_buckets(path: ServerPath) -> None:
 
 
 def check_clock(path: ServerPath, server_time: Any) -> None:
-    """Warn if the clocks of this computer and the server differ: leases do not depend on them, samples do.
+    """Warn if this computer's clock differs from the server's: leases do not depend on clocks, samples do.
 
-    Raises Unsure for an invalid time.
+    Raises Unsure if the server's time is invalid.
     """
     try:
         apart = time.time() - datetime.fromisoformat(server_time).timestamp()
@@ -102,13 +102,13 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
 
 
 async def _kept_on(path: ServerPath) -> int:
-    """Return the least number of servers that store one of the buckets; 0 if a bucket is missing."""
+    """Return the number of servers that store the least replicated bucket; 0 if a bucket is missing."""
     infos = [await _retried(path, partial(_info, path, f"KV_{bucket}")) for bucket in names.BUCKETS]
     return min(1 + len(cluster_of(info, path).followers) if info else 0 for info in infos)
 
 
 async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
-    """Return the state of a stream, None if there is none. Raises Unsure if it has no leader."""
+    """Return the state of a stream; None if there is no such stream. Raises Unsure if it has no leader."""
     try:
         info = await ask(path, f"STREAM.INFO.{stream}")
     except ServerError as failure:
@@ -131,9 +131,9 @@ async def _remove(path: ServerPath, stream: str) -> None:
 
 
 async def _retried(path: ServerPath, attempt: Callable[[], Awaitable[T]]) -> T:
-    """Repeat an attempt for up to WAIT_S: servers elect a leader, or a change is in progress.
+    """Repeat an attempt for up to WAIT_S, because an election or another change may be in progress.
 
-    Raises NoRight, the last refusal of the servers, or FleetError if they have no quorum.
+    Raises NoRight or the servers' last refusal; FleetError if they have no quorum.
     """
     loop = asyncio.get_running_loop()
     ends = loop.time() + WAIT_S
