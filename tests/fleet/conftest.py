@@ -1,4 +1,4 @@
-"""Real NATS servers for each module, with or without a fleet's buckets; tests may be coroutines."""
+"""Real NATS servers for each module, with or without a fleet's buckets. Tests may be coroutine functions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 if not os.environ.get("CI") and not all(map(find_spec, ("nats", "nkeys", "pyarrow", "starlette"))):
-    collect_ignore_glob = ["*"]  # an extra is not installed; CI must have it
+    collect_ignore_glob = ["*"]  # a library of the extra `fleet` is missing; in CI that is an error
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Ignore remains of nats-py's connections to a dead server, which the garbage collector reports."""
+    """Ignore warnings about nats-py's connections to a dead server, which the garbage collector finds."""
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"))
@@ -40,7 +40,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 @pytest.fixture(scope="module")
 def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Return three servers without a fleet."""
+    """Return three servers without a fleet's buckets."""
     from nats_clusters import cluster
 
     with cluster(tmp_path_factory.mktemp("nats")) as running:
@@ -49,7 +49,7 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Return one server without a fleet."""
+    """Return one server without a fleet's buckets."""
     from nats_clusters import cluster
 
     with cluster(tmp_path_factory.mktemp("nats"), 1) as server:

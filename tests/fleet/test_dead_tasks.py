@@ -1,4 +1,4 @@
-"""Required tasks and threads of a fleet's gateway: if one ends, it is logged, and the gateway ends.
+"""Tasks and threads that a fleet's gateway needs: if one ends, that is logged, and the gateway shuts down.
 
 A failure on one line affects only that line.
 """
@@ -49,11 +49,11 @@ STARTERS = {
     *("Thread", "ThreadPoolExecutor", "TaskGroup", "Timer"),
     *("create_task", "ensure_future", "to_thread", "run_in_executor"),
 }
-WAITED_FOR = {  # modules that start tasks and threads, and themselves wait for them
+WAITED_FOR = {  # modules that start tasks or threads, and wait for them themselves
     *("connections", "direct_gets", "fleet_commands", "forwarder", "gateway", "hub", "leaders"),
     *("line_keeper", "member", "observer", "owner_records", "page_part", "servers", "shares"),
-    *("command_log", "fleet_lines"),  # whose callers wait for their threads
-    "spool",  # whose thread the gateway watches
+    *("command_log", "fleet_lines"),  # callers in other modules wait for these threads
+    "spool",  # the gateway checks this thread
 }
 MEMBER = (
     *(f"path {at}" for at in (1, 2, 3)),
@@ -66,14 +66,14 @@ THREADS = ("multidrop spool", "multidrop poller", "multidrop batches")
 
 
 class Ill(Exception):
-    """Raised by code under test."""
+    """An unexpected exception in the code under test."""
 
 
 async def fail(*details: object) -> None:
     raise Ill("a mistake")
 
 
-def test_no_other_module_of_the_fleet_starts_a_task_or_a_thread() -> None:
+def test_only_known_modules_of_the_fleet_start_tasks_or_threads() -> None:
     found = set()
     for path in Path(multidrop.fleet.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -89,7 +89,10 @@ def test_no_other_module_of_the_fleet_starts_a_task_or_a_thread() -> None:
 def gateway(
     fleet: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[Callable[[FleetGateway], Awaitable[object]]], None]]:
-    """A function that runs a gateway of real servers until its end, and calls another once it is ready."""
+    """Return a function that runs a gateway on real servers until it ends.
+
+    The function calls its argument with the gateway once that is ready.
+    """
 
     def run(act: Callable[[FleetGateway], Awaitable[object]]) -> None:
         async def main() -> None:
@@ -104,7 +107,7 @@ def gateway(
             try:
                 await asyncio.wait_for(running, 60)
             finally:
-                assert made.member.lease.session == 0  # it was ended: others take over at once
+                assert made.member.lease.session == 0  # ended, so other gateways take over immediately
                 assert [one.get_name() for one in asyncio.all_tasks() if one.get_name() in TASKS] == []
 
         asyncio.run(main())
@@ -112,7 +115,7 @@ def gateway(
     return run
 
 
-def test_the_list_of_all_tasks_and_threads(gateway: Any) -> None:
+def test_a_gateway_runs_exactly_the_listed_tasks_and_threads(gateway: Any) -> None:
     async def look(made: FleetGateway) -> None:
         assert set(supervisor().kept) == set(TASKS)
         assert supervisor().watched == ["spool"]
@@ -131,9 +134,9 @@ def test_a_task_that_is_killed_is_logged_and_ends_the_gateway(
 ) -> None:
     async def kill(made: FleetGateway) -> None:
         task = supervisor().kept[name]
-        while not task.done():  # wait_for of Python 3.11 may swallow one
+        while not task.done():  # Python 3.11's wait_for may swallow one cancellation
             task.cancel()
-            await asyncio.wait([task], timeout=5)  # a second one would interrupt its cleanup
+            await asyncio.wait([task], timeout=5)  # a second cancellation would interrupt the cleanup
 
     with pytest.raises(Ended, match=f"{name} has ended: it was cancelled"):
         gateway(kill)
@@ -152,7 +155,7 @@ def test_the_exception_of_a_task_is_logged_with_its_cause(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_spool_whose_thread_ends_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_the_spools_thread_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def leave() -> bool:
         raise SystemExit
 
@@ -165,7 +168,7 @@ def test_a_spool_whose_thread_ends_ends_the_gateway(gateway: Any, monkeypatch: p
         gateway(kill)
 
 
-def test_a_poller_that_fails_ends_the_gateway(gateway: Any) -> None:
+def test_failed_polling_ends_the_gateway(gateway: Any) -> None:
     async def kill(made: FleetGateway) -> None:
         made.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
 
@@ -174,7 +177,7 @@ def test_a_poller_that_fails_ends_the_gateway(gateway: Any) -> None:
 
 
 def test_a_failed_subscription_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stop would not be heard."""
+    """Otherwise the gateway would miss stops."""
 
     async def kill(made: FleetGateway) -> None:
         monkeypatch.setattr(made.paths[1], "subscribe", fail)
@@ -185,14 +188,14 @@ def test_a_failed_subscription_ends_the_gateway(gateway: Any, monkeypatch: pytes
 
 
 async def test_a_commander_reports_the_end_of_its_connection(fleet: Cluster, tmp_path: Path) -> None:
-    """The page then reconnects."""
+    """The page then connects again."""
     async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
         commands._keeping[1].cancel()
         with pytest.raises(Ended, match="a connection to the fleet has ended"):
             await asyncio.wait_for(commands.stay(), 60)
 
 
-# ---- failures that end no gateway ----
+# ---- failures after which the gateway continues ----
 
 
 async def test_a_failing_forwarder_is_logged_and_retries(
@@ -219,7 +222,7 @@ async def test_a_failing_forwarder_is_logged_and_retries(
     assert "Traceback" in caplog.text
 
 
-def test_a_spool_continues_after_unexpected_failures(
+def test_a_spool_continues_to_write_after_unexpected_failures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.0)
@@ -259,7 +262,7 @@ async def test_a_failed_start_of_compaction_is_retried(
     assert "no process is left" in caplog.text
 
 
-def test_metrics_that_fail_are_an_error_of_the_server(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_metrics_are_answered_with_a_server_error(caplog: pytest.LogCaptureFixture) -> None:
     def families() -> Any:
         raise Ill("a mistake")
 
@@ -268,7 +271,7 @@ def test_metrics_that_fail_are_an_error_of_the_server(caplog: pytest.LogCaptureF
     assert "Ill: a mistake" in caplog.text
 
 
-def test_a_stop_that_fails_in_the_desk_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_raises_in_the_desk_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with desks(tmp_path) as desk:
         monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
@@ -277,11 +280,11 @@ def test_a_stop_that_fails_in_the_desk_is_answered(tmp_path: Path, monkeypatch: 
     assert "it is not known whether the stop was sent" in answer.text
 
 
-# ---- one line ----
+# ---- failures on one line ----
 
 
 class Taken:
-    """The lines of a gateway, with a simulated one to take."""
+    """The lines of a gateway, with a simulated line to take."""
 
     def __init__(self, port: str, folder: Path) -> None:
         self.mastership = Mastership()
@@ -310,7 +313,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
 async def test_a_line_that_fails_to_open_is_not_polled(
     taken: Taken, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
-    """Another gateway may be its master before long."""
+    """Another gateway may soon be the line's master."""
     add_line = taken.lines.poller.add_line
 
     def add(described: Any) -> None:
@@ -323,7 +326,7 @@ async def test_a_line_that_fails_to_open_is_not_polled(
     assert taken.lines.poller.buses == {}
 
 
-async def test_a_line_that_cannot_be_opened_to_commands_is_not_polled(
+async def test_a_line_whose_commands_cannot_be_received_is_not_polled(
     taken: Taken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
@@ -336,7 +339,7 @@ async def test_a_line_that_cannot_be_opened_to_commands_is_not_polled(
     assert taken.lines.poller.buses == {}
 
 
-async def test_lines_are_closed_though_polling_has_failed(taken: Taken) -> None:
+async def test_lines_are_closed_after_polling_has_failed(taken: Taken) -> None:
     await taken.lines.take(LINE, taken.description)
     taken.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
     await taken.lines.let_go(LINE)
@@ -344,7 +347,7 @@ async def test_lines_are_closed_though_polling_has_failed(taken: Taken) -> None:
     taken.lines.poller._is_failure_raised = True
 
 
-def test_lines_on_which_polling_fails_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_with_failing_polls_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failures = {"hall": "Ill: of its class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures))
 

@@ -1,7 +1,7 @@
-"""Drills with real processes, judged by the lines' records: no overlap, and short silences.
+"""Drills with real processes, judged by the lines' records: no overlap of masters, and only short silences.
 
-Processes are killed or suspended; in namespaces, cables are cut and whole machines die.
-`python -m bench.questions.fleet_drills --rounds 40` does more.
+Processes are killed or suspended. In network namespaces, cables are cut and whole machines die. `python -m
+bench.questions.fleet_drills --rounds 40` does more drills.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fleet_drills import (
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
-# One of each kind; the bench does them all. Suspended gateways have their own test below.
+# One drill of each kind; the bench does all. A suspended gateway has its own test below.
 DONE = (
     "gateway killed",
     "gateway and node killed",
@@ -45,12 +45,12 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
 def test_a_suspended_gateway_is_killed_and_its_lines_are_taken_over(drill: FleetDrill) -> None:
     stopped: list[subprocess.Popen[str]] = []
     gaps = drill.judge(lambda: stopped.append(drill.stop_gateway()), seconds=1.0)
-    assert max(gaps.values()) > 2.0  # it had lines, and they were taken over
+    assert max(gaps.values()) > 2.0  # the gateway had lines, and others took them over
     assert stopped[0].wait(PATIENCE_S) == -signal.SIGKILL
     assert drill.hall.overlaps() == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # of a service; of a closed terminal
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # service manager, closed terminal
 def test_a_drained_gateway_releases_all_its_lines(drill: FleetDrill, number: int) -> None:
     drill.settle()
     drill.hall.reset()
@@ -68,7 +68,7 @@ def test_no_drill_makes_two_masters(drill: FleetDrill, deed: str) -> None:
     assert drill.hall.overlaps() == 0
 
 
-# ---- cut cables, with each gateway and node in its own namespace ----
+# ---- cut cables, with each gateway and each server in its own namespace ----
 
 CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody")
 
@@ -107,12 +107,12 @@ def test_a_gateway_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill)
         assert gateway()["session"] == session
     finally:
         place.heal_to_here(host)
-        cut_drill.gateways["gw-a"].kill()  # one that is started tries all lines at once
+        cut_drill.gateways["gw-a"].kill()  # a restarted gateway tries to open all lines immediately
         cut_drill.gateways["gw-a"].wait()
     assert cut_drill.hall.overlaps() == 0
 
 
-# ---- machines with a gateway and a node each ----
+# ---- machines with one gateway and one server each ----
 
 
 @pytest.fixture(scope="module")
@@ -121,10 +121,10 @@ def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineD
         yield found
 
 
-def test_no_line_waits_for_an_election_where_a_gateway_dies_with_the_node_on_its_machine(
+def test_takeover_from_a_dead_machine_waits_for_no_election(
     machine_drill: MachineDrill,
 ) -> None:
-    """All its lines' records have leaders on other machines: `settle` waits for that."""
+    """The dead gateway's line records have leaders on other machines: `settle` waits for that."""
     machine_drill.settle()
     before = machine_drill.status()["lines"]
     machine_drill.judge(machine_drill.kill_machine)

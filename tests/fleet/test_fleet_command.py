@@ -1,4 +1,4 @@
-"""`multidrop fleet`: one sentence for each mistake, and its output about a fleet."""
+"""`multidrop fleet`: each mistake is reported in one sentence; output about a fleet."""
 
 from __future__ import annotations
 
@@ -74,17 +74,17 @@ def test_no_server_is_one_sentence(run: Run, nobody: str, words: list[str]) -> N
 
 
 @pytest.mark.parametrize("words", [["stop", "pump-1"], ["write", "pump-1", "frequency", "20", "--yes"]])
-def test_a_user_without_a_home_can_stop(
+def test_without_a_home_folder_a_stop_is_still_sent(
     run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    """A command could not be noted, as in a container, and is not sent; a stop is."""
+    """A command is not sent, because it cannot be logged, as in a container. A stop is sent nevertheless."""
 
     def none() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(Path, "home", none)
-    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # root could make it
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # a path that not even root can create
     status, out, err = run("fleet", *words, "--nats", nobody)
     assert (status, out) == (1, "")
     assert f"no NATS server answers at {nobody}: Connection refused" in err
@@ -203,7 +203,7 @@ def test_a_missing_extra_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPat
     )
 
 
-def test_two_gateways_of_one_name_on_one_machine(run: Run, tmp_path: Path, nobody: str) -> None:
+def test_a_second_gateway_of_a_name_on_one_machine_is_refused(run: Run, tmp_path: Path, nobody: str) -> None:
     from multidrop.fleet.leases.life_lock import LifeLock
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
@@ -226,9 +226,9 @@ def test_init_creates_and_shows_the_fleet(run: Run, nats: Cluster, tmp_path: Pat
     assert lines["hall-1"]["port"] == "socket://127.0.0.1:4002"
     assert lines["hall-1"]["master"] is None
     status, out, _ = run("fleet", "status", *servers)
-    assert status == 1  # a line without a master
+    assert status == 1  # the line has no master
     assert "1 line, 1 without a master" in out
-    assert run("fleet", "status", "--json", *servers)[0] == 1  # for programs too
+    assert run("fleet", "status", "--json", *servers)[0] == 1  # the same status with --json
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 
@@ -243,12 +243,12 @@ async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
             return self
 
         async def __aexit__(self, *error: object) -> None:
-            """No port was opened."""
+            """Do nothing."""
 
         async def stop(self, *what: object, **more: object) -> None:
             task = asyncio.current_task()
             assert task is not None
-            task.cancel()  # as Ctrl-C does
+            task.cancel()  # as on Ctrl-C
             await asyncio.sleep(60)
 
     monkeypatch.setattr(commands, "_asker", lambda *given: Endless())

@@ -1,4 +1,4 @@
-"""`fleet demo`: it shows a takeover, and removes its processes and files, however it ends."""
+"""`fleet demo`: it shows a takeover, and always removes its processes and files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from multidrop.cli.fleet.demo import Stage, plant_file
 from multidrop.plant.loader import load_plant
 
 
-async def test_the_fleet_is_calm_when_no_line_has_moved_between_two_views() -> None:
+async def test_the_demo_waits_until_no_line_moves_between_two_views() -> None:
     stage = Stage()
 
     async def look(master: str) -> None:
@@ -40,7 +40,7 @@ async def test_the_fleet_is_calm_when_no_line_has_moved_between_two_views() -> N
     await asyncio.wait_for(waiting, PATIENCE)
 
 
-def test_the_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
+def test_the_demo_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(plant_file({"line-1": 5020, "line-2": 5021}))
     assert [polled.drive.name for line in load_plant(path).lines for polled in line.drives] == [
@@ -55,14 +55,16 @@ def test_the_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
     ("said", "version"),
     [("nats-server: v2.15.1", (2, 15)), ("nats-server: v2.9.10", (2, 9)), ("no idea", (0, 0))],
 )
-def test_the_version_of_a_server(tmp_path: Path, said: str, version: tuple[int, int]) -> None:
+def test_a_servers_version_is_parsed_or_zero(tmp_path: Path, said: str, version: tuple[int, int]) -> None:
     program = tmp_path / "nats-server"
     program.write_text(f"#!/bin/sh\necho '{said}'\n")
     program.chmod(0o755)
     assert demo_processes.version_of(str(program)) == version
 
 
-def test_without_a_server_it_says_where_to_get_one(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_nats_server_the_error_says_where_to_get_one(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(demo_processes, "_programs", lambda: iter(["/nowhere/nats-server"]))
     status, out, err = run("fleet", "demo")
     assert (status, out) == (2, "")
@@ -72,11 +74,11 @@ def test_without_a_server_it_says_where_to_get_one(run: Run, monkeypatch: pytest
     )
 
 
-# ---- itself ----
+# ---- the demo itself ----
 
 
 def processes_of(folder: str) -> list[str]:
-    """Return the processes with this folder in their arguments or environment."""
+    """Return the processes that have this folder in their arguments or environment."""
     found = []
     for process in Path("/proc").iterdir():
         with suppress(OSError):
@@ -93,7 +95,7 @@ def await_nothing_left(folder: str) -> None:
 
 @contextmanager
 def started() -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Yield the demo and its folder once all its processes are started."""
+    """Yield the demo's process and its folder, once all processes of the demo have started."""
     with BoundProcess([*MULTIDROP, "fleet", "demo"], stdout=subprocess.PIPE, text=True) as demo:
         assert demo.stdout is not None
         folder = ""
@@ -102,7 +104,7 @@ def started() -> Iterator[tuple[subprocess.Popen[str], str]]:
                 folder = found[1]
             if "gw-3 are started" in line:
                 break
-        assert len(processes_of(folder)) >= 8  # servers, gateways, lines, and the cleanup
+        assert len(processes_of(folder)) >= 8  # servers, gateways, lines, and the process that removes files
         yield demo, folder
 
 
@@ -137,7 +139,7 @@ def test_the_demo_removes_processes_and_files_however_it_ends(number: signal.Sig
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_on_a_terminal_it_draws_and_prints_its_notes_at_the_end() -> None:
+def test_on_a_terminal_the_demo_draws_and_prints_its_notes_at_the_end() -> None:
     with on_terminal("fleet", "demo", size=(110, 30)) as terminal:
         terminal.wait_for_match(r"in (/\S+)\r")
         folder = re.search(r"in (/\S+)\r", terminal.text)[1]  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""One gateway of a fleet: which clients it answers, and how it ends."""
+"""One gateway of a fleet: which requests it answers, and how it shuts down."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATIENCE_S = 60.0
 
 
 class Asked:
-    """A request, and the answers to it."""
+    """A request from NATS, and the answers to it."""
 
     def __init__(self, wanted: str, reply: str = "_INBOX.asker.1") -> None:
         self.subject = names.gateway_subject("gw-1", wanted)
@@ -36,8 +36,8 @@ class Asked:
         self.answers.append(json.loads(data))
 
 
-async def test_a_waiting_namesake_answers_no_requests(tmp_path: Path) -> None:
-    """The other one gets the request too: `status` would show the wrong one, and `drain` trust it."""
+async def test_a_gateway_that_waits_for_its_namesake_answers_no_requests(tmp_path: Path) -> None:
+    """The namesake gets the request too. `status` would show the wrong one, `drain` would trust it."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     lease = gateway.member.lease
     for wanted in ("state", "drain"):
@@ -52,7 +52,7 @@ async def test_a_waiting_namesake_answers_no_requests(tmp_path: Path) -> None:
 
 
 async def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path) -> None:
-    """Servers would deliver the answer there, even to a record that the requester may not write."""
+    """Servers would deliver the answer there, even into a record that the requester may not write."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.member.lease.session = 7
     for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):
@@ -68,13 +68,13 @@ async def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("trouble", "is_forwarded"), [(None, True), ("the stream is full", False)])
-async def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
+async def test_shutdown_waits_for_unsent_messages_unless_the_stream_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: str | None, is_forwarded: bool
 ) -> None:
     monkeypatch.setattr(fleet_gateway, "FORWARD_S", PATIENCE_S)
     monkeypatch.setattr(fleet_gateway, "IN_TROUBLE_S", 0.0)
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-    taken = iter([0, 0, 1])  # messages of the spool's two that the stream has at each look
+    taken = iter([0, 0, 1])  # number of the spool's two messages that the stream has, at each check
     forwarder: Any = type(
         "Forwarding", (), {"trouble": trouble, "last": property(lambda _: next(taken, 2))}
     )()
@@ -88,7 +88,7 @@ async def test_the_end_waits_for_unsent_messages_unless_the_stream_fails(
     await gateway._close()
 
 
-async def test_a_margin_is_never_negative(tmp_path: Path) -> None:
+async def test_without_a_lease_the_margin_is_zero(tmp_path: Path) -> None:
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     assert gateway.state()["margin_s"] == 0.0
     await gateway._close()
@@ -97,7 +97,7 @@ async def test_a_margin_is_never_negative(tmp_path: Path) -> None:
 async def test_the_kernels_timer_is_cancelled_after_the_lines_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process whose member failed may go on: the kernel would kill it."""
+    """Otherwise the kernel would kill a process that continues after its member has failed."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
     held: list[bool] = []
@@ -117,7 +117,7 @@ async def test_the_kernels_timer_is_cancelled_after_the_lines_are_closed(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_gateway_without_servers_ends_in_order(tmp_path: Path) -> None:
+def test_without_servers_a_gateway_shuts_down_in_order(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "multidrop", "fleet"]
     with cluster(tmp_path / "nats", 1) as one, closing(SerialHall(1)) as hall:
         environment = {**os.environ, "MULTIDROP_NATS": one.urls[0], "XDG_STATE_HOME": str(tmp_path)}

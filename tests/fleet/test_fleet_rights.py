@@ -1,7 +1,7 @@
-"""Rights on a fleet's servers, with the configuration of `fleet rights`: requests that each user is refused.
+"""Rights on a fleet's servers, from the files that `fleet rights` writes: requests that each user is refused.
 
-Each attempt is made twice: at a server with the rights as written, which must refuse it, and at one whose
-users may do everything, which must not. So each attempt could succeed.
+Each attempt is made at two servers. The server with these rights must refuse it. The server on which users
+may do everything must accept it, which proves that the attempt is valid.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CONSUMERS = ("CONSUMER.CREATE.{}", "CONSUMER.CREATE.{}.c.>", "CONSUMER.DURABLE.C
 COMMANDS = ("cmd.line-1", "stop.line-1", "do.gw-b.run")
 PATIENCE_S = 30.0
 
-FORBIDDEN = {  # forbidden to each user, besides the subjects forbidden to all
+FORBIDDEN = {  # subjects forbidden to each user, besides those forbidden to all
     "gw-a": (
         *("samples.gw-b.log", "samples.gw-c.log", "samples.gw-a"),
         *("$KV.lease_0.gw-b.gw-b", "$KV.lease_1.gw-b.gw-c", "$KV.lease_2.gw-a.gw-b", "$KV.lease_0.gw-b"),
@@ -84,7 +84,7 @@ LISTENED = (
 class Attempt(NamedTuple):
     user: str
     deed: str  # "publish" or "subscribe"
-    subject: str  # {name}: the inbox of that user
+    subject: str  # {name} stands for that user's inbox
 
 
 def attempts() -> Iterator[Attempt]:
@@ -100,7 +100,7 @@ def attempts() -> Iterator[Attempt]:
 
 
 async def refused(servers: SecuredCluster) -> set[Attempt]:
-    """Make all attempts, and return those that the server refuses."""
+    """Make all attempts, and return those that the server has refused."""
     inboxes = {user: inbox_of(public_key(servers.key(user).read_text().strip())) for user in USERS}
     found: set[Attempt] = set()
     for user in FORBIDDEN:
@@ -117,7 +117,7 @@ async def refused(servers: SecuredCluster) -> set[Attempt]:
                 await client.publish(subject, b"{}")
             else:
                 await client.subscribe(subject)
-        for _ in range(2):  # the first ping may overtake pending data
+        for _ in range(2):  # this flush's ping may overtake pending data; the second one's cannot
             await client.flush()
         await client.close()
         for attempt, subject in mine.items():
@@ -187,12 +187,12 @@ async def _ignore(_: Exception) -> None:
         (["hub"], "'hub' is taken"),
     ],
 )
-def test_names_that_rights_cannot_be_given_to(names: list[str], sentence: str) -> None:
+def test_names_that_cannot_have_rights_are_rejected(names: list[str], sentence: str) -> None:
     with pytest.raises(ValueError, match=re.escape(sentence)):
         rights_of(names)
 
 
-def test_secrets_are_readable_only_by_their_owner(as_written: SecuredCluster) -> None:
+def test_secret_files_are_readable_only_by_their_owner(as_written: SecuredCluster) -> None:
     keys = as_written.folder / "keys"
     assert {path.name for path in keys.iterdir()} == {*(f"{user}.key" for user in USERS), "routes"}
     assert [oct(path.stat().st_mode & 0o777) for path in (keys, *keys.iterdir())] == ["0o700", *["0o600"] * 7]
@@ -202,7 +202,7 @@ def test_secrets_are_readable_only_by_their_owner(as_written: SecuredCluster) ->
         assert path.read_text().strip() not in public
 
 
-def test_adding_a_gateway_changes_no_key(tmp_path: Path) -> None:
+def test_adding_a_gateway_keeps_all_existing_keys(tmp_path: Path) -> None:
     from multidrop.fleet.servers.files import write_files
 
     urls = ["nats://a:4222", "nats://b:4222"]
@@ -224,10 +224,10 @@ def test_adding_a_gateway_changes_no_key(tmp_path: Path) -> None:
     assert {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-# ---- the command ----
+# ---- the command `fleet rights` ----
 
 
-def test_the_command_shows_no_secret(run: Run, tmp_path: Path) -> None:
+def test_the_rights_command_prints_no_secret(run: Run, tmp_path: Path) -> None:
     words = [
         "fleet",
         "rights",
@@ -251,7 +251,7 @@ def test_the_command_shows_no_secret(run: Run, tmp_path: Path) -> None:
     assert text.count('cert_file: "/etc/nats/own.pem", key_file: "/etc/nats/own.key"') == 2
 
 
-def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
+def test_rights_without_tls_cause_a_warning(run: Run, tmp_path: Path) -> None:
     status, _, err = run("fleet", "rights", "gw-1", "--nats", "nats://a:4222", "--folder", tmp_path)
     assert (status, len(err.splitlines())) == (0, 1)
     assert "without TLS anyone on the network can read samples and commands" in err
@@ -270,7 +270,9 @@ def test_without_tls_there_is_a_warning(run: Run, tmp_path: Path) -> None:
         (["gw-1", "--nats", "nats://a:port"], "nats://a:port is not an address of a NATS server"),
     ],
 )
-def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[str], sentence: str) -> None:
+def test_an_invalid_rights_command_writes_no_file(
+    run: Run, tmp_path: Path, words: list[str], sentence: str
+) -> None:
     status, out, err = run("fleet", "rights", *words, "--folder", tmp_path / "nats")
     assert (status, out) == (2, "")
     [line] = err.splitlines()
@@ -279,7 +281,7 @@ def test_a_mistaken_call_writes_nothing(run: Run, tmp_path: Path, words: list[st
 
 
 def test_only_a_denial_of_this_request_means_not_sent() -> None:
-    """Rights may be granted to an open connection: an older denial does not explain a later silence."""
+    """Rights may be granted to an open connection, so an older denial explains no missing answer."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
     asyncio.run(denials.note(denied))
@@ -294,7 +296,7 @@ def test_only_a_denial_of_this_request_means_not_sent() -> None:
 
 
 @pytest.mark.slow
-def test_a_creds_file_is_passed_to_nats(tmp_path: Path) -> None:
+def test_a_creds_file_is_passed_to_nats_py(tmp_path: Path) -> None:
     path = tmp_path / "gw-1.creds"
     path.write_text("-----BEGIN NATS USER JWT-----\ney\n------END NATS USER JWT------\n")
     assert connect_options(["nats://a"], path) == {"user_credentials": str(path)}

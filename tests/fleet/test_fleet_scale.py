@@ -1,4 +1,7 @@
-"""A thousand lines of 20 gateways' state machines in four processes; bench.questions.fleet_scale has more."""
+"""The state machines of 20 gateways with a thousand lines, in four processes.
+
+bench.questions.fleet_scale has larger fleets.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from nats_clusters import Cluster
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
-def test_each_of_a_thousand_lines_has_one_gateway_when_five_of_twenty_die_and_return(nats: Cluster) -> None:
+def test_each_of_1000_lines_has_one_gateway_after_5_of_20_die_and_return(nats: Cluster) -> None:
     with large_fleet(nats, plant_of_fake_lines(1000)) as fleet:
         fleet.settled(fleet.start(*groups(20, 4)))
         fleet.check()

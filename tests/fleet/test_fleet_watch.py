@@ -1,4 +1,4 @@
-"""`fleet watch`: an old view is marked as old, and every terminal size has its picture."""
+"""`fleet watch`: an old view is marked as old, and the picture fits every terminal size."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ def test_the_screen_shows_gateways_lines_and_moves() -> None:
 
 @pytest.mark.long
 @table("height", range(1, 60))
-def test_each_size_has_its_picture(height: int) -> None:
+def test_the_picture_fits_each_screen_height(height: int) -> None:
     for width in (20, 80, 200):
         drawn(told(trouble="no server", lines=500), width, height)
 
 
-def test_lines_that_do_not_fit_are_counted_and_the_masterless_come_first() -> None:
+def test_hidden_lines_are_counted_and_masterless_lines_come_first() -> None:
     text = drawn(told(lines=500))
     shown = len(re.findall(r"^line-\d+ ", text, re.MULTILINE))
     assert f"and {500 - shown} more lines" in text
@@ -87,7 +87,7 @@ def test_at_80_columns_and_24_rows_each_of_twelve_lines_has_its_master() -> None
     assert "last moves:" in text
 
 
-def test_notes_are_shown_whole_or_not() -> None:
+def test_notes_are_shown_whole_or_not_at_all() -> None:
     notes = {"notes": [f"{at} " + "words " * 20 for at in range(3)]}
     shown = drawn(told() | notes, 80).splitlines()
     assert [row[0] for row in shown if re.match(r"\d words", row)] == ["1", "2"]
@@ -106,7 +106,7 @@ def test_a_narrow_terminal_drops_less_important_columns() -> None:
     ]
 
 
-def test_a_narrow_terminal_shows_masters_and_new_masters() -> None:
+def test_on_a_narrow_terminal_masters_and_moves_to_them_stay_visible() -> None:
     shown = drawn(told(), 40).splitlines()
     assert [re.sub(" +", " ", row) for row in shown if re.match("LINE|line-1 ", row)] == [
         "LINE MASTER SINCE",
@@ -136,7 +136,7 @@ def test_no_table_head_is_shown_without_rows(height: int) -> None:
 
 
 def test_lines_of_a_silent_master_are_shown() -> None:
-    """Sessions of dead gateways are not ended without a living one; each line has a master in the records."""
+    """While no gateway is alive, no session of a dead gateway is ended, so the records still name masters."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
     found["lines"]["line-7"]["master"] = "gw-2"
@@ -150,7 +150,7 @@ def test_lines_of_a_silent_master_are_shown() -> None:
 
 
 @pytest.mark.parametrize(("master", "status"), [("gw-1", 0), ("gw-2", 1), (None, 1)])
-def test_the_exit_status_says_that_a_master_is_missing(
+def test_the_exit_status_is_1_if_a_line_has_no_living_master(
     monkeypatch: pytest.MonkeyPatch, master: str | None, status: int
 ) -> None:
     async def seen(paths: object) -> dict[str, Any]:
@@ -181,7 +181,7 @@ def test_a_missing_gateway_and_a_lost_port_are_shown(
     assert "gw-1: line line-2 cannot be opened from here; another gateway polls it" in drawn(lost)
 
 
-def test_lines_are_in_the_order_of_their_numbers() -> None:
+def test_line_10_is_listed_after_line_2() -> None:
     rows = drawn(told(lines=12)).splitlines()
     assert [row.split()[0] for row in rows if row.startswith("line-")] == [f"line-{at}" for at in range(12)]
 
@@ -200,7 +200,7 @@ def test_a_name_cannot_control_the_terminal() -> None:
     assert "\x1b" not in drawn(found)
 
 
-def test_moves_with_an_unseen_start() -> None:
+def test_moves_without_a_known_former_master_are_shown() -> None:
     moves = [MOVE | {"from": None}, MOVE | {"from": ""}, MOVE | {"to": ""}]
     assert [re.sub(" +", " ", row)[27:] for row in move_table(moves)] == [
         "to gw-2",
@@ -218,7 +218,7 @@ def test_sizes_have_two_digits_and_a_unit(number: float, text: str) -> None:
 
 
 class FailingView:
-    """Gives a fleet, and no answer from the second look on."""
+    """A view that shows a fleet at the first read and fails at later reads."""
 
     looks = 0
 
@@ -231,7 +231,9 @@ class FailingView:
         return {"gateways": {}, "lines": {}, "moves": []}
 
 
-async def test_a_failed_read_is_shown_with_the_age_of_the_view(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(fleet_watch, "EVERY_S", 0.02)
     shown: list[dict[str, Any]] = []
     over = asyncio.Event()
@@ -246,8 +248,8 @@ async def test_a_failed_read_is_shown_with_the_age_of_the_view(monkeypatch: pyte
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
 
-async def test_a_watch_ends_with_the_task_of_its_connection() -> None:
-    """Else it would show the last look for ever."""
+async def test_watch_ends_when_the_task_of_its_connection_ends() -> None:
+    """Otherwise it would show the last view forever."""
     supervisor().keep("path", asyncio.sleep(0)).cancel()
     watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
     with pytest.raises(Ended, match="path has ended: it was cancelled"):
@@ -274,19 +276,19 @@ def test_watch_prints_one_line_a_second_until_interrupted(fleet: Cluster) -> Non
         assert process.wait(30) == 0
         assert process.stderr.read() == ""
     assert [one["trouble"] for one in found] == [None] * 3
-    assert found[0]["at_ms"] + 900 <= found[2]["at_ms"]  # the first look may have taken long
+    assert found[0]["at_ms"] + 900 <= found[2]["at_ms"]  # the first read may have taken long
 
 
 @pytest.mark.long
-def test_on_a_terminal_it_draws_until_it_is_interrupted(fleet: Cluster) -> None:
+def test_on_a_terminal_watch_draws_until_interrupted(fleet: Cluster) -> None:
     with on_terminal("fleet", "watch", MULTIDROP_NATS=",".join(fleet.urls)) as terminal:
         terminal.wait_for("0 lines, 0 without a master")
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.process.wait(30) == 0
         terminal.written = os.read(terminal.fd, 65536)
-        assert b"\x1b[?25h" in terminal.written  # the cursor
+        assert b"\x1b[?25h" in terminal.written  # the cursor is shown again
         assert b"Traceback" not in terminal.written
 
 
-def test_an_impossible_time_is_a_question_mark() -> None:
+def test_an_invalid_time_is_shown_as_a_question_mark() -> None:
     assert moment(10**30) == "?"

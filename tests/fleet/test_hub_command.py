@@ -1,4 +1,4 @@
-"""`multidrop hub`: a stream into files by one command, and a sentence for each mistake."""
+"""`multidrop hub`: stores a stream in files, and reports each mistake in one sentence."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Servers whose stream has 40 exchanges in 4 messages, of one gateway's spool."""
+    """Servers whose stream has 40 exchanges in 4 messages, from one gateway's spool."""
     folder = tmp_path_factory.mktemp("nats")
 
     async def forward(urls: list[str]) -> None:
@@ -52,7 +52,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.mark.slow
-def test_once_stores_every_present_row_once(
+def test_hub_once_stores_every_row_of_the_stream_once(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     require_module("duckdb")
@@ -97,10 +97,10 @@ def test_stored_rows_survive_any_end_of_the_hub(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_waits_for_what_the_hub_is_doing(
+def test_a_signal_ends_the_hub_only_between_steps_of_its_task(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    """An error within nats-py's own tasks would leave pending futures behind."""
+    """An exception raised inside nats-py's own tasks would leave pending futures."""
     done: list[str] = []
 
     async def read(hub: SampleHub, *, once: bool) -> None:
@@ -116,7 +116,7 @@ def test_a_signal_waits_for_what_the_hub_is_doing(
     assert done == ["went on", "ended"]
 
 
-def test_a_hub_whose_compaction_ends_fails(
+def test_the_hub_fails_if_compaction_ends(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def end(folder: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_hub_whose_compaction_ends_fails(
     monkeypatch.setattr(parquet_sink, "compact_for_ever", end)
     assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 1
     said = capsys.readouterr().err
-    assert "Traceback" in said  # in the log
+    assert "Traceback" in said  # from the log
     assert said.endswith("multidrop: compaction has ended: ZeroDivisionError: a mistake\n")
 
 
@@ -145,7 +145,7 @@ def test_no_server_is_one_sentence(
     assert told.count("\n") == 1
 
 
-def test_servers_come_from_the_environment(
+def test_the_hubs_servers_may_come_from_the_environment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ports = free_ports(2)
@@ -161,7 +161,7 @@ def test_servers_come_from_the_environment(
     )
 
 
-def test_a_foreign_folder_is_one_sentence(
+def test_the_hub_refuses_a_foreign_folder_in_one_sentence(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "report.txt").write_text("mine")
@@ -171,7 +171,7 @@ def test_a_foreign_folder_is_one_sentence(
     )
 
 
-def test_exactly_one_sink_is_required(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_hub_requires_exactly_one_sink(capsys: pytest.CaptureFixture[str]) -> None:
     status, told = refused(capsys, "nats://127.0.0.1:4222")
     assert status == 2
     assert "one of the arguments --parquet --postgres is required" in told

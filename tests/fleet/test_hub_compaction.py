@@ -1,4 +1,4 @@
-"""Compaction of a hub's files: each row is read exactly once before, during and after it."""
+"""Compaction of a hub's files: readers get each row exactly once before, during and after it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from multidrop.fleet.samples.parquet_sink import ParquetSink, compact_for_ever
 from multidrop.history import compact as compact_module
 from multidrop.history.compact import main as compact
 
-HOUR = 360_000  # exchanges of STEP
-FILES, EXCHANGES = 12, 10  # four files an hour
+HOUR = 360_000  # exchanges in an hour, one every STEP
+FILES, EXCHANGES = 12, 10  # four files per hour
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def first_of(file: int) -> int:
 
 
 def write(sink: ParquetSink, files: range) -> None:
-    """Write files of two messages each."""
+    """Write these files, with two messages each."""
     for file in files:
         buffer = RowBuffer()
         assert buffer.add(numbered(first_of(file), EXCHANGES).columns())
@@ -66,7 +66,7 @@ def merge(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_hours_that_are_over_become_one_file(sink: ParquetSink, tmp_path: Path) -> None:
+def test_the_files_of_a_past_hour_are_merged_into_one(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     merge(tmp_path)
     newest = [f"{2 * file + 1:08d}-{2 * file + 2:08d}" for file in range(8, FILES)]
@@ -82,19 +82,19 @@ def test_hours_that_are_over_become_one_file(sink: ParquetSink, tmp_path: Path) 
     for path in sorted((tmp_path / "rows").glob("*.parquet"))[3:]:
         path.unlink()
     assert names(tmp_path, "rows")[-1] == "00000017-00000024"
-    assert sink.begin("made") == KeptPlace(24, {"a.x": 24})  # a merged file has the hub's position, too
+    assert sink.begin("made") == KeptPlace(24, {"a.x": 24})  # a merged file contains the hub's position too
 
 
 class Broken(Exception):
-    """The process ends here."""
+    """Simulates the end of the process."""
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_interrupted_before_each_step_no_row_is_lost(
+def test_compaction_interrupted_before_any_step_loses_no_row(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After any number of files that were written or removed, and as often as it takes."""
+    """The interruption comes after each possible number of written or removed files, also repeatedly."""
     write(sink, range(FILES))
     steps = {"replace": Path.replace, "unlink": Path.unlink}
     left = 0
@@ -128,7 +128,9 @@ def test_interrupted_before_each_step_no_row_is_lost(
 
 
 @pytest.mark.long
-def test_a_reader_of_merged_files_fails_or_has_every_row_once(sink: ParquetSink, tmp_path: Path) -> None:
+def test_a_reader_of_files_being_merged_fails_or_gets_every_row_once(
+    sink: ParquetSink, tmp_path: Path
+) -> None:
     write(sink, range(FILES))
     told = []
     for at in (0, 1, 2, 5):
@@ -164,7 +166,7 @@ def test_merged_files_keep_the_size_limit(
 
 
 @pytest.mark.long
-async def test_a_hub_compacts_while_it_reads(sink: ParquetSink, tmp_path: Path) -> None:
+async def test_the_hub_compacts_files_while_it_reads_the_stream(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     task = asyncio.create_task(compact_for_ever(tmp_path, every=0.01))
     async with asyncio.timeout(60.0):

@@ -1,4 +1,4 @@
-"""All interleavings of a lease's holder and a gateway that takes it over, with the code's own rules."""
+"""All interleavings of a lease's holder and a gateway that takes over, with the code's own rules."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ WHOLE = Terms(lease=2, guard=2)
 
 
 def killed_at(until: int, terms: Terms) -> int:
-    """Return when the kernel's timer ends a holder that did not let go in time (csrc/mastership.c)."""
+    """Return when the kernel's timer kills a holder that did not close its lines (csrc/mastership.c)."""
     return until + terms.guard // 2
 
 
 class PathState(NamedTuple):
-    """One path: the record, messages under way, and what both sides know. Times are ages in ticks."""
+    """The state of one path: the record, the messages in flight, and what both sides know.
 
-    ended: int | None = None  # since when renewal is impossible
-    request: int | None = None  # a renewal on its way to the server, by when it was sent
-    ack: int | None = None  # its acknowledgement on its way back
+    Times are ages, in ticks of the model.
+    """
+
+    ended: int | None = None  # time since which renewal is impossible; None: not ended
+    request: int | None = None  # a renewal on its way to the server: when it was sent
+    ack: int | None = None  # the server's acknowledgement on its way back: when that renewal was sent
     renewed: int | None = 0  # the newest renewal that the holder counts
-    seen: tuple[bool, int] | None = None  # the taker: is it the present revision, and since when
-    ending: bool | None = None  # the taker's write under way: is it of the present revision
+    seen: tuple[bool, int] | None = None  # by the taker: is its revision the present one, and since when
+    ending: bool | None = None  # the taker's write in flight: whether it replaces the present revision
 
 
 @dataclass(frozen=True)
 class Model:
-    """A holder that may be suspended at any point, a taker, and a network that delays and loses.
+    """A holder that may be suspended at any point, a taker, and a network that delays and loses messages.
 
-    The taker writes once enough paths have been ended for as long as the guard.
+    The taker starts to write when enough paths have been ended for the time of the guard.
     """
 
     terms: Terms
@@ -44,20 +47,20 @@ class Model:
     has_cas: bool = True
     has_timer: bool = True
     waits: bool = True
-    listens: bool = True  # for the guard
-    lateness: int = 0  # of the timer
+    listens: bool = True  # the taker listens for the time of the guard before it writes
+    lateness: int = 0  # delay of the kernel's timer, in ticks
 
     # ---- one path ----
 
     def path_steps(self, path: PathState) -> Iterator[PathState]:
-        """Yield all that may happen next on one path."""
+        """Yield all possible next states of one path."""
         if path.request is None and path.ack is None:
             yield path._replace(request=0)
         if path.ack is not None:
             yield path._replace(ack=None, renewed=0 if self.counts_from_ack else path.ack)
-            yield path._replace(ack=None)  # lost
+            yield path._replace(ack=None)  # the acknowledgement is lost
         if path.request is not None:
-            yield path._replace(request=None)  # lost, or refused on an ended path
+            yield path._replace(request=None)  # the renewal is lost, or refused because the path was ended
             if path.ended is None:
                 seen = None if path.seen is None else (False, path.seen[1])
                 ending = None if path.ending is None else False
@@ -77,13 +80,13 @@ class Model:
         return not self.waits or lease_rules.is_stale(SeenRevision(1, -seen[1]), 0, self.terms)
 
     def grown_older(self, path: PathState) -> PathState:
-        """Return the path one tick later."""
+        """Return the path's state one tick later."""
 
         def older(age: int | None, most: int) -> int | None:
             return None if age is None else min(age + 1, most)
 
         terms = self.terms
-        oldest = terms.lease + terms.guard // 2 + self.lateness + 1  # from here on no rule depends on it
+        oldest = terms.lease + terms.guard // 2 + self.lateness + 1  # no rule depends on a greater age
         return path._replace(
             request=older(path.request, oldest),
             ack=older(path.ack, oldest),
@@ -93,27 +96,27 @@ class Model:
         )
 
     def normal(self, path: PathState) -> PathState:
-        """Return the representative of all path states with the same future."""
+        """Return the representative of all path states that have the same future."""
         if not self.has_cas:
             return path
         seen = (
             path.seen if path.seen and path.seen[0] else None
-        )  # the watched revision is gone: it cannot end it
+        )  # the observed revision was replaced, so the taker cannot end it
         request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
 
     # ---- all interleavings ----
 
     def deadline(self, renewed: Iterable[int | None]) -> int:
-        """Return until when the holder may send, relative to now, by the newest renewal of each path."""
+        """Return until when the holder may send, relative to now, from the newest renewal of each path."""
         sent = [None if age is None else -age for age in renewed]
         return lease_rules.deadline(sent, self.terms)
 
     def search(self, most: int | None = None) -> tuple[int, tuple[PathState, ...] | None]:
-        """Return how many states there are, and one in which two masters could write, if there is one.
+        """Return the number of reachable states, and one in which two masters could write, if there is one.
 
-        A state has a flag, True between the holder's check of the clock and its write, and its sorted paths.
-        States of a dead holder are left out.
+        A state has a flag and its sorted paths. The flag is True between the holder's check of the clock and
+        its write. States of a dead holder are left out.
         """
         table = _PathTable(self)
         first = (False, *(table.number(PathState()),) * self.paths)
@@ -144,12 +147,12 @@ class Model:
         if not self.is_killed(table, later):
             yield (has_looked, *later)
         if has_looked:
-            yield (False, *numbers)  # written
+            yield (False, *numbers)  # the holder has written
         elif lease_rules.may_send(0, table.deadline(numbers)):
             yield (True, *numbers)
         for place, number in enumerate(numbers):
             if number in numbers[:place]:
-                continue  # the same follows
+                continue  # an equivalent state follows
             others = numbers[:place] + numbers[place + 1 :]
             for after in table.steps[number]:
                 yield (has_looked, *sorted([*others, after]))
@@ -159,7 +162,7 @@ class Model:
 
 
 class _PathTable:
-    """All states of one path, numbered, with what follows each."""
+    """All states of one path, numbered, with the next states of each."""
 
     def __init__(self, model: Model) -> None:
         self.paths: list[PathState] = []
@@ -167,15 +170,15 @@ class _PathTable:
         self._model = model
         self.steps: list[list[int]] = []
         self.later: list[int] = []
-        self._deadlines: dict[tuple[int | None, ...], int] = {}  # by the newest renewals
+        self._deadlines: dict[tuple[int | None, ...], int] = {}  # deadlines by the newest renewals
         self.number(PathState())
-        for path in self.paths:  # it grows in the meantime
+        for path in self.paths:  # this list grows during the loop
             after = {self.number(following) for following in model.path_steps(path)}
             self.steps.append(sorted(after - {self.number(path)}))
             self.later.append(self.number(model.grown_older(path)))
 
     def deadline(self, numbers: list[int]) -> int:
-        """Return the holder's deadline with its paths in these states."""
+        """Return the holder's deadline if its paths are in these states."""
         renewed = tuple([self.paths[number].renewed for number in numbers])
         if renewed not in self._deadlines:
             self._deadlines[renewed] = self._model.deadline(renewed)
@@ -204,14 +207,14 @@ MUTATIONS = {
 
 
 @pytest.mark.long
-def test_no_two_masters_in_any_interleaving() -> None:
+def test_no_interleaving_has_two_masters() -> None:
     states, wrong = Model(SMALL).search()
     assert wrong is None
     assert states > 100_000
 
 
 @pytest.mark.long
-def test_no_two_masters_in_any_interleaving_of_a_longer_lease() -> None:
+def test_no_interleaving_has_two_masters_with_a_longer_lease() -> None:
     states, wrong = Model(WHOLE).search()
     assert wrong is None
     assert states > 500_000
@@ -225,13 +228,13 @@ LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's la
     "mutation",
     [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in MUTATIONS],
 )
-def test_each_mutation_has_two_masters(mutation: str) -> None:
+def test_each_mutation_of_the_rules_allows_two_masters(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search(most=500_000)
     assert wrong is not None
 
 
 def test_the_rules_in_use_are_those_of_the_model() -> None:
-    """Both quorums are more than half, and the timer fires before the guard is over."""
+    """Both quorums are more than half of the paths, and the kernel's timer fires before the guard is over."""
     terms = Terms()
     assert terms.needed + terms.ended > lease_rules.PATHS
     assert killed_at(0, terms) < terms.guard

@@ -1,4 +1,4 @@
-"""Metrics of a fleet's gateway: valid for promtool, only for this machine, robust to any request."""
+"""Metrics of a fleet's gateway: valid for promtool, only for this computer, robust against any request."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def samples(state: dict[str, Any]) -> dict[str, float]:
     return {name.removeprefix("multidrop_fleet_"): float(value) for name, _, value in found}
 
 
-def test_lines_without_a_port_are_scraped() -> None:
+def test_metrics_of_lines_without_a_port_are_complete() -> None:
     found = samples({**STATE, "lost": ["hall-1"], "unopened": ["hall-2", "hall-3"]})
     assert (found["lost_lines"], found["unopened_lines"]) == (1, 2)
 
 
-def test_the_state_of_a_gateway_is_scraped() -> None:
+def test_metrics_show_the_state_of_a_gateway() -> None:
     found = samples(STATE)
     assert found['gateway_info{gateway="gw-1",version="1.0"}'] == 1
     assert found['gateway_state{multidrop_fleet_gateway_state="working"}'] == 1
@@ -62,7 +62,7 @@ def test_the_state_of_a_gateway_is_scraped() -> None:
     assert {name: value for name, value in found.items() if "{" not in name} == expected
 
 
-def test_unknown_figures_have_no_sample() -> None:
+def test_unknown_figures_have_no_sample_in_the_metrics() -> None:
     spool = STATE["spool"] | {"behind": None, "lag_s": None}
     found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "no lease", "spool": spool})
     missing = {"lease_margin_seconds", "session", "behind_messages", "behind_seconds"}
@@ -85,7 +85,7 @@ def test_an_openmetrics_parser_accepts_the_metrics() -> None:
     assert found["multidrop_fleet_moves"] == "counter"
 
 
-# ---- the port ----
+# ---- the HTTP port ----
 
 
 def asked(line: str = "GET /metrics HTTP/1.1", host: str = "localhost:9464", *more: str) -> bytes:
@@ -93,7 +93,7 @@ def asked(line: str = "GET /metrics HTTP/1.1", host: str = "localhost:9464", *mo
 
 
 def said(head: bytes) -> tuple[int, str, str]:
-    """Return status, content type and text of the answer."""
+    """Return status, content type and text of the response to a request."""
     text = answer(head, lambda: families_of(STATE, "1.0")).decode()
     head_text, _, body = text.partition("\r\n\r\n")
     fields = dict(line.split(": ", 1) for line in head_text.split("\r\n")[1:])
@@ -125,12 +125,12 @@ def test_both_metrics_formats_are_served() -> None:
         (asked("GET /metrics?x=1 HTTP/1.0"), 200),
     ],
 )
-def test_only_metrics_are_served(head: bytes, status: int) -> None:
+def test_requests_for_anything_but_metrics_are_refused(head: bytes, status: int) -> None:
     assert said(head)[0] == status
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_have_an_answer(data: bytes) -> None:
+def test_any_bytes_get_an_http_response(data: bytes) -> None:
     assert said(data + b"\r\n\r\n")[0] in (400, 403, 404, 405)
 
 
@@ -153,7 +153,7 @@ def test_addresses_that_are_invalid_or_open_to_others_are_rejected(address: str,
         listen(address)
 
 
-def test_a_port_in_use_is_one_sentence() -> None:
+def test_a_metrics_port_in_use_is_reported_in_one_sentence() -> None:
     with closing(listen("127.0.0.1:0")) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=f"--metrics 127.0.0.1:{port} is not available: "):
@@ -161,7 +161,7 @@ def test_a_port_in_use_is_one_sentence() -> None:
 
 
 async def test_silent_clients_are_limited_and_do_not_delay_the_end() -> None:
-    """Clients above the limit, or with too much data, are dropped at once; none delays the end."""
+    """Clients beyond the limit, or with too much data, are disconnected; none delays the shutdown."""
 
     async def ask(port: int, data: bytes) -> bytes:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)

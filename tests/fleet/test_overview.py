@@ -1,4 +1,4 @@
-"""FleetView: masters from the records, answers from the gateways, and None for silent ones."""
+"""FleetView: masters from the records, states from the gateways, and None for silent gateways."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOVE = {"line": "line-1", "turn": 5, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
 
 
 class Answering:
-    """A path on which gateways give the test's answers; other gateways are absent."""
+    """A path on which gateways give the test's answers, and other gateways do not exist."""
 
     urls = ["nats://a:4222"]
     is_open = True
@@ -43,7 +43,7 @@ def lease(session: int, *, ended: bool = False) -> dict[str, Any]:
 
 
 def view(answers: dict[str, Any] | None = None) -> FleetView:
-    """Return a view of five lines and three gateways; gw-3 has ended."""
+    """Return a view of five lines and three gateways, of which gw-3 has ended."""
     made = FleetView(Answering(answers or {}))  # type: ignore[arg-type]
     records, leases = made._records, [MemoryBucket(name) for name in names.LEASES]
     for follower, bucket in zip(records.observer.paths, leases, strict=True):
@@ -70,13 +70,13 @@ def looked(made: FleetView) -> dict[str, Any]:
     return made.fleet()
 
 
-def test_a_line_has_a_master_whose_session_is_not_over() -> None:
+def test_only_a_session_that_is_not_over_is_shown_as_master() -> None:
     found = looked(view())
     assert {name: line["master"] for name, line in found["lines"].items()} == {
         "line-1": "gw-1",
-        "line-2": None,  # of a session before
-        "line-3": None,  # of one that ended
-        "line-4": None,  # given away
+        "line-2": None,  # owned by an earlier session
+        "line-3": None,  # owned by a session that has ended
+        "line-4": None,  # released
         "line-5": None,  # no master yet
     }
     first = {"port": "socket://h:1", "revision": 1, "master": "gw-1", "session": 2, "since_ms": 1000}
@@ -85,14 +85,14 @@ def test_a_line_has_a_master_whose_session_is_not_over() -> None:
     assert {name: gateway["lines"] for name, gateway in found["gateways"].items()} == {"gw-1": 1, "gw-2": 0}
 
 
-def test_a_silent_gateway_has_no_state() -> None:
+def test_a_silent_gateway_is_shown_without_a_state() -> None:
     made = view({"gw-1": STATE | {"last_moves": [MOVE]}})
     found = looked(made)
     assert found["gateways"]["gw-1"]["says"] == STATE
     assert found["gateways"]["gw-2"]["says"] is None
     assert [move["from"] for move in found["moves"] if move["line"] == "line-1"] == ["gw-9"]
     made._path.answers.clear()  # type: ignore[attr-defined]
-    assert looked(made)["gateways"]["gw-1"]["says"] is None  # its earlier answer is outdated
+    assert looked(made)["gateways"]["gw-1"]["says"] is None  # its earlier answer no longer counts
 
 
 @table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
@@ -104,12 +104,12 @@ def test_invalid_moves_are_ignored(moves: Any) -> None:
 def test_a_gateway_whose_session_others_ended_is_missing() -> None:
     now_ms = time.time_ns() // 1_000_000
     made = view()
-    died = {  # by name: its newest record on each path, and whether it is missing
+    died = {  # by gateway: the newest record of each path, and whether it is missing
         "gw-4": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - 60_000}, True),
-        "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # it left
+        "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # it ended its session itself
         "gw-6": (lease(2, ended=True) | {"by": "gw-6", "at_ms": now_ms}, False),
         "gw-7": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - MISSED_MS}, False),
-        "gw-9": (lease(2), False),  # it starts, on one path
+        "gw-9": (lease(2), False),  # it is starting, and holds one path
         "gw-8": (lease(2, ended=True) | {"by": "gw-1"}, True),
     }
     clock = HandClock()
@@ -119,7 +119,7 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
             if name != "gw-9" or at == 0:
                 follower.bucket.store(name, record)  # type: ignore[attr-defined]
     asyncio.run(made.look())
-    clock.pass_s(60)  # an end by others counts once the lease must have run out
+    clock.pass_s(60)  # an end by others counts when the lease must have expired
     found = looked(made)["missing"]
     assert found.keys() == {name for name, (_, is_missing) in died.items() if is_missing}
     assert found["gw-4"] == {"host": "pc", "session": 2, "seen_ms": now_ms - 60_000}
@@ -131,14 +131,14 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
     assert found["gateways"]["gw-4"]["session"] == 3
 
 
-def test_without_a_connection_it_says_which_servers() -> None:
+def test_without_a_connection_the_error_names_the_servers() -> None:
     made = view()
     made._path.is_open = False  # type: ignore[misc]
     with pytest.raises(FleetError, match="no NATS server is reached at nats://a:4222"):
         looked(made)
 
 
-def test_how_long_no_renewal_was_seen() -> None:
+def test_unseen_time_counts_from_the_last_renewal_of_two_paths() -> None:
     made = view()
     now = [10 * 10**9]
     observer = made._records.observer
@@ -146,7 +146,7 @@ def test_how_long_no_renewal_was_seen() -> None:
     looked(made)
     now[0] += 2 * 10**9
     observer.paths[0].bucket.store("gw-1", lease(2))  # type: ignore[attr-defined]
-    found = looked(made)  # one path of three was renewed: that does not count
+    found = looked(made)  # a renewal on one of three paths does not count
     assert found["gateways"]["gw-1"]["unseen_s"] == 2.0
     observer.paths[1].bucket.store("gw-1", lease(2))  # type: ignore[attr-defined]
     assert looked(made)["gateways"]["gw-1"]["unseen_s"] == 0.0

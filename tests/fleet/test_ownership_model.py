@@ -25,7 +25,7 @@ class Stored(NamedTuple):
 
 
 class Write(NamedTuple):
-    """A record on its way to a bucket; `after` is the revision that it replaces."""
+    """A record on its way to a bucket. `after` is the revision that it replaces."""
 
     writer: str
     bucket: int
@@ -38,7 +38,7 @@ Records = tuple[Stored, ...]
 
 
 class Session(NamedTuple):
-    """The knowledge of one gateway's session; `given` has the buckets and revisions that it gave away."""
+    """What one gateway's session knows. `given` has the buckets and revisions that it has released."""
 
     known: Records = (Stored(),) * BUCKETS
     given: frozenset[tuple[int, int]] = frozenset()
@@ -57,7 +57,7 @@ def owner_called(name: str) -> Owner:
 
 @lru_cache(1 << 16)
 def as_read(records: Records) -> LineRecords:
-    """Return records as the code has them; the turn is for people alone."""
+    """Return records in the code's form. The turn is left out: it is only for display."""
     return {
         f"bucket {at}": Record(
             "line",
@@ -70,23 +70,24 @@ def as_read(records: Records) -> LineRecords:
 
 @dataclass(frozen=True)
 class Model:
-    """Sessions that claim and release at any time, by records read once, and end at any time.
+    """Sessions that claim and release at any time, by records that they have read, and end at any time.
 
-    Writes are stored late, in any order, or never; an answer is a read like any other. At most `most` records
-    are stored. A session that does not know of another's end claims nothing, like an idle one.
+    Writes are stored late, in any order, or never. An answer to a write is a read of the record. At most
+    `most` records are stored. A session that does not know that another one has ended claims nothing, like an
+    idle session.
     """
 
     sessions: str = "ab"
     most: int = 5
     needed: int = NEEDED
     has_cas: bool = True
-    gives_up_first: bool = True  # a released line stops being ours before the release is sent
-    looks_home: bool = True  # before it writes elsewhere
+    gives_up_first: bool = True  # a line stops being ours before its release is sent
+    looks_home: bool = True  # reads the line's first bucket before it writes in others
     minds_two_votes: bool = True
     minds_who_lives: bool = True
 
     def search(self) -> tuple[int, State | None]:
-        """Return the number of states, and one with two masters or a dead end, if any."""
+        """Return the number of states, and one with two masters or a dead end, if there is any."""
         nothing = (Stored(),) * BUCKETS
         first = State(nothing, (Session(),) * len(self.sessions), frozenset())
         known, layer = {first}, [first]
@@ -113,7 +114,7 @@ class Model:
         return votes >= self.needed
 
     def survivors(self, state: State) -> Iterator[tuple[int, Session]]:
-        """Yield each session as it is when all others are over and it has read all records."""
+        """Yield each session in the state in which all others are over and it has read all records."""
         for at, session in enumerate(state.sessions):
             if not session.is_over:
                 for bucket, record in enumerate(state.records):
@@ -121,7 +122,7 @@ class Model:
                 yield at, session
 
     def is_lost(self, survivor: tuple[int, Session]) -> bool:
-        """Say whether it has not the line, and cannot get it, whichever bucket has no leader."""
+        """Return True if the session has lost the line, and cannot get it when some bucket has no leader."""
         at, session = survivor
         if self.is_mine(at, session) or not session.known[0].revision:
             return False
@@ -155,7 +156,7 @@ class Model:
         return state._replace(sessions=tuple(sessions))
 
     def with_write(self, state: State, write: Write) -> State:
-        """Return the state after the write is stored; later writes on the replaced record fail."""
+        """Return the state after this write is stored. Later writes that replace the same record fail."""
         revision = state.records[write.bucket].revision + 1
         records = list(state.records)
         records[write.bucket] = Stored(write.owner, write.votes, revision)
@@ -168,7 +169,7 @@ class Model:
         )
 
     def acts(self, name: str, session: Session, over: set[str]) -> Iterator[tuple[Session, frozenset[Write]]]:
-        """Yield the actions that a session may start, with their writes."""
+        """Yield the actions that a session may start now, with their writes."""
         ours = [bucket for bucket, one in enumerate(session.known) if one.owner == name]
         if ours:
             given = frozenset((bucket, session.known[bucket].revision) for bucket in ours)
@@ -193,7 +194,7 @@ class Model:
     def claims(
         self, name: str, known: Records, over: frozenset[str], doubted: tuple[int, ...]
     ) -> list[tuple[tuple[int, int], ...]]:
-        """Return the buckets and votes that a session may write: the first ones, and with the spare ones."""
+        """Return the buckets and votes that a session may write: the first ones; these and the spare ones."""
         records = as_read(known)
         buckets = list(records)
         if not self.looks_home and not known[0].revision:
@@ -217,7 +218,7 @@ class Model:
 
 
 def read(session: Session, bucket: int, record: Stored) -> Session:
-    """Return the session after it has read this record; an older record is ignored."""
+    """Return the session after it has read this record. An older record is ignored."""
     if session.known[bucket].revision >= record.revision:
         return session
     known = list(session.known)
@@ -231,7 +232,7 @@ def read(session: Session, bucket: int, record: Stored) -> Session:
 def test_no_line_has_two_masters_or_gets_lost_in_any_interleaving(
     sessions: str, most: int, least: int
 ) -> None:
-    """Two sessions with five records, and three with three, were searched by hand: 553,000 states."""
+    """Two sessions with five records, and three with three, were checked manually: 553,000 states."""
     states, wrong = Model(sessions, most).search()
     assert wrong is None
     assert states > least
@@ -248,6 +249,6 @@ MUTATIONS = {
 
 
 @table("mutation", MUTATIONS)
-def test_each_mutation_has_two_masters_or_a_lost_line(mutation: str) -> None:
+def test_each_mutation_of_the_rules_has_two_masters_or_a_lost_line(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search()
     assert wrong is not None

@@ -33,14 +33,16 @@ from multidrop.gateway.settings import read_settings
         ("every = 5", "every"),
     ],
 )
-def test_each_mistake_is_reported(tmp_path: Path, table: str, sentence: str) -> None:
+def test_each_mistake_in_the_fleet_table_is_reported(tmp_path: Path, table: str, sentence: str) -> None:
     with pytest.raises(PlantError) as raised:
         read_settings(written(tmp_path, f"[serve.fleet]\n{table}\n"), {})
     assert sentence in str(raised.value)
 
 
-def test_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`serve --check` works without it, and `serve` says what to install."""
+def test_fleet_settings_are_checked_without_the_nats_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`serve --check` works without the library, and `serve` reports what to install."""
     for name in [name for name in sys.modules if name.split(".")[0] == "nats"]:
         monkeypatch.setitem(sys.modules, name, None)
     for name in [name for name in sys.modules if name.startswith("multidrop.fleet")]:
@@ -55,7 +57,7 @@ def test_settings_need_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("dying", ["path", "watch"])
 def test_the_part_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch, dying: str) -> None:
-    """The gateway then says so; else the page would show an old fleet for ever."""
+    """The gateway then reports it. Otherwise the page would show an old fleet forever."""
 
     async def go_on() -> None:
         await asyncio.Event().wait()
@@ -72,7 +74,7 @@ def test_the_part_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch,
 
 
 class Looks(FleetView):
-    """A view whose reads succeed until the test makes them fail."""
+    """A view whose reads succeed until the test lets them fail."""
 
     failure: OSError | None = None
 
@@ -81,7 +83,7 @@ class Looks(FleetView):
             raise self.failure
 
 
-def test_an_old_view_is_unhealthy() -> None:
+def test_an_old_view_makes_the_part_unhealthy() -> None:
     now = [0.0]
     view = Looks(ServerPath([]))
     watch = FleetWatch(view, lambda: now[0])
@@ -137,7 +139,7 @@ def test_the_page_shows_a_real_fleet_and_a_missing_one(fleet: Cluster, tmp_path:
 
 
 @pytest.mark.long
-def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
+def test_a_viewers_key_is_enough_to_show_the_fleet(tmp_path: Path) -> None:
     from secured_clusters import multidrop, secured_cluster
 
     plant = written(tmp_path, port="socket://127.0.0.1:4001")
@@ -156,7 +158,7 @@ def test_a_viewers_key_is_enough(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("user", ["viewer", "commander"])
-def test_the_page_stops_the_fleet_with_a_commanders_key_alone(tmp_path: Path, user: str) -> None:
+def test_the_page_stops_the_fleet_only_with_a_commanders_key(tmp_path: Path, user: str) -> None:
     from secured_clusters import secured_fleet
 
     with secured_fleet(tmp_path / "fleet", 1) as fleet:
@@ -179,7 +181,7 @@ def test_the_page_stops_the_fleet_with_a_commanders_key_alone(tmp_path: Path, us
         assert set(drives.values()) == {True}, told
 
 
-def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path: Path) -> None:
+def test_the_page_cannot_stop_the_fleet_without_a_key_or_servers(tmp_path: Path) -> None:
     with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
         assert gateway.get("/api/plant").json["fleet_stop"] is False
         answer = gateway.post("/api/fleet/stop", {})
@@ -198,10 +200,10 @@ def test_the_fleet_is_not_stopped_without_a_key_nor_without_its_servers(tmp_path
 
 
 @pytest.mark.slow
-def test_missing_servers_are_reported(tmp_path: Path) -> None:
+def test_missing_fleet_servers_are_reported_on_the_page(tmp_path: Path) -> None:
     [port] = free_ports(1)
     with served(tmp_path, f'[serve.fleet]\nnats = ["nats://127.0.0.1:{port}"]\n') as gateway:
         wanted = f"it was never read: no NATS server is reached at nats://127.0.0.1:{port}"
         until(lambda: wanted == gateway.get("/health").json["parts"]["fleet"])
         assert gateway.get("/api/fleet").json["age_s"] is None
-        assert gateway.frame()["drives"]  # the gateway's own lines go on
+        assert gateway.frame()["drives"]  # the gateway's own lines are still shown

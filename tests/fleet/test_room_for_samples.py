@@ -1,4 +1,4 @@
-"""Samples never use the space of leases: a server that cannot store leases would end all polling."""
+"""Samples never use the disk space of leases: servers that cannot store leases would end all polling."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_servers_with_too_little_room_are_one_sentence(run: Run, tmp_path: Path,
 
 
 @pytest.mark.long
-def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> None:
+def test_an_existing_stream_is_kept_and_reported(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         with_path(one, lambda path: create_stream(path, replicas=1))
         _, out, err = run("fleet", "init", "--nats", one.urls[0], "--json")
@@ -86,7 +86,7 @@ def test_an_existing_stream_stays_and_is_reported(run: Run, tmp_path: Path) -> N
         assert "the stream of samples" not in run("fleet", "init", "--nats", one.urls[0])[2]
 
 
-def test_an_invalid_size_is_rejected(run: Run) -> None:
+def test_an_invalid_stream_size_is_rejected(run: Run) -> None:
     status, out, err = run("fleet", "init", "--keep", "much")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert "invalid size 'much'" in err

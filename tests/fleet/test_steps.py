@@ -1,4 +1,4 @@
-"""The steps of a gateway and their order, in simulated time, without a server."""
+"""The steps of a gateway's state machine and their order, in simulated time, without a server."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def a_member() -> Member:
 
 
 def steps(wake: Callable[[Member], object]) -> list[float]:
-    """Return when steps were taken (s) from the first to 0.12 s on; after 0.06 s `wake` is called."""
+    """Return the times of the steps in s, during 0.12 s from the first one; `wake` is called at 0.06 s."""
 
     async def main() -> list[float]:
         loop = asyncio.get_running_loop()
@@ -51,7 +51,7 @@ def test_steps_are_taken_periodically() -> None:
 
 
 @pytest.mark.parametrize("times", [1, 100])
-def test_changed_records_cause_a_step_at_once(times: int) -> None:
+def test_changed_records_cause_an_immediate_step(times: int) -> None:
     def wake(member: Member) -> None:
         for _ in range(times):
             member.records._on_change()
@@ -72,14 +72,14 @@ def test_steps_are_never_taken_without_a_pause() -> None:
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
 def test_a_gateway_with_an_expiring_lease_ends_no_other_session(left_s: float, ends: bool) -> None:
-    """The servers fail all alike then; who was ended could not go on when they are back."""
+    """The servers may be failing for all gateways: an ended one could not continue afterwards."""
 
     async def main() -> bool:
         member = a_member()
         clock = HandClock()
         member.lease.clock = clock
         member.lease.until = clock.now + 2 * SECOND
-        await member.step()  # earlier observations are timed again
+        await member.step()  # the waiting times of earlier observations restart
         asked: list[object] = []
 
         async def note(present: object) -> bool:

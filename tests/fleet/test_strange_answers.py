@@ -1,4 +1,4 @@
-"""Invalid answers instead of JetStream's: each causes one sentence and ends no gateway, forwarder or hub."""
+"""Invalid answers instead of JetStream's: each is reported in one sentence, and ends no task."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ TIMES = {
 
 
 class Liar:
-    """A path, or a connection, whose every request has this answer."""
+    """A path or connection that gives this answer to every request."""
 
     url = "nats://liar"
     server_name = "liar"
@@ -73,7 +73,7 @@ class Liar:
 
 @pytest.mark.parametrize("name", [*STRANGE, *PARTS])
 async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: str) -> None:
-    """Gateway, forwarder and hub retry after a FleetError, and end by any other."""
+    """After a FleetError, gateway, forwarder and hub retry; any other exception would end them."""
     path: Any = Liar({**STRANGE, **PARTS}[name])
     bucket = Bucket("own_0", lambda: path)
     for request in (bucket.put("a", {}, 1), bucket.get("a")):
@@ -93,8 +93,8 @@ async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: 
 async def test_invalid_cluster_states_are_reported_and_move_no_leader(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A gateway's tasks read them and must not end."""
-    monkeypatch.setattr(setup, "WAIT_S", 0.0)  # for the end of an election
+    """The gateway's tasks that read cluster states must not end."""
+    monkeypatch.setattr(setup, "WAIT_S", 0.0)  # do not wait for an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(FleetError, match="the answer of NATS about a bucket's servers is invalid"):
         await check_buckets(path)

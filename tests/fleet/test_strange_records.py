@@ -1,4 +1,4 @@
-"""Damaged or hostile records: each is skipped with a warning and affects no other record."""
+"""Damaged or hostile records: each is skipped with a warning, and affects no other record."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_valid_record_may_have_further_fields(bucket: str, key: str, value: di
     assert parsed(bucket, key, json.dumps(value).encode()) == (value, "")
     more = {**value, "of another version": [1, 2]}
     assert parsed(bucket, key, json.dumps(more).encode()) == (more, "")
-    assert parsed(bucket, key, b"") == (None, "")  # removed
+    assert parsed(bucket, key, b"") == (None, "")  # the record was removed
 
 
 async def test_an_invalid_record_is_logged_once_and_others_are_read(
@@ -108,7 +108,7 @@ async def test_a_record_written_by_another_gateway_is_an_end(one: Cluster) -> No
     async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
-        assert (await rogue.get("gw-1")).value == LEASE  # no other user has written it
+        assert (await rogue.get("gw-1")).value == LEASE  # no other user has written a record
         await rogue.put("gw-1", {**LEASE, "session": 8, "ended": False}, revision)
         ended = {**LEASE, "session": 8, "ended": True, "by": "gw-2"}
         assert (await own.get("gw-1")).value == ended
@@ -117,7 +117,7 @@ async def test_a_record_written_by_another_gateway_is_an_end(one: Cluster) -> No
 
 @pytest.mark.long
 async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each bucket has one of each kind before the gateway starts, and gets more while it works."""
+    """Each bucket has an invalid record of each kind before the gateway starts, and gets more later."""
     monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
 
     async def strew(path: ServerPath, suffix: str) -> None:
@@ -132,7 +132,7 @@ async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pyt
         await strew(path, "-before")
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         mastership = RecordingMastership(boottime_ns)
-        terms = USUAL._replace(lease=10 * SECOND)  # so that a busy machine costs it no session
+        terms = USUAL._replace(lease=10 * SECOND)  # long enough for a busy machine
         member = Member("gw-a", paths, Hall().add("gw-a", mastership), mastership, terms=terms)
         task = asyncio.create_task(member.run())
 
@@ -145,7 +145,7 @@ async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pyt
         await strew(path, "-again")
         await asyncio.wait([task], timeout=1.0)
         await until_polled(is_first=True)
-        for bucket in names.LEASES[:2]:  # our own ones: that costs only a session
+        for bucket in names.LEASES[:2]:  # our own records: losing them costs only a session
             await path.request(f"$KV.{bucket}.gw-a.rogue", b"{")
         await until_polled(is_first=False)
         task.cancel()
@@ -156,7 +156,7 @@ async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pyt
 
 @pytest.mark.long
 async def test_an_early_end_by_another_counts_once_the_lease_has_expired(one: Cluster) -> None:
-    """Its gateway hangs, and its engine polls on for as long as the lease holds: it cannot know."""
+    """The gateway may hang while its engine polls on: it cannot know that its session was ended."""
     async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         hall, members, tasks = Hall(), {}, {}
@@ -222,7 +222,7 @@ async def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes,
 
 
 @pytest.mark.slow
-async def test_a_refusal_of_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
+async def test_a_refusal_by_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
     async with connected_path(one) as path:
         with pytest.raises(ServerError, match="NATS refuses: "):
             await Bucket("nothing", lambda: path).get("gw-1")

@@ -1,4 +1,4 @@
-"""Tasks that ignore a cancellation are ended in finite time."""
+"""Tasks that ignore cancellations are still ended in finite time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PATIENCE_S = 60.0
 
 
 async def deaf(times: int) -> str:
-    """Go on after so many cancellations, as a path does whose pong comes in that moment."""
+    """Ignore this many cancellations, as a path does if a pong arrives at the same moment."""
     for _ in range(times):
         try:
             await asyncio.sleep(3600)
@@ -28,7 +28,7 @@ async def _begun(times: int) -> asyncio.Task[str]:
     return task
 
 
-async def test_a_task_is_cancelled_until_it_is_over() -> None:
+async def test_a_task_is_cancelled_until_it_has_ended() -> None:
     tasks = [await _begun(times) for times in (0, 1, 3)]
     found = await asyncio.wait_for(end_tasks(*tasks), PATIENCE_S)
     assert [type(one) for one in found] == [asyncio.CancelledError] * 3

@@ -1,4 +1,4 @@
-"""FleetGateway: one gateway process of a fleet. It polls its share of the lines and forwards their samples."""
+"""FleetGateway: a gateway process of a fleet. It polls its share of the lines and forwards their samples."""
 
 from __future__ import annotations
 

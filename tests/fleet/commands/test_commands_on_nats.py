@@ -1,4 +1,4 @@
-"""Commands on real servers: delivered on three paths, carried out once, by the present master only."""
+"""Commands on real servers: delivered on three paths, and carried out once, only by the present master."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ATTEMPTS = 20
 
 
 class OnNats:
-    """One gateway's desks, on subjects of real servers."""
+    """One gateway's desks, subscribed at real servers."""
 
     def __init__(self, cluster: Cluster, name: str, made: Desks) -> None:
         self.made = made
@@ -66,7 +66,7 @@ class OnNats:
 
 
 class Fleet:
-    """Two gateways and an asker."""
+    """Two gateways, and a client that sends commands."""
 
     def __init__(self, cluster: Cluster, folder: Path, gateways: list[OnNats]) -> None:
         self.one, self.other = gateways
@@ -131,7 +131,7 @@ def test_a_command_received_on_three_paths_is_sent_once(tell: Callable[[Story], 
     tell(story)
 
 
-def test_without_a_master_nothing_is_sent_and_that_is_certain(tell: Callable[[Story], None]) -> None:
+def test_without_a_master_a_command_is_reported_as_not_sent(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         await fleet.one.shut()
@@ -166,7 +166,7 @@ async def _is_unheard(path: ServerPath, subject: str) -> bool:
 
 
 async def _died(fleet: Fleet) -> None:
-    """Kill the first gateway, wait until all servers know that, and open the line on the other."""
+    """Kill the first gateway, wait until all servers know that, and open the line on the other gateway."""
     await fleet.one.die()
     async with asyncio.timeout(PATIENCE_S):
         for path in fleet.asker._paths:
@@ -181,7 +181,7 @@ async def _lost(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("deed", [_moved, _moved_back, _died, _lost])
-def test_a_line_moved_after_the_offer_sends_nothing(
+def test_a_command_is_not_sent_if_its_line_moves_after_the_offer(
     tell: Callable[[Story], None], deed: Callable[[Fleet], Awaitable[None]]
 ) -> None:
     async def story(fleet: Fleet) -> None:
@@ -212,7 +212,7 @@ def test_a_confirmation_duplicated_on_all_paths_is_carried_out_once(tell: Callab
     tell(story)
 
 
-def test_another_gateway_rejects_an_offer(tell: Callable[[Story], None]) -> None:
+def test_a_gateway_rejects_the_offer_of_another_gateway(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()
@@ -226,7 +226,7 @@ def test_another_gateway_rejects_an_offer(tell: Callable[[Story], None]) -> None
     tell(story)
 
 
-async def test_subscriptions_follow_their_path(fleet: Cluster) -> None:
+async def test_subscriptions_move_with_their_path_to_another_server(fleet: Cluster) -> None:
     path, asker = (ServerPath(fleet.urls[number:]) for number in (0, 1))
     heard: list[str] = []
 
@@ -270,12 +270,12 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandDrill]:
         yield found
 
 
-def test_the_command_line_writes_and_stops(drill: CommandDrill) -> None:
+def test_the_fleet_command_line_writes_and_stops(drill: CommandDrill) -> None:
     before = drill.setpoints("drive-0")
     for _ in range(ATTEMPTS):
         done = drill.run("write", "drive-0", "frequency", "49.99", "--yes", "--json", "--by", "anna")
         answer = json.loads(done.stdout)
-        if answer["outcome"] != "not sent":  # a busy machine may need more than a second
+        if answer["outcome"] != "not sent":  # on a busy machine the confirmation may come too late
             break
     assert done.returncode == 0, done.stderr
     assert (answer["outcome"], answer["held"]) == ("done", "49.99 Hz")
@@ -303,7 +303,7 @@ def test_the_command_line_writes_and_stops(drill: CommandDrill) -> None:
 
 
 def test_commands_are_carried_out_once_and_answers_are_true(drill: CommandDrill) -> None:
-    """`python -m bench.questions.fleet_commands --commands 6000` is the whole."""
+    """`python -m bench.questions.fleet_commands --commands 6000` is the long version."""
     before = {drive: drill.setpoints(drive) for drive in drill.sims}
     found = asyncio.run(drill.ask(120, 15.0))
     assert (found.twice, found.wrongly, found.unnoted) == (0, 0, 0)

@@ -1,4 +1,4 @@
-"""Commands at a gateway: the present master sends each once and in time, or not at all."""
+"""Commands at a gateway: the line's master sends each one once and in time, or not at all."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DONE, REFUSED, NOT_SENT, UNKNOWN = (
 )
 SETPOINT = "frequency"
 
-pytestmark = patient  # a stop whose reply is late is sent again, and the writes are counted here
+pytestmark = patient  # writes are counted here, and a stop is repeated if its reply is late
 
 
 def setpoints(desk: Desks) -> list[int]:
@@ -75,7 +75,7 @@ def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Des
     assert setpoints(desk) == [2000]
 
 
-def test_copies_of_a_request_are_one_offer(desk: Desks) -> None:
+def test_copies_of_a_request_get_the_same_offer(desk: Desks) -> None:
     same = {"id": "one", "register": SETPOINT, "value": 20.0}
     assert desk.offered(**same) == desk.offered(**same)
     assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
@@ -92,7 +92,7 @@ def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome:
 
 
 def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
-    """The library may use only the rest of the second."""
+    """The bus waits only for the rest of the second until it must send."""
     with desks(tmp_path, patience_s=0) as desk:
         _is_held_up(desk)
 
@@ -116,7 +116,7 @@ def _is_held_up(desk: Desks) -> None:
 
 
 def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(tmp_path: Path) -> None:
-    """The library asks again right before it sends."""
+    """The bus checks again right before it sends."""
     with desks(tmp_path) as desk:
         token = desk.offered()
         offer = desk.desk.offers.find(token)
@@ -134,7 +134,7 @@ def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(tmp_path: Path) ->
 
 def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with desks(tmp_path) as desk:
-        synced: list[tuple[int, int]] = []  # lines of the log, and writes that the drive had by then
+        synced: list[tuple[int, int]] = []  # lines in the log, and writes received by the drive by then
 
         def sync(file: int) -> None:
             os.fsync(file)
@@ -146,7 +146,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
 
 
 def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
-    """Do it while a command's first record is written: the last moment before it is sent."""
+    """Call `deed` while a command's first record is being logged: the last moment before it is sent."""
 
     def before(record: dict[str, Any]) -> None:
         if record["step"] == "begun":
@@ -173,8 +173,8 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-def test_a_command_is_not_sent_after_a_change_in_between(desk: Desks, deed: str, is_late: bool) -> None:
-    """Between the offer and the word to do it, and between that word and the sending."""
+def test_a_command_is_not_sent_after_a_change_since_its_offer(desk: Desks, deed: str, is_late: bool) -> None:
+    """The change comes before the confirmation, or between the confirmation and the sending."""
     if is_late:
         answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
     else:
@@ -185,7 +185,7 @@ def test_a_command_is_not_sent_after_a_change_in_between(desk: Desks, deed: str,
     assert desk.writes == []
 
 
-def test_a_stop_of_another_drive_keeps_the_offer(desk: Desks) -> None:
+def test_a_stop_of_another_drive_does_not_void_the_offer(desk: Desks) -> None:
     token = desk.offered()
     desk.desk.offers.void(LINE, ["fan"], "a stop was called")
     desk.desk.offers.void("hall-2", None, "a stop was called")
@@ -201,8 +201,8 @@ def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) 
     assert desk.writes == []
 
 
-def test_only_the_master_answers(desk: Desks) -> None:
-    """Another gateway may be the master, and the first answer counts."""
+def test_only_the_master_answers_commands_and_stops(desk: Desks) -> None:
+    """Another gateway may be the master, and the sender uses the first answer."""
     desk.is_master = False
     assert desk.ask(register=SETPOINT, value=20.0) is None
     assert asyncio.run(desk.stop()) is None
@@ -231,7 +231,7 @@ def test_asking_for_the_result_withdraws_the_offer(desk: Desks) -> None:
     assert desk.writes == []
 
 
-def test_without_a_list_only_stops_are_carried_out(tmp_path: Path) -> None:
+def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) -> None:
     with desks(tmp_path, {}) as desk:
         for what in ({"register": SETPOINT, "value": 20.0}, {"verb": "start"}, {"verb": "emergency_stop"}):
             answer = desk.ask(**what)
@@ -246,7 +246,7 @@ def test_without_a_list_only_stops_are_carried_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("may", ["all", [], {"write": "pump.frequency"}, {"write": [["pump.frequency"]]}])
-def test_a_damaged_list_allows_nothing(tmp_path: Path, may: Any) -> None:
+def test_a_damaged_permission_list_allows_nothing(tmp_path: Path, may: Any) -> None:
     with desks(tmp_path, may) as desk:
         answer = desk.ask(register=SETPOINT, value=20.0)
         assert isinstance(answer, CommandAnswer)
@@ -268,7 +268,7 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
 
 @pytest.mark.slow
 def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
-    """Long before the motor is at rest, the sender learns that the stop was sent."""
+    """The sender learns that the stop was sent long before the motor has stopped."""
     desk.sim["output_frequency"] = 10.0
     data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
     sentence = "pump: the stop was confirmed, but the motor is not yet seen to stand"
@@ -297,7 +297,7 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
 ) -> None:
-    """A copy may have reached that one. Where we have the line again, the asker's next copy stops it."""
+    """The next master may have got a copy of the stop. If we are master again, we answer the next copy."""
 
     def lost(seconds: float | None) -> dict[str, Stopped]:
         LOSSES[loss](desk)
@@ -315,7 +315,7 @@ def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
     assert desk.written == {"control"}
 
 
-def test_a_stop_withdraws_offers_and_its_copies_count_once(desk: Desks) -> None:
+def test_copies_of_a_stop_are_sent_once_and_void_offers(desk: Desks) -> None:
     token = desk.offered()
 
     async def main() -> CommandAnswer:
@@ -416,7 +416,7 @@ def test_hostile_commands_are_refused_in_one_sentence(desk: Desks, data: bytes) 
     assert desk.writes == []
 
 
-ODD_STOPS = [  # messages that any asker may send, or a network may spoil
+ODD_STOPS = [  # messages that any client may send, or that a network may damage
     b"",
     b"\xff\xfe",
     b"null",
@@ -460,8 +460,8 @@ def test_a_malformed_stop_is_carried_out(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is noted in words that can be printed, and one that names no drives stops all of the line."""
-    # Who asks again for a stop without an id asks for another one.
+    """It is logged as printable text. A stop that names no drives stops all drives of the line."""
+    # A repeated request without an id would be a new stop.
     monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
     assert answer is not None
@@ -502,7 +502,7 @@ def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
 
 
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
-    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    """By keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     with desks(tmp_path, {"write": [f"{spelt}.frequency"]}, name=fan) as desk:
         told = desk.ask(drive=spelt, register="frequency", value=20.0)
@@ -515,7 +515,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 
 
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
-def test_an_asker_rejects_invalid_answers(data: bytes) -> None:
+def test_a_sender_rejects_invalid_answers(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)
 
@@ -524,7 +524,7 @@ def test_an_asker_rejects_invalid_answers(data: bytes) -> None:
 def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Each is sent after its call, and all have the answer of the one that is repeated."""
+    """Each stop is sent after its call. All calls get the answer of the stop that is repeated."""
     repeated: list[float | None] = []
 
     def noted(*details: Any, stop: Callable[..., Results]) -> Results:
@@ -551,10 +551,10 @@ def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     with desks(tmp_path) as desk:
         answers = asyncio.run(stopped(desk))
     assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
-    assert repeated == [None, 0.0, 0.0]  # the last stop serves seven callers
+    assert repeated == [None, 0.0, 0.0]  # the last stop answers seven calls
 
 
-def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:
+def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     for request in (
         CommandRequest("1", "anna", "mill", register="setpoint", value=10.0),
@@ -566,7 +566,7 @@ def test_a_command_to_a_drive_that_has_left_its_line_was_not_sent() -> None:
 
 
 def test_an_offer_keeps_the_known_setpoint() -> None:
-    """It is not sent yet, and perhaps never: a start would be refused, or not see a power cycle."""
+    """The offered command may never be sent. A changed setpoint would affect the next start."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     drive.commanded = 40.0
     prepare(drive, CommandRequest("1", "anna", "mill", verb="set_frequency", options={"hz": 10.0}))

@@ -1,4 +1,4 @@
-"""The sender of a command: certain outcomes are true, and the command is sent once, whatever is answered."""
+"""The sender of commands: each command is sent once, and its reported outcome is true."""
 
 from __future__ import annotations
 
@@ -30,14 +30,17 @@ def answer(outcome: str, text: str = "as it is") -> dict[str, str]:
 
 
 class Said:
-    """A message that came back."""
+    """A message that was received."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
 
 
 class ScriptedPath:
-    """A path with answers by kind of request: "cmd", "do", "ask" or "stop"; the last one is repeated."""
+    """A path with a list of answers for each kind of request: "cmd", "do", "ask" or "stop".
+
+    The last answer of a list is repeated.
+    """
 
     is_open = True
 
@@ -57,11 +60,11 @@ class ScriptedPath:
         return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
 
     async def close(self) -> None:
-        """Keep the script."""
+        """Do nothing: the answers stay."""
 
 
 class Plant:
-    """The plant's bucket, as far as it can be read."""
+    """The plant's bucket, of which a test may make reads fail."""
 
     def __init__(self, failure: FleetError | None = None) -> None:
         self._failure = failure
@@ -83,7 +86,7 @@ def asked(
     plant: Plant | None = None,
     nobody_s: float = 0.01,
 ) -> CommandAnswer:
-    """Return the result of a sender that has only this path."""
+    """Return the result of a command from a client that has only this path."""
 
     async def main() -> CommandAnswer:
         asker = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
@@ -106,7 +109,7 @@ def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
 
 NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
 NO_RIGHT = MayNotSend("no right")
-ANY = FleetError("no right")  # the request may have been delivered
+ANY = FleetError("no right")  # the gateway may have received the request
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
 
 WRITES: dict[
@@ -199,7 +202,7 @@ def test_a_stop_is_sent_until_a_gateway_answers(tmp_path: Path, case: str) -> No
     assert told.text.startswith(text)
 
 
-def test_progress_of_a_stop_is_reported_once(tmp_path: Path) -> None:
+def test_progress_of_a_stop_is_reported_once_per_change(tmp_path: Path) -> None:
     sent, turning = answer("under way", "sent"), answer("under way", "still turning")
     path = ScriptedPath(stop=[sent, sent, LOST, turning, sent, IT_IS_DONE])
     told: list[CommandAnswer] = []
@@ -211,7 +214,7 @@ def test_progress_of_a_stop_is_reported_once(tmp_path: Path) -> None:
     assert last.outcome is DONE
 
 
-def test_a_missing_master_is_reported_once_at_once(tmp_path: Path) -> None:
+def test_a_missing_master_is_reported_once_and_immediately(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
     last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
@@ -223,7 +226,7 @@ def test_a_missing_master_is_reported_once_at_once(tmp_path: Path) -> None:
     ]
 
 
-def test_a_stop_without_further_answers_reports_the_last_one(tmp_path: Path) -> None:
+def test_a_stop_whose_gateway_falls_silent_reports_its_last_answer(tmp_path: Path) -> None:
     path = ScriptedPath(
         stop=[{**answer("under way", "pump-1: the stop was sent"), "gateway": "gw-1"}, NOBODY]
     )
@@ -232,7 +235,7 @@ def test_a_stop_without_further_answers_reports_the_last_one(tmp_path: Path) -> 
     assert last.text.endswith("; its last answer: pump-1: the stop was sent")
 
 
-def test_a_stop_without_answers_is_reported_before_giving_up(tmp_path: Path) -> None:
+def test_a_stop_without_answers_is_reported_before_the_client_gives_up(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[LOST])
     last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
@@ -297,7 +300,7 @@ def test_an_unopened_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     assert path.asked == ["stop"]
 
 
-def test_only_the_agreed_text_is_carried_out(tmp_path: Path) -> None:
+def test_only_the_confirmed_text_is_carried_out(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
 
     async def agreed(asker: FleetCommands) -> CommandAnswer:
@@ -318,14 +321,14 @@ def test_all_lines_are_stopped_and_the_worst_outcome_is_returned(tmp_path: Path)
     assert told.drives["pump-1"].outcome is DONE
 
 
-def test_drives_of_one_line_are_one_stop(tmp_path: Path) -> None:
+def test_the_drives_of_one_line_are_stopped_by_one_message(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
     asked(tmp_path, path, lambda asker: asker.stop(["pump-1", "fan-1", "pump-2"]))
     assert path.asked == ["stop", "stop"]
 
 
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
-    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    """By keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     plant = Plant()
     plant.records["hall-3"] = Record("hall-3", 1, {"line": {"drive": [{"name": fan}]}})
@@ -345,7 +348,7 @@ def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted
 
     async def stopped(asker: FleetCommands) -> CommandAnswer:
         asker.by = by
-        return await asker.stop("pump-1")  # for ["pump-1"]: a text is a list of letters too
+        return await asker.stop("pump-1")  # means ["pump-1"], although a text is a sequence too
 
     assert asked(tmp_path, path, stopped).outcome is DONE
     assert path.asked == ["stop"]
@@ -353,12 +356,12 @@ def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted
 
 
 @pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
-def test_an_unreadable_plant_sends_nothing(tmp_path: Path, what: Any) -> None:
+def test_without_a_readable_plant_nothing_is_sent(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):
         asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
 
 
-def test_an_earlier_copy_of_the_plant_is_enough(tmp_path: Path) -> None:
+def test_an_older_copy_of_the_plant_is_enough_for_commands(tmp_path: Path) -> None:
     plant = Plant()
     plant._failure = FleetError("no server")
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])

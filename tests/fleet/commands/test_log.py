@@ -1,4 +1,4 @@
-"""The log of commands on disks that hang or fail, and a log thread that is killed."""
+"""The log of commands on disks that hang or fail, and after its thread was killed."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ async def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path)
         await _write_and_stop(desk)
 
 
-async def test_records_are_in_the_order_of_the_calls_and_none_follows_the_closing(tmp_path: Path) -> None:
+async def test_log_records_keep_the_order_of_calls_and_end_at_closing(tmp_path: Path) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
     await asyncio.gather(*(log.note({"step": number}) for number in range(5)))
     log.close()

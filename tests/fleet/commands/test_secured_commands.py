@@ -1,4 +1,4 @@
-"""Commands under the rights that `fleet rights` writes: a commander may, a viewer may not."""
+"""Commands under the rights that `fleet rights` writes: a commander may send them, a viewer may not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def servers(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SecuredC
 
 @asynccontextmanager
 async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[CommandSubjects]:
-    """Accept commands with the rights of a gateway."""
+    """Accept commands as a gateway, with a gateway's rights."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
     await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
@@ -90,7 +90,7 @@ async def nobody_is_asked(asker: Client) -> bool:
 
 
 def test_servers_report_a_line_without_gateway(servers: SecuredCluster, tmp_path: Path) -> None:
-    """Servers report it across the accounts of commander and gateway."""
+    """Servers report this although commander and gateway are in different accounts."""
 
     async def main(made: Desks) -> None:
         async with commanded(servers, made) as subjects:

@@ -1,4 +1,4 @@
-"""Gateways with an incompatible ownership protocol: which they are, and when they are gone."""
+"""Gateways with an incompatible ownership protocol: which they are, and when they no longer count."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SENTENCE = "incompatible version of multidrop in this fleet: no line is taken un
 
 
 class Trial:
-    """A gateway called "me" that watches others, whose sessions are in memory."""
+    """A gateway called "me" that watches other gateways, whose sessions are in memory."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock = HandClock()
@@ -28,7 +28,7 @@ class Trial:
         self._monkeypatch = monkeypatch
 
     def begin(self, name: str, rules: int) -> Lease:
-        """Start the session of a gateway with these rules."""
+        """Start a session of a gateway with this version of the rules."""
         lease = Lease(name, self.buckets, RecordingMastership(self.clock), clock=self.clock)
         with self._monkeypatch.context() as patch:
             patch.setattr(lease_rules, "RULES", rules)
@@ -37,7 +37,7 @@ class Trial:
 
     @property
     def trouble(self) -> str:
-        """Return the sentence after a read of all paths."""
+        """Read all paths, and return the sentence about incompatible gateways."""
         for path in range(3):
             asyncio.run(self.observer.look(path))
         self.incompatible.look(self.observer.sessions())
@@ -59,7 +59,7 @@ def test_an_incompatible_gateway_is_named_until_it_ends(trial: Trial) -> None:
     assert trial.trouble == ""
 
 
-def test_a_record_without_a_version_is_incompatible(trial: Trial) -> None:
+def test_a_record_without_a_rules_version_is_incompatible(trial: Trial) -> None:
     trial.begin("first", RULES)
     for bucket in trial.buckets:
         bucket.store(
@@ -68,7 +68,7 @@ def test_a_record_without_a_version_is_incompatible(trial: Trial) -> None:
     assert trial.trouble == SENTENCE.format("first")
 
 
-def test_a_killed_gateway_is_waited_for_at_most_its_lease(trial: Trial) -> None:
+def test_a_killed_incompatible_gateway_counts_for_at_most_its_lease(trial: Trial) -> None:
     trial.begin("older", RULES - 1)
     assert trial.trouble
     trial.clock.now += USUAL.lease - 1
@@ -77,6 +77,6 @@ def test_a_killed_gateway_is_waited_for_at_most_its_lease(trial: Trial) -> None:
     assert trial.trouble == ""
 
 
-def test_our_own_earlier_session_is_not_an_incompatible_gateway(trial: Trial) -> None:
+def test_our_own_earlier_session_is_never_incompatible(trial: Trial) -> None:
     trial.begin("me", RULES - 1)
     assert trial.trouble == ""

@@ -1,4 +1,4 @@
-"""The lines for which this gateway accepts commands, and the commands that each line's plant record allows."""
+"""The lines for which this gateway accepts commands, and the commands that each line's record allows."""
 
 from __future__ import annotations
 

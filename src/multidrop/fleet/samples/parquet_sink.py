@@ -129,9 +129,7 @@ def _joined(commit: Commit) -> Any:
     drives = table.column("drive").chunk(0)
     ranks = pc.rank(drives.dictionary).cast(pa.int32()).take(drives.indices)
     by_time = pc.array_sort_indices(table.column("time").chunk(0).cast(pa.int64()))
-    return table.take(
-        by_time.take(pc.array_sort_indices(ranks.take(by_time)))
-    )  # this sort keeps the order of times
+    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # the second sort is stable
 
 
 def _about(commit: Commit) -> dict[str, Any]:

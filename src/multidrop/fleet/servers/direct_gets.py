@@ -97,7 +97,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
                     failure = failed
             is_refused = isinstance(
                 failure, NoRight
-            )  # the same on all paths: all servers grant the same rights
+            )  # and so on all paths: all servers have one list of rights
             if not gets and (number or not ways[1:] or is_refused):
                 break
         raise failure

@@ -27,9 +27,7 @@ CLUSTER = "multidrop"
 ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
 MOST_PORTS = 65535
 STORE = Path("/var/lib/nats")
-PINGS = (
-    'ping_interval: "1s", ping_max: 2'  # for routes: a dead one is noticed after 3 s, not after 60 to 90 s
-)
+PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: a dead one is noticed after 3 s, not 60 to 90 s
 
 
 class TlsFiles(NamedTuple):
