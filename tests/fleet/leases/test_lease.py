@@ -1,4 +1,4 @@
-"""Start, renewals and end of a session, with records in memory and a settable clock."""
+"""Start, renewal and end of a session, with records in memory and a clock that the tests set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from multidrop.fleet.leases.rules import SECOND, USUAL
 
 
 class Trial:
-    """Three buckets and a clock; gateways are made by `lease` and `observer`."""
+    """Three buckets and a clock. Gateways are created by `lease` and `observer`."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -60,17 +60,17 @@ async def begun() -> tuple[Trial, Lease]:
 
 
 async def watched() -> tuple[Trial, Lease, Observer]:
-    """Return the same, and an observer that has read the session's records."""
+    """Return a trial, a lease with a session, and an observer that has read the session's records."""
     trial, lease = await begun()
     observer = trial.observer()
     await look(observer)
     return trial, lease, observer
 
 
-async def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> None:
+async def test_a_session_starts_on_all_paths_and_counts_from_its_request() -> None:
     trial = Trial()
     for bucket in trial.buckets:
-        bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes its time
+        bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes 0.25 s
     lease, began = trial.lease(), trial.clock.now
     assert await lease.try_to_begin()
     assert lease.session == 1
@@ -78,7 +78,7 @@ async def test_a_session_starts_on_all_paths_and_counts_from_its_sending() -> No
     assert trial.masterships[0].until == lease.until
 
 
-async def test_a_renewal_counts_from_its_sending() -> None:
+async def test_a_renewal_counts_from_its_request() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
     sent = trial.clock.now
@@ -90,14 +90,14 @@ async def test_a_renewal_counts_from_its_sending() -> None:
 
 
 async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
-    """The time of its sending is unknown."""
+    """It is unknown when the stored record was sent."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease, began = trial.lease(), trial.clock.now
     assert await lease.try_to_begin()
     trial.buckets[2].loses_answers = False
     trial.clock.pass_s(1)
-    await lease.renew_once(2)  # finds its record
+    await lease.renew_once(2)  # finds the record that the unanswered start has stored
     assert lease.held[2] is not None
     trial.clock.pass_s(0.5)
     await lease.renew_once(1)
@@ -106,7 +106,7 @@ async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
     assert lease.until == began + 1.5 * SECOND + USUAL.lease
 
 
-async def test_the_deadline_is_the_second_latest() -> None:
+async def test_the_deadline_is_that_of_the_second_newest_renewal() -> None:
     trial, lease = await begun()
     began = trial.clock.now
     trial.clock.pass_s(1)
@@ -129,14 +129,14 @@ async def test_the_lease_survives_one_lost_path_but_not_two() -> None:
         trial.clock.pass_s(0.5)
         await renew(lease)
     assert not lease.is_valid
-    trial.buckets[1].is_down = False  # no one has ended it: the same session continues
+    trial.buckets[1].is_down = False  # no other gateway has ended its record, so the session continues
     await renew(lease)
     assert lease.is_valid
     assert lease.session == 1
 
 
 def test_a_failed_renewal_is_retried_soon() -> None:
-    """The renewal does not wait once its bucket has a leader."""
+    """The path is renewed as soon as its bucket has a leader."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -167,7 +167,7 @@ async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     trial.clock.pass_s(1)
     for _ in range(2):
         await renew(lease)
-        lease._extend()  # as after the next answer
+        lease._extend()  # as after the answer on another path
         assert lease.until == until
     for bucket in trial.buckets:
         bucket.loses_answers = False
@@ -175,7 +175,7 @@ async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     assert lease.until == until + SECOND
 
 
-async def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
+async def test_a_late_answer_to_an_earlier_session_is_not_counted() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
 
@@ -191,8 +191,8 @@ async def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
     assert not lease.is_valid
 
 
-async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> None:
-    """Otherwise the next gateway would wait for the lease to expire."""
+async def test_a_session_ends_despite_renewals_stored_meanwhile() -> None:
+    """Otherwise the next gateway would wait until the lease expires."""
     trial, lease = await begun()
     for bucket, value in zip(trial.buckets, trial.values(), strict=True):
         bucket.store("a", value)
@@ -202,7 +202,7 @@ async def test_renewals_that_are_stored_while_a_session_ends_hide_no_end() -> No
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_an_end_replaces_only_renewals_of_its_own_session(later: dict[str, Any]) -> None:
+async def test_an_end_replaces_only_renewals_of_the_same_session(later: dict[str, Any]) -> None:
     trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
@@ -210,7 +210,7 @@ async def test_an_end_replaces_only_renewals_of_its_own_session(later: dict[str,
     assert trial.buckets[0].records["a"].value.get("by") == later.get("by")
 
 
-async def test_unanswered_renewals_at_the_end_start_no_session() -> None:
+async def test_an_unanswered_renewal_does_not_extend_an_ended_session() -> None:
     """Otherwise the engine might send again, and the kernel's timer would run without a session."""
     trial = Trial()
     gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
@@ -230,7 +230,7 @@ async def test_unanswered_renewals_at_the_end_start_no_session() -> None:
     assert trial.masterships[0].events == ["extend", "end"]
 
 
-async def test_a_late_path_of_an_ended_session_is_not_used_by_the_next() -> None:
+async def test_a_late_answer_of_an_ended_session_gives_the_next_no_path() -> None:
     trial = Trial()
     late = GatedBucket("lease_2", answers=True)
     trial.buckets[2] = late
@@ -252,7 +252,7 @@ async def test_a_late_path_of_an_ended_session_is_not_used_by_the_next() -> None
 
 
 async def test_a_suspension_between_clock_and_timer_is_survived() -> None:
-    """A timer in the past would kill the process; the engine refuses it."""
+    """A timer that is set to the past would kill the process, so the engine refuses it."""
 
     class StandingStill(RecordingMastership):
         def extend(self, until_ns: int) -> None:
@@ -268,8 +268,8 @@ async def test_a_suspension_between_clock_and_timer_is_survived() -> None:
     assert not lease.is_valid
 
 
-async def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
-    """CLOCK_BOOTTIME starts again when a machine does."""
+async def test_session_numbers_come_from_the_record_not_from_a_clock() -> None:
+    """CLOCK_BOOTTIME restarts when a computer boots."""
     trial, lease = await begun()
     await lease.end()
     trial.clock.now = 3 * SECOND
@@ -279,8 +279,8 @@ async def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
     assert [value["session"] for value in trial.values()] == [2, 2, 2]
 
 
-async def test_no_session_number_is_used_twice_whatever_others_write() -> None:
-    """Otherwise lines that others consider free could belong to a session that polls them."""
+async def test_no_session_number_is_reused_whatever_the_records_say() -> None:
+    """Otherwise lines that other gateways consider free could belong to a session that polls them."""
     trial = Trial()
     lease = trial.lease()
     for number in (1, 2, 3):
@@ -294,15 +294,15 @@ async def test_no_session_number_is_used_twice_whatever_others_write() -> None:
     assert lease.session == 4
     await lease.end()
     for bucket in trial.buckets:
-        bucket.store("a", None)  # as a record that is none of ours is read
-    after, newest = trial.lease(), trial.buckets[0].last  # of another process
+        bucket.store("a", None)  # as an invalid record is read
+    after, newest = trial.lease(), trial.buckets[0].last  # a lease of another process
     assert not await after.try_to_begin()
     trial.clock.pass_s(USUAL.lease / SECOND)
     assert await after.try_to_begin()
     assert after.session == newest + 1 > 4
 
 
-async def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
+async def test_a_gateway_with_a_taken_name_waits_until_the_lease_expires() -> None:
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     assert await first.try_to_begin()
@@ -324,7 +324,7 @@ async def test_a_stranger_of_the_same_name_waits_for_a_lease() -> None:
 
 
 async def test_a_single_free_path_is_not_taken() -> None:
-    """Otherwise a waiting namesake would take the paths one after the other."""
+    """Otherwise a waiting namesake would take one path after another."""
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     assert await first.try_to_begin()
@@ -337,7 +337,7 @@ async def test_a_single_free_path_is_not_taken() -> None:
     assert first.is_valid
 
 
-async def test_two_simultaneous_starts_are_never_both_valid() -> None:
+async def test_of_two_simultaneous_starts_at_most_one_is_valid() -> None:
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
@@ -346,7 +346,7 @@ async def test_two_simultaneous_starts_are_never_both_valid() -> None:
 
 
 async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
-    """The first session renews path 0 right before the second one takes it, and path 2 all the time."""
+    """The first session renews path 0 right before the second one takes it, and keeps renewing path 2."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
     first, second = trial.lease(), trial.lease()
@@ -369,7 +369,7 @@ async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
     assert not second.is_valid
 
 
-async def test_the_lock_file_proves_the_predecessors_death(
+async def test_the_lock_file_proves_that_the_predecessor_is_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
@@ -378,7 +378,7 @@ async def test_the_lock_file_proves_the_predecessors_death(
     assert await trial.lease(lock=lock).try_to_begin()
     with pytest.raises(FleetError, match="another gateway of this machine uses"):
         LifeLock(tmp_path / "a.lock")
-    lock.close()  # as the kernel does for a process that is killed
+    lock.close()  # the kernel does this when a process is killed
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         again = trial.lease(lock=lock)
         assert await again.try_to_begin()
@@ -391,10 +391,10 @@ async def test_the_lock_file_proves_the_predecessors_death(
         ("this machine", "another machine", True),
         ("this machine", "", True),
         ("", "", True),
-        ("this machine", "this machine", False),  # another file at this path, as in two containers
+        ("this machine", "this machine", False),  # another file at the same path, as in two containers
     ],
 )
-async def test_a_lock_of_another_machine_or_file_proves_nothing(
+async def test_a_lock_of_another_machine_or_file_proves_no_death(
     before: str, after: str, is_copied: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
@@ -411,7 +411,7 @@ async def test_a_lock_of_another_machine_or_file_proves_nothing(
 async def test_a_copied_disk_or_a_reboot_proves_no_death(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The machine's id, the path and the lock's own id are copied; the kernel's boot is not."""
+    """The machine id, the path and the lock's id are copied; the id of the kernel's boot is not."""
     trial = Trial()
     machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
     machine.write_text("copied\n", "utf-8")
@@ -428,7 +428,7 @@ async def test_a_copied_disk_or_a_reboot_proves_no_death(
 
 
 @pytest.mark.parametrize("empty", [0, 1])
-def test_without_one_of_its_ids_a_machine_has_none(
+def test_a_machine_without_one_of_its_ids_counts_as_unknown(
     empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
@@ -442,14 +442,14 @@ def test_without_one_of_its_ids_a_machine_has_none(
     assert life_lock.machine_id() == ""
 
 
-# ---- those who watch ----
+# ---- observers ----
 
 
 async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() -> None:
     trial = Trial()
     lease, observer = trial.lease(), trial.observer()
     assert await lease.try_to_begin()
-    trial.clock.pass_s(100)  # the watcher comes late: it cannot know when the record was written
+    trial.clock.pass_s(100)  # an observer that starts late cannot know when the record was written
     await look(observer)
     assert observer.dead() == {}
     trial.clock.pass_s(USUAL.lease / SECOND)
@@ -462,7 +462,7 @@ async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() ->
 
 @pytest.mark.parametrize("has_rival", [False, True])
 async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bool) -> None:
-    """Its server may have died with the gateway. Another observer may have ended one of the others."""
+    """The path's server may have died with the gateway; a rival observer may have ended another record."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
@@ -483,12 +483,12 @@ async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bo
 
 
 async def test_only_the_stale_revision_is_ended() -> None:
-    """A record that is renewed between the judgement and its end stays, even if it was read again."""
+    """A record that is renewed between the decision and its end is kept, even if it was read again."""
     trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
     judged = observer.dead()["a"]
-    await renew(lease)  # the network heals just now
+    await renew(lease)  # the network recovers at this moment
     await look(observer)
     assert lease.is_valid
     for path, record in judged.items():
@@ -499,8 +499,8 @@ async def test_only_the_stale_revision_is_ended() -> None:
     assert not lease.is_over
 
 
-async def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
-    """A gateway may be judged between the reads of two paths."""
+async def test_a_record_that_was_just_read_is_not_stale() -> None:
+    """A gateway may be judged between the reads of two of its paths."""
     trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)
@@ -513,7 +513,7 @@ async def test_a_record_that_was_read_and_not_judged_yet_is_not_stale() -> None:
 
 
 async def test_no_gateway_ends_itself() -> None:
-    """Its own end would count at once for all others."""
+    """An end by the gateway itself would count immediately for all others."""
     trial = Trial()
     lease, observer = trial.lease("b"), trial.observer("b")
     assert await lease.try_to_begin()
@@ -525,7 +525,7 @@ async def test_no_gateway_ends_itself() -> None:
 
 
 async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
-    """Otherwise all gateways would end each other after an outage of the servers."""
+    """Otherwise all gateways would end each other's sessions after an outage of the servers."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
     observer.restart_waits()
@@ -538,7 +538,7 @@ async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
     assert observer.is_over("a", 1)
 
 
-async def test_an_ended_session_stays_ended_after_a_cut() -> None:
+async def test_an_ended_session_stays_over_after_an_outage() -> None:
     """Otherwise lines would be assigned to a dead gateway for a while."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
@@ -551,7 +551,7 @@ async def test_an_ended_session_stays_ended_after_a_cut() -> None:
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
     second = trial.lease()
-    assert not await second.try_to_begin()  # others wrote the end, and it did not see for how long
+    assert not await second.try_to_begin()  # another gateway wrote the end, and it is unknown how old that is
     trial.clock.pass_s(USUAL.lease / SECOND)
     assert await second.try_to_begin()
     await look(observer)
@@ -559,14 +559,14 @@ async def test_an_ended_session_stays_ended_after_a_cut() -> None:
     assert observer.sessions().keys() == {"a"}
 
 
-async def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
-    """Its last renewal may have been a moment ago."""
+async def test_an_end_written_during_an_outage_does_not_count_yet() -> None:
+    """The session's last renewal may have come right before that end."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
     trial.clock.pass_s(60)
     for bucket in trial.buckets:
         bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
-    await look(observer)  # its last renewal that was seen is long past
+    await look(observer)  # the last renewal that this observer saw is old
     observer.restart_waits()
     await observer.end_the_dead()
     assert not observer.is_over("a", 1)
@@ -574,7 +574,7 @@ async def test_an_unseen_end_is_not_believed_after_a_cut() -> None:
     assert observer.is_over("a", 1)
 
 
-async def test_a_read_reports_sessions_that_ended_or_may_be_ended() -> None:
+async def test_a_read_reports_whether_a_session_ended_or_may_be_ended() -> None:
     trial = Trial()
     lease, observer = trial.lease(), trial.observer()
     assert await lease.try_to_begin()
@@ -590,7 +590,7 @@ async def test_a_read_reports_sessions_that_ended_or_may_be_ended() -> None:
 
 
 @table(("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)])
-def test_a_possibly_dead_gateway_is_read_at_once(since_s: float, rests_s: float) -> None:
+def test_a_possibly_dead_gateway_is_read_without_delay(since_s: float, rests_s: float) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         trial = Trial()
@@ -607,7 +607,7 @@ def test_a_possibly_dead_gateway_is_read_at_once(since_s: float, rests_s: float)
 
 
 async def test_without_answers_no_gateway_counts_as_dead() -> None:
-    """The server that it reads from may be suspended while others renew the leases."""
+    """The server that the observer reads may be suspended while gateways renew their leases on others."""
     trial, _lease, observer = await watched()
     for bucket in trial.buckets:
         bucket.is_down = True
@@ -626,7 +626,7 @@ async def test_without_answers_no_gateway_counts_as_dead() -> None:
 
 
 async def test_an_end_by_another_counts_once_the_lease_has_expired() -> None:
-    """Its writer may be wrong: until then the ended gateway may still send."""
+    """The end's writer may be wrong. Until the lease has expired, the ended gateway may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
     assert await lease.try_to_begin()
@@ -647,7 +647,7 @@ async def test_an_end_by_another_counts_once_the_lease_has_expired() -> None:
     assert late.is_over("a", 1)
 
 
-async def test_a_gateways_own_end_counts_at_once() -> None:
+async def test_an_end_by_the_gateway_itself_counts_immediately() -> None:
     trial, lease, observer = await watched()
     await lease.end()
     await look(observer)
@@ -655,7 +655,7 @@ async def test_a_gateways_own_end_counts_at_once() -> None:
     assert await trial.lease().try_to_begin()
 
 
-async def test_a_namesake_waits_if_another_gateway_wrote_the_end() -> None:
+async def test_a_namesake_waits_although_another_gateway_wrote_the_end() -> None:
     trial = Trial()
     lease, second = trial.lease(), trial.lease()
     assert await lease.try_to_begin()
@@ -667,8 +667,8 @@ async def test_a_namesake_waits_if_another_gateway_wrote_the_end() -> None:
     assert await second.try_to_begin()
 
 
-async def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
-    """Its path would stay ended for as long as it lives."""
+async def test_a_gateway_with_only_one_stale_path_is_not_ended() -> None:
+    """An ended path would stay ended for the rest of the session."""
     trial = Trial()
     lease, observer = trial.lease(), trial.observer()
     assert await lease.try_to_begin()
@@ -692,7 +692,7 @@ async def test_an_ended_path_stays_ended_for_this_session() -> None:
     assert lease.is_valid
 
 
-async def test_a_session_without_a_path_is_weak_until_the_next() -> None:
+async def test_a_session_without_one_path_is_weak_until_the_next_starts() -> None:
     trial, lease, observer = await watched()
     assert (lease.is_weak, observer.weak()) == (False, [])
     trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
@@ -725,7 +725,7 @@ async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
 
 
 async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
-    """A gateway of this name that died while it started has left it; two paths are ours, so it is over."""
+    """A namesake that died while it started has left its record there. We hold two paths, so it is over."""
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()
@@ -737,7 +737,7 @@ async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_session_is_weak_if_a_late_path_was_ended() -> None:
+async def test_a_session_is_weak_if_a_late_path_was_ended_by_others() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()

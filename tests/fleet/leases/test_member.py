@@ -1,4 +1,4 @@
-"""Gateways' state machines on a real cluster, with fake lines."""
+"""Gateways' state machines on real servers, with fake lines."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from multidrop.fleet.servers.setup import open_all
 
 LINES = [f"line-{at}" for at in range(30)]
 PATIENCE_S = 120.0
-LONG = USUAL._replace(lease=600 * SECOND)  # no lease may expire, however busy the machine is
+LONG = USUAL._replace(lease=600 * SECOND)  # no lease expires during the tests, even on a busy machine
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -42,7 +42,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def until(condition: Callable[[], bool], what: str) -> float:
-    """Return how long it took (s)."""
+    """Wait until the condition holds; return how many seconds that took."""
     begun = time.monotonic()
     while not condition():
         assert time.monotonic() - begun < PATIENCE_S, what
@@ -51,7 +51,7 @@ async def until(condition: Callable[[], bool], what: str) -> float:
 
 
 async def until_leaders_are_home(cluster: Cluster) -> None:
-    """Wait until each node leads one bucket of the leases."""
+    """Wait until each server leads one of the lease buckets."""
     begun = time.monotonic()
     wanted = [{f"KV_{bucket}"} for bucket in names.LEASES]
     while True:
@@ -63,7 +63,7 @@ async def until_leaders_are_home(cluster: Cluster) -> None:
 
 
 class Gateways:
-    """Members of one fleet, each with connections of its own."""
+    """Members of one fleet, each with its own connections."""
 
     _names = count()
 
@@ -85,7 +85,7 @@ class Gateways:
         return member
 
     async def die(self, name: str) -> None:
-        """End the gateway as SIGKILL does: its sockets are closed without further bytes."""
+        """End the gateway as SIGKILL would: its sockets are closed without further bytes."""
         member, task = self.members.pop(name), self.tasks.pop(name)
         member._leave = _do_nothing  # type: ignore[method-assign]
         task.cancel()
@@ -108,7 +108,7 @@ class Gateways:
         return sorted(line for lines in self.taken().values() for line in lines) == sorted(LINES)
 
     def are_shared(self) -> bool:
-        """Return True if each polls its assigned lines, and all are present."""
+        """Return True if all gateways are present, and each polls the lines assigned to it."""
         return all(
             set(member.wanted.values()) == set(self.members)
             and {line for line, gateway in member.wanted.items() if gateway == member.name}
@@ -159,7 +159,7 @@ async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> As
             await path.close()
 
 
-async def test_each_gateway_has_its_share_and_dead_ones_are_replaced(fleet: Cluster) -> None:
+async def test_each_gateway_has_its_share_and_dead_gateways_are_replaced(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", "c") as running:
         await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
         dead = running.members["b"]
@@ -171,11 +171,11 @@ async def test_each_gateway_has_its_share_and_dead_ones_are_replaced(fleet: Clus
         again = await running.join("b")
         assert not again.polled
         await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
-        assert again.lease.session >= 2  # more if the machine was suspended
+        assert again.lease.session >= 2  # more than 2 if the machine was suspended
 
 
 class Ports:
-    """The ports of a member's lines, which may be cut."""
+    """The ports of a member's lines, which a test may cut."""
 
     def __init__(self, member: Member) -> None:
         self.is_cut = False
@@ -195,7 +195,7 @@ class Ports:
 async def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is cut off from its lines, and not from the servers; its lease stays valid."""
+    """The gateway is cut off from its lines but not from the servers, so its lease stays valid."""
     monkeypatch.setattr(unopened_lines, "LOST_NS", SECOND // 2)
     for wait in (
         "FIRST_WAIT_NS",
@@ -206,7 +206,7 @@ async def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         await until(running.are_shared, "shares")
         ports = {name: Ports(member) for name, member in running.members.items()}
-        a, b, c = (running.members[name] for name in "abc")  # they joined in any order
+        a, b, c = (running.members[name] for name in "abc")  # in any order of joining
         ports["a"].is_cut = True
         await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
         assert a.lease.is_valid
@@ -233,7 +233,7 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
         assert not drained.polled
 
 
-def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
+def test_while_a_server_is_silent_only_a_drained_gateway_releases_lines(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
@@ -256,13 +256,13 @@ def test_with_a_silent_server_only_a_drained_gateway_gives_lines_away(
     asyncio.run(main())
 
 
-async def test_an_orderly_end_hands_over_at_once(fleet: Cluster) -> None:
+async def test_a_gateway_that_shuts_down_hands_its_lines_over_immediately(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         await running.leave("a")
         await until(running.all_are_polled, "leave")
 
 
-async def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
+async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster) -> None:
     async with gateways(fleet, "a", terms=LONG) as running:
         lines, member = running.hall.gateways[0], running.members["a"]
         bucket = Bucket(names.PLANT, member.best)
@@ -286,7 +286,7 @@ async def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
 async def test_beside_an_incompatible_gateway_no_line_is_claimed(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither at a gateway's start, nor when an incompatible one joins."""
+    """Checked when a gateway starts, and when an incompatible one joins."""
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
         member = await running.join("a")
@@ -309,8 +309,8 @@ async def test_beside_an_incompatible_gateway_no_line_is_claimed(
 
 
 @pytest.mark.long
-async def test_a_dead_node_moves_no_line(fleet: Cluster) -> None:
-    """Two of three paths are renewed as before while the third waits for another leader: 4 to 9 s."""
+async def test_a_dead_server_moves_no_line(fleet: Cluster) -> None:
+    """Two of three paths are renewed as before. The third waits 4 to 9 s for another leader."""
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         member = running.members["a"]
         await until(running.are_shared, "shares")
@@ -343,14 +343,14 @@ async def test_a_dead_node_moves_no_line(fleet: Cluster) -> None:
 async def test_weak_sessions_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise the next dead server would end them."""
+    """Otherwise the next dead server would end all of them."""
     monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:
         other = LeaseBucket(names.LEASES[1], member.best, "other")
         while not member.lease.is_weak:
             record = await other.get(member.name)
-            with suppress(Conflict):  # it was renewed in the meantime
+            with suppress(Conflict):  # the record was renewed in the meantime
                 await other.put(member.name, {**record.value, "ended": True}, record.revision)
             await member.lease.renew_once(1)
 
@@ -370,12 +370,12 @@ async def test_weak_sessions_are_given_up_one_after_another(
         assert running.hall.overlaps == []
 
 
-async def test_without_servers_all_lines_are_silent_and_no_gateway_is_killed(
+async def test_without_servers_all_lines_are_closed_and_no_gateway_is_killed(
     fleet: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The timer is cancelled after the lines were closed, and never set to the past."""
+    """The timer is cancelled after the lines were closed, and never set to a time in the past."""
     async with gateways(fleet, "a", "b") as running:
-        await until(running.are_shared, "shares")  # or one has never had a lease, and no timer
+        await until(running.are_shared, "shares")  # otherwise one may never have had a lease, nor a timer
         with fleet.paused():
             await until(lambda: not any(running.taken().values()), "silence")
             masterships = [lines.mastership for lines in running.hall.gateways]

@@ -1,4 +1,4 @@
-"""A line that is being closed: commands end at once; stops are answered until it is closed."""
+"""A line that is being closed: commands end immediately, and stops are answered until it is closed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from multidrop.supervisor import supervisor
 
 
 class HeardPath:
-    """A path without a server; records subscriptions by subject."""
+    """A path without a server, which records the subscribed functions by subject."""
 
     def __init__(self) -> None:
         self.heard: dict[str, Callable[[Any], Any]] = {}
@@ -32,7 +32,7 @@ class HeardPath:
         self.heard.pop(subject, None)
 
     async def ask(self, subject: str, **what: Any) -> dict[str, Any]:
-        """Return the answer."""
+        """Send a request to a subscribed function, and return the answer."""
         answered: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
         class Asked:
@@ -48,14 +48,14 @@ class HeardPath:
 
 
 class SlowLines:
-    """Lines that are closed when the test says so."""
+    """Lines that are closed only when the test allows it."""
 
     def __init__(self) -> None:
         self.closes = asyncio.Event()
         self.is_going = False
 
     async def take(self, line: str, description: Any) -> None:
-        """Open no line."""
+        """Do nothing."""
 
     async def let_go(self, line: str) -> None:
         self.is_going = True
@@ -90,8 +90,8 @@ async def test_a_closing_line_answers_its_stops_until_it_is_closed(desk: Desks) 
     assert desk.written == {"control"}
 
 
-async def test_a_stop_is_answered_only_to_an_inbox(desk: Desks) -> None:
-    """An answer that goes to a record of the plant would take its line from all gateways."""
+async def test_a_stop_is_answered_only_on_an_inbox(desk: Desks) -> None:
+    """An answer that is stored as a record of the plant would take the line from all gateways."""
     answered: list[str] = []
 
     path = HeardPath()
@@ -152,7 +152,7 @@ async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
 
 
 class ClosedLines(SlowLines):
-    """Lines whose buses are closed some time before that is known."""
+    """Lines whose buses close before their gateway notes that."""
 
     def __init__(self, close: Callable[[], None]) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class ClosedLines(SlowLines):
 async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
     desk: Desks, drives: list[str] | None
 ) -> None:
-    """The requester would accept a refusal, and ask no other gateway."""
+    """The sender would accept a refusal, and ask no other gateway."""
 
     lines = ClosedLines(desk.bus(LINE).close)
     subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)  # type: ignore[list-item]

@@ -1,4 +1,4 @@
-"""Requests in flight while a line is handed over: each has its row."""
+"""Requests in flight while a line is handed over: each of them gets its row."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def simulated_line(folder: Path, delay: float) -> Iterator[tuple[list[NumberedDr
 
 
 class Gateway:
-    """A poller with a valid mastership, and its rows of values that were requested."""
+    """A poller with a valid mastership, and its rows for requests that were sent."""
 
     def __init__(self, folder: Path) -> None:
         self.mastership = Mastership(guard_s=0.01)
@@ -71,7 +71,7 @@ def gateways(tmp_path: Path) -> Iterator[list[Gateway]]:
 
 
 def hand_over(gateway: Gateway, drives: list[NumberedDrive], line: PlantLine) -> None:
-    """Poll until a drive has received a request, and close the line before it answers."""
+    """Poll until a drive has received a request, and close the line before the drive answers."""
     gateway.poller.add_line(line)
     begun = sum(drive.answers for drive in drives)
     until(lambda: sum(drive.answers for drive in drives) > begun)
@@ -118,7 +118,7 @@ def test_an_abandoned_request_has_a_row_with_its_status(
 
 
 def rows(*numbers: int | None) -> list[KeptRow]:
-    """Return a row each 100 ns; 0 leaves one out, None is a miss."""
+    """Return one row per 100 ns with these values; 0 leaves a row out, None is a miss."""
     return [KeptRow(100 * at, number) for at, number in enumerate(numbers) if number != 0]
 
 
@@ -142,7 +142,7 @@ def test_the_judge_finds_lost_and_doubled_answers(
 
 
 @pytest.mark.long
-def test_late_answers_have_a_row_that_says_so(tmp_path: Path, gateways: list[Gateway]) -> None:
+def test_late_answers_have_a_row_marked_as_late(tmp_path: Path, gateways: list[Gateway]) -> None:
     with simulated_line(tmp_path, delay=0.02) as (drives, line):
         gateways[0].poller.add_line(line)
         for delay in (0.02, 0.45, 0.02, 0.9, 0.02):

@@ -30,7 +30,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 class Trial:
-    """A gateway with a lease and one line of the plant."""
+    """A gateway with a lease, and a plant with one line."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -71,12 +71,12 @@ class Trial:
             await asyncio.sleep(0.001)
 
     async def is_at_rest(self) -> None:
-        """Wait, as time passes, until no task is in progress on the line."""
+        """Wait, while time passes, until no task is in progress on the line."""
         while self.keeper._at_work:
             await asyncio.sleep(0.001)
 
     async def let_the_first_lag(self) -> None:
-        """Let a second pass, and renew all paths but the one with the home of the line's first bucket."""
+        """Let a second pass; then renew the lease on all paths except that of the line's first bucket."""
         self.clock.pass_s(1.001)
         for path, name in enumerate(names.OWNERS):
             if name != self.buckets[0].name:
@@ -100,12 +100,12 @@ class Trial:
         self.keeper.claim({"hall": claim})
 
     def owner(self) -> tuple[str, int] | None:
-        """Return the owner with enough votes, as far as the gateway knows."""
+        """Return the line's owner by its votes, as far as the gateway has read them."""
         record = self.records.owner("hall")
         return owner_of(record) if record else None
 
     def is_taken_by_another(self, *places: int) -> None:
-        """Read that these of the line's records name another gateway."""
+        """Let the gateway read that the records at these places name another gateway."""
         for place in places:
             bucket = names.owner_buckets("hall")[place]
             known = self.records.of("hall")[bucket]
@@ -121,7 +121,7 @@ async def claimed() -> Trial:
 
 
 class DeadTrial(Trial):
-    """The same with a line whose last master is over."""
+    """A trial with a line whose last master has ended."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -136,7 +136,7 @@ class DeadTrial(Trial):
         await asyncio.wait_for(self.is_polled(), 10)
 
 
-async def test_a_claimed_line_accepts_stops_at_once_and_commands_after_the_guard() -> None:
+async def test_a_new_master_accepts_stops_immediately_and_commands_after_the_guard() -> None:
     trial = await claimed()
     assert trial.lines.taken == {"hall"}
 
@@ -153,7 +153,7 @@ async def test_a_claimed_line_accepts_stops_at_once_and_commands_after_the_guard
 
 
 async def test_a_line_of_another_gateway_accepts_neither_stops_nor_commands() -> None:
-    """It is about to be let go, and its new master answers."""
+    """The line is about to be closed, and its new master answers."""
     trial = await claimed()
     trial.clock.pass_s(1)
     assert trial.keeper.may_command("hall")
@@ -163,7 +163,7 @@ async def test_a_line_of_another_gateway_accepts_neither_stops_nor_commands() ->
     assert not trial.keeper.may_command("hall")
 
 
-async def test_lines_are_released_while_there_is_time_to_close_them() -> None:
+async def test_lines_are_released_only_while_there_is_time_to_close_them() -> None:
     trial = await claimed()
     trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
     trial.keeper.reconcile()
@@ -175,7 +175,7 @@ async def test_lines_are_released_while_there_is_time_to_close_them() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_after_the_lease_waiting_work_neither_opens_nor_writes() -> None:
+async def test_after_the_lease_expires_waiting_tasks_neither_open_nor_write() -> None:
     trial = Trial()
     bucket = trial.buckets[0]
     writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
@@ -197,7 +197,7 @@ async def test_after_the_lease_waiting_work_neither_opens_nor_writes() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_a_line_lost_while_waiting_is_not_opened() -> None:
+async def test_a_line_lost_while_waiting_to_be_opened_is_not_opened() -> None:
     trial = Trial()
     openings = trial.keeper._openings = asyncio.Semaphore(0)
     await trial.read_and_begin()
@@ -230,15 +230,15 @@ async def test_a_line_is_closed_before_it_is_released() -> None:
 
 
 async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
-    """An unanswered write may still be stored later, until a newer record rules that out."""
+    """The unanswered write may be stored at any later time, until a newer record rules that out."""
     trial = await claimed()
     bucket = trial.buckets[0]
     trial.keeper.releasing = {"hall"}
     await trial.reconcile()
     trial.are_down()
-    trial.keeper.reconcile()  # released, without an answer
+    trial.keeper.reconcile()  # its release is sent, but not answered
     await until(lambda: trial.keeper.is_silent)
-    trial.keeper.releasing = set()  # it is to stay after all
+    trial.keeper.releasing = set()  # the line shall stay with this gateway after all
     for _ in range(3):
         await trial.reconcile()
         assert trial.lines.taken == set()
@@ -250,20 +250,20 @@ async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
 
 
 def owners(trial: Trial) -> list[tuple[str, int]]:
-    """Return whom the records name that are stored, in the order in which they are written."""
+    """Return the owners that the stored records name, in the order in which records are written."""
     return [owner_of(bucket.records.get("hall")) for bucket in trial.buckets]
 
 
 ME, NOBODY = ("a", 1), ("", 0)
 
 
-async def test_a_new_line_is_claimed_by_one_record() -> None:
+async def test_a_new_line_is_claimed_by_writing_one_record() -> None:
     trial = await claimed()
     assert owners(trial) == [ME, NOBODY, NOBODY]
     assert trial.keeper.moves == 1
 
 
-async def test_a_line_of_a_dead_master_is_claimed_by_two() -> None:
+async def test_a_line_of_a_dead_master_is_claimed_by_writing_two_records() -> None:
     trial = DeadTrial()
     await trial.claim()
     assert owners(trial) == [ME, ME, NOBODY]
@@ -281,7 +281,7 @@ async def test_a_bucket_without_a_leader_does_not_delay_a_claim(place: int) -> N
     assert owners(trial).count(ME) == 2
 
 
-async def test_a_late_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_slow_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -293,7 +293,7 @@ async def test_a_late_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPa
 
 
 async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Retry at once with newer records: a server that is cut off does not answer for long."""
+    """The claim is repeated immediately, with newer records. A server that is cut off is silent for long."""
     monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
     trial = DeadTrial()
     await trial.read_and_begin()
@@ -310,7 +310,7 @@ async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pyte
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
+async def test_a_bucket_that_may_have_lost_its_home_server_is_written_last() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     await trial.let_the_first_lag()
@@ -320,7 +320,7 @@ async def test_a_bucket_whose_home_may_be_gone_is_written_last() -> None:
 
 
 async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
-    """Servers that are busy are slow in all buckets."""
+    """If servers are busy, all their buckets are slow."""
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.clock.pass_s(1.5)
@@ -330,8 +330,10 @@ async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_bucket_with_a_lost_home_does_not_delay_claims(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was the only one left to be written as long as another was not read."""
+async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is the only bucket left to write until another bucket was read."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()
@@ -344,7 +346,7 @@ async def test_a_bucket_with_a_lost_home_does_not_delay_claims(monkeypatch: pyte
     await asyncio.wait_for(trial.is_polled(), 10)
 
 
-async def test_a_lost_race_ends_the_claim() -> None:
+async def test_a_claim_ends_when_another_gateway_was_faster() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
@@ -355,7 +357,7 @@ async def test_a_lost_race_ends_the_claim() -> None:
 
 
 async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise it would be opened between the writes of its release."""
+    """Otherwise the line would be opened between the writes of its release."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -363,7 +365,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
     trial.keeper.reconcile()
     await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
     writers = trial.keeper._owners._writing[trial.buckets[1].name]
-    async with writers, writers:  # all that may write there are at work
+    async with writers, writers:  # all writers of that bucket are busy
         trial.keeper.reconcile()
         await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
         trial.buckets[0].open()
@@ -380,7 +382,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
 
 
 async def test_a_late_answer_does_not_undo_a_release() -> None:
-    """The record was read before its answer came, and given away at once."""
+    """The record was read before the claim's answer came, and released immediately."""
     trial = Trial()
     await trial.read_and_begin()
     bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
@@ -399,11 +401,11 @@ async def test_a_late_answer_does_not_undo_a_release() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
+async def test_a_line_with_an_uncertain_release_is_claimed_like_any_other() -> None:
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}
-    for _ in range(2):  # it is closed first
+    for _ in range(2):  # the first call closes the line
         trial.keeper.reconcile()
         await until(lambda: not trial.keeper._tasks)
     assert not trial.keeper.is_mine("hall")
@@ -417,8 +419,8 @@ async def test_an_uncertain_release_is_reclaimed_like_any_line() -> None:
     await until(lambda: "hall" in trial.keeper.polled)
 
 
-async def test_an_unclosed_line_ends_the_gateway() -> None:
-    """Its session is not ended: the others wait for as long as if it had died."""
+async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
+    """The gateway's session is not ended, so others wait as long as after its death."""
     trial = await claimed()
 
     async def fail(line: str) -> None:
@@ -434,7 +436,7 @@ async def test_an_unclosed_line_ends_the_gateway() -> None:
 
 
 async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
-    """Such as a user's own class: it is logged with its cause, and tried again."""
+    """Such a failure, as in a user's own class, is logged with its cause, and the line is retried."""
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
 
@@ -458,7 +460,7 @@ async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCa
 
 
 class BrokenLines(RecordingLines):
-    """Lines whose ports cannot be opened; `why` is the reason, "" opens them."""
+    """Lines whose ports cannot be opened. `why` is the reason; "" lets them open."""
 
     why = "nothing listens there"
 
@@ -469,7 +471,7 @@ class BrokenLines(RecordingLines):
 
 
 class BrokenTrial(Trial):
-    """The same with a port that cannot be opened."""
+    """A trial with a port that cannot be opened."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__()
@@ -493,7 +495,7 @@ class BrokenTrial(Trial):
         await until(lambda: not self.keeper._at_work)
 
 
-async def test_an_unopened_line_is_logged_once_per_reason_and_when_it_opens(
+async def test_a_line_that_cannot_be_opened_is_logged_once_per_reason(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -515,7 +517,9 @@ async def test_an_unopened_line_is_logged_once_per_reason_and_when_it_opens(
     ]
 
 
-async def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_trouble_with_a_line_is_forgotten_when_another_gateway_takes_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     trial = BrokenTrial(monkeypatch)
     await trial.claim()
     trial.keeper.releasing = {"hall"}
@@ -534,7 +538,7 @@ async def test_no_problem_is_shown_for_a_line_of_another_gateway(monkeypatch: py
         (PortLoss("no route to host", SECOND), "no route to host"),
     ],
 )
-async def test_a_lost_port_is_reported_before_a_long_reopening_fails(
+async def test_a_lost_port_is_reported_before_a_slow_reopening_fails(
     loss: PortLoss, reported: str | None
 ) -> None:
     trial = await claimed()

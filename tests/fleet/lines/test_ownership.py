@@ -1,4 +1,4 @@
-"""Ownership of lines: the balance between gateways, and who may claim or release a line when."""
+"""Ownership of lines: how evenly they are assigned, and which gateway may claim or release one when."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def test_no_gateway_has_more_than_110_percent_of_the_mean() -> None:
     assert min(shares.values()) >= 25
 
 
-def test_few_lines_move_when_a_gateway_leaves_or_comes() -> None:
+def test_few_lines_move_when_a_gateway_joins_or_leaves() -> None:
     all_of_them = assign(LINES, GATEWAYS)
     without = assign(LINES, GATEWAYS[1:])
     must = sum(gateway == GATEWAYS[0] for gateway in all_of_them.values())
     assert must <= moved(all_of_them, without) <= must + len(LINES) // 20
 
 
-def test_the_assignment_does_not_depend_on_order() -> None:
+def test_the_assignment_does_not_depend_on_the_order_of_names() -> None:
     lines, gateways = LINES[:], GATEWAYS[:]
     random.Random(1).shuffle(lines)
     random.Random(2).shuffle(gateways)
@@ -44,7 +44,7 @@ def test_the_assignment_does_not_depend_on_order() -> None:
 
 
 def weight(line: str, gateway: str, number: int) -> int:
-    """Return a pair's weight as the first version weighed it, in whole numbers of Python."""
+    """Return the weight of a line and a gateway as the first version computed it, with Python's integers."""
     own, other = (
         int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
         for name in (line, gateway)
@@ -55,7 +55,7 @@ def weight(line: str, gateway: str, number: int) -> int:
 @table("number", [1, 2, 3, 5, 20])
 @table("lines", [1, 7, 40, 333])
 def test_each_line_is_with_the_heaviest_gateway_that_has_room(lines: int, number: int) -> None:
-    """Versions that weigh otherwise would share the lines otherwise, and move them to and fro."""
+    """Versions with other weights would assign lines differently, and so move them back and forth."""
     room = dict.fromkeys(GATEWAYS[:number], -(-lines * 110 // (100 * number)))
     wanted = {}
     for line in sorted(LINES[:lines]):
@@ -79,7 +79,10 @@ BUCKETS = ("first", "second", "third")
 
 
 def records_of(*owners: tuple[str, int] | None, alone: bool = False) -> dict[str, Record | None]:
-    """Return a line's records with these owners, at revisions from 11 on; the first `alone` has two votes."""
+    """Return a line's records with these owners and revisions from 11 on.
+
+    With `alone`, the first record has two votes.
+    """
     found: dict[str, Record | None] = {}
     for at, (bucket, owner) in enumerate(zip(BUCKETS, owners, strict=True)):
         value = owner and owner_value(owner, 5, 0, NEEDED if alone and not at else 1)
@@ -147,12 +150,12 @@ CASES = {
 
 
 @table("case", CASES)
-def test_claims_and_releases(case: str) -> None:
+def test_claims_and_releases_in_each_case(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 
 
-def test_no_claim_before_the_first_record_was_read() -> None:
+def test_a_line_is_not_claimed_before_its_first_record_was_read() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     records["first"] = None
     assert claim_of(ME, records, is_over) is None
@@ -177,7 +180,7 @@ def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
     assert claim == Claim({"second": 12, "first": 11}, {}, 6)
 
 
-def test_an_uncertain_release_is_reclaimed_at_its_revision() -> None:
+def test_a_line_with_an_uncertain_release_is_claimed_at_that_revision() -> None:
     records = records_of(ME, ME, LIVING)
     assert claim_of(ME, records, is_over) is None
     assert claim_of(ME, records, is_over, ["second"]) == Claim({"second": 12}, {}, 6)
@@ -189,7 +192,7 @@ def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tu
     return record and (record.value["gateway"], record.value["session"])
 
 
-def test_the_owner_has_two_votes() -> None:
+def test_the_owner_of_a_line_needs_two_votes() -> None:
     assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
     assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
     assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
@@ -198,7 +201,7 @@ def test_the_owner_has_two_votes() -> None:
 
 
 def test_the_newer_of_two_owners_is_shown() -> None:
-    """The first record of all names a dead session with two votes, while its bucket has no leader."""
+    """The first record has two votes for a dead session, because its bucket has no leader."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
         records[bucket] = Record("x", 20, owner_value(ME, 6, 0))
@@ -208,7 +211,7 @@ def test_the_newer_of_two_owners_is_shown() -> None:
 
 
 @table("name", ["", "hall.1", "hall 1", "hall*", ">", "Größe", "a/b", "x\n"])
-def test_names_that_cannot_be_in_a_subject(name: str) -> None:
+def test_names_that_are_invalid_in_a_subject_are_rejected(name: str) -> None:
     with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
         names.checked_name("line", name)
 
@@ -217,7 +220,7 @@ def test_names_that_cannot_be_in_a_subject(name: str) -> None:
     ("name", "better"),
     [("hall 1", "hall-1"), ("hall.1", "hall-1"), ("зал 1", "1"), ("", "line-1"), ("*", "line-1")],
 )
-def test_an_invalid_name_gets_a_suggestion(name: str, better: str) -> None:
+def test_an_invalid_name_is_rejected_with_a_suggestion(name: str, better: str) -> None:
     with pytest.raises(ValueError, match=f": write {better}$"):
         names.checked_name("line", name)
     assert names.is_name(better)

@@ -1,4 +1,4 @@
-"""Records of the lines in a gateway's share: when they are read, and that every change is noticed."""
+"""Records of the lines in a gateway's share: when they are read, and that no change is missed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def is_mine(record: Record) -> bool:
 
 
 class Trial:
-    """A bucket in memory, and the knowledge of gateway a in session 2 about it."""
+    """A bucket in memory, and what gateway a, in its session 2, has read from it."""
 
     def __init__(self) -> None:
         self.bucket = MemoryBucket()
@@ -34,11 +34,11 @@ class Trial:
         self.follower = ShareFollower(made, self.note, is_mine, self.had.__contains__)
 
     def note(self, *_: object) -> None:
-        """Process each record as share records do."""
+        """Recompute which records may change, as ShareRecords does after each record."""
         self.follower.recompute()
 
     def looked(self) -> list[str]:
-        """Look once, and return the lines that changed."""
+        """Read once, and return the lines whose records have changed."""
         return [record.key for record in asyncio.run(self.follower.look())]
 
     def asks(self) -> bool:
@@ -73,7 +73,7 @@ def test_a_line_of_another_session_is_read_until_it_is_free(value: Any) -> None:
     assert not trial.asks()
 
 
-def test_lines_owned_by_other_records_are_not_read() -> None:
+def test_lines_that_are_ours_by_other_records_are_not_read() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])
@@ -84,10 +84,10 @@ def test_lines_owned_by_other_records_are_not_read() -> None:
     assert not trial.asks()
 
 
-def test_an_uncertain_line_is_read_again_even_outside_the_share(
+def test_a_line_with_an_unanswered_write_is_read_again_outside_the_share(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The unanswered write may still be stored when the bucket has a leader again."""
+    """The write may still be stored when the bucket has a leader again."""
     now = 1000.0
     monkeypatch.setattr(line_records.time, "monotonic", lambda: now)
     trial = Trial()
@@ -100,7 +100,7 @@ def test_an_uncertain_line_is_read_again_even_outside_the_share(
     assert not trial.asks()
 
 
-def test_an_older_record_of_a_server_that_is_behind_changes_nothing() -> None:
+def test_an_older_record_from_a_lagging_server_is_ignored() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])
@@ -115,13 +115,13 @@ def test_an_older_record_of_a_server_that_is_behind_changes_nothing() -> None:
     assert is_mine(trial.follower.records["line"])
 
 
-async def test_a_larger_share_is_read_at_once() -> None:
+async def test_an_added_line_is_read_without_delay() -> None:
     trial = Trial()
     trial.follower.want(["line"])
     await trial.follower.look()
     resting = asyncio.create_task(trial.follower.rest())
     trial.follower.want(["line", "another"])
-    for _ in range(5):  # turns of the loop, and no time
+    for _ in range(5):  # turns of the event loop, during which no time passes
         await asyncio.sleep(0)
     assert resting.done()
 
@@ -143,7 +143,7 @@ def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
     return [(move.before, move.after) for move in records.moves.newest(9)]
 
 
-def test_moves_name_the_former_master_once_two_records_agree() -> None:
+def test_moves_name_the_former_master_when_two_records_agree() -> None:
     records = followed()
     take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST)
     assert moves_of(records) == [("", "b")]
@@ -153,7 +153,7 @@ def test_moves_name_the_former_master_once_two_records_agree() -> None:
     assert moves_of(records) == [("b", "a"), ("", "b")]
 
 
-def test_one_record_is_enough_to_own_a_line() -> None:
+def test_a_single_first_record_is_enough_to_own_a_line() -> None:
     records = followed()
     take(records, 1, OTHER, FIRST, SECOND)
     take(records, 2, ME, FIRST)
@@ -163,19 +163,19 @@ def test_one_record_is_enough_to_own_a_line() -> None:
     assert records.owned_by("b", 1) == set()
 
 
-def test_an_unfollowed_line_has_no_former_master() -> None:
-    """It was read in a cold start or an hour ago, and has had other masters since."""
+def test_a_line_read_long_ago_has_no_known_former_master() -> None:
+    """The line was read in a cold start or an hour ago, and has had other masters since."""
     records = followed()
     take(records, 8, owner_value(("b", 1), 8, 0), FIRST, SECOND)
     assert moves_of(records) == [(None, "b")]
     take(records, 11, owner_value(("a", 2), 11, 0), FIRST, SECOND)
     assert moves_of(records)[0] == (None, "a")
-    take(records, 12, owner_value(("", 0), 12, 0), FIRST, SECOND)  # we gave it away
+    take(records, 12, owner_value(("", 0), 12, 0), FIRST, SECOND)  # we have released the line
     assert moves_of(records)[0] == ("a", "")
 
 
-def test_a_line_claimed_again_by_its_master_has_not_moved() -> None:
-    """The outcome of its release was unknown."""
+def test_a_line_claimed_again_by_its_master_is_no_move() -> None:
+    """The outcome of the line's release was unknown."""
     records = followed()
     take(records, 1, owner_value(("a", 2), 1, 0), FIRST, SECOND)
     take(records, 2, owner_value(("a", 2), 2, 0), FIRST, SECOND)
@@ -193,8 +193,8 @@ def test_sessions_without_lines_are_forgotten() -> None:
     assert len(records._owned) == 1
 
 
-def test_lines_that_were_read_before_a_failure_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lines fill whole batches, and a server does not report the end."""
+def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lines fill whole batches, and the read that would show their end fails."""
     monkeypatch.setattr(buckets, "BATCH", 2)
     path: Any = None
     records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)

@@ -1,4 +1,4 @@
-"""A line is released only while other gateways can claim it, now and in the next moment."""
+"""A line is released only while other gateways can claim it, now and immediately afterwards."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from multidrop.fleet.lines.releases import WAIT_S, Releases
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.leaders import Cluster, Replica
 
-FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # one of each
+FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # a line of each
 LINES = set(FIRST.values())
 
 
 class Trial:
-    """Releases of a gateway, the buckets with a leader, and those with a silent server."""
+    """The releases of a gateway, the buckets with a leader, and the buckets with a silent server."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.led = set(names.OWNERS)
@@ -41,7 +41,7 @@ class Trial:
         asyncio.run(self.releases.look())
 
 
-def test_lines_wait_until_two_buckets_are_known_to_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_not_released_until_two_buckets_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Trial(monkeypatch)
     trial.led = {"own_1"}
     assert trial.releases.due(LINES) == set()
@@ -69,7 +69,9 @@ def test_servers_are_checked_only_while_lines_wait_for_release(
     assert trial.releases.due(LINES) == set()
 
 
-def test_lines_wait_while_a_server_of_two_buckets_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_not_released_while_a_server_of_two_buckets_is_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     trial = Trial(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(LINES)
@@ -92,7 +94,7 @@ def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -
     trial.now_s = WAIT_S
     trial.look()
     assert trial.releases.due(LINES) == LINES
-    trial.maimed.clear()  # heard, and silent again: the wait restarts
+    trial.maimed.clear()  # the server was heard and is silent again, so the wait restarts
     trial.look()
     trial.maimed = {"own_0", "own_1"}
     trial.look()

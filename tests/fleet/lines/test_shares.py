@@ -1,4 +1,4 @@
-"""Shares of lines: assigned immediately, or, at a cold start, once no gateway joins or leaves."""
+"""Shares of lines: assigned immediately or, in a cold start, when no further gateways join."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LINES = tuple(f"line-{at}" for at in range(40))
 
 
 class Trial:
-    """Gateway a at the start of its session, with its own clock and no server."""
+    """Gateway a at the start of its session, with its own clock and without a server."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -29,11 +29,11 @@ class Trial:
         self.member.records._lines = LINES
 
     def sees(self, *others: str) -> None:
-        """Note these gateways, as it does before its session starts."""
+        """Note these other gateways, as gateway a does before its session starts."""
         self.member._see(dict.fromkeys(others, VALUE))
 
     def shared_among(self, *others: str) -> set[str]:
-        """Step beside these gateways, and return the gateways that have lines now."""
+        """Take a step while these other gateways are present; return the gateways that have lines now."""
         asyncio.run(self.member._share_out(dict.fromkeys(others, VALUE)))
         return set(Counter(self.member.wanted.values()))
 
@@ -41,7 +41,7 @@ class Trial:
         return self.shared_among(*others) == {"a", *others}
 
 
-def test_a_returning_gateway_shares_with_the_others() -> None:
+def test_a_returning_gateway_gets_its_share_immediately() -> None:
     trial = Trial()
     trial.sees("b", "c")
     trial.clock.pass_s(QUIET_NS / SECOND)
@@ -49,7 +49,7 @@ def test_a_returning_gateway_shares_with_the_others() -> None:
 
 
 def test_a_cold_start_assigns_lines_once_no_gateway_joins() -> None:
-    """Otherwise the first one would read the records of all lines, and the second those of half."""
+    """Otherwise the first gateway would read the records of all lines, the second those of half."""
     trial = Trial()
     assert trial.shared_among("b") == set()
     trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
@@ -61,7 +61,7 @@ def test_a_cold_start_assigns_lines_once_no_gateway_joins() -> None:
     assert trial.is_shared_with_those_who_come("b", "c")
 
 
-def test_a_settled_gateway_reassigns_at_once() -> None:
+def test_a_settled_gateway_reassigns_lines_immediately() -> None:
     trial = Trial()
     trial.clock.pass_s(SETTLE_S)
     assert trial.is_shared_with_those_who_come("b", "c")

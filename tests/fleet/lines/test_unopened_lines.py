@@ -1,4 +1,4 @@
-"""Lines that a gateway cannot open: when others should take them, and when it tries again."""
+"""Lines that a gateway cannot open: when it reports them to others, and when it tries them again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def failed(unopened: UnopenedLines, line: str) -> None:
         unopened.failed(line)
 
 
-def test_a_line_is_reported_after_several_failed_openings() -> None:
+def test_a_line_is_reported_after_three_failed_openings() -> None:
     unopened = UnopenedLines(HandClock())
     for _ in range(OPENINGS - 1):
         unopened.failed("a")
@@ -38,7 +38,7 @@ def test_a_line_is_reported_after_several_failed_openings() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_a_polled_line_is_reported_once_its_port_is_lost_for_long() -> None:
+def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     unopened.lost("a")
@@ -56,10 +56,10 @@ def test_a_polled_line_is_reported_once_its_port_is_lost_for_long() -> None:
 
 @pytest.mark.parametrize(
     ("silent_s", "named_after_s"),
-    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # an old reply, and none at all
+    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # also an old reply, and none
 )
 def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s: float) -> None:
-    """The port is reported lost, and reopening fails, only some seconds after the line was cut."""
+    """The port's loss and the failure of reopening are noticed only some seconds after the line was cut."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
 
@@ -74,7 +74,7 @@ def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s
     assert lost_after(0.1)
 
 
-def test_trials_take_one_line_at_a_time_with_backoff() -> None:
+def test_one_line_is_tried_at_a_time_with_increasing_pauses() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -90,7 +90,7 @@ def test_trials_take_one_line_at_a_time_with_backoff() -> None:
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
-def test_hopeless_lines_are_tried_first_and_without_backoff() -> None:
+def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -105,7 +105,7 @@ def test_hopeless_lines_are_tried_first_and_without_backoff() -> None:
     assert unopened.named() == {"a", "b", "c"}
 
 
-def test_after_a_successful_trial_the_others_follow_at_once() -> None:
+def test_after_a_successful_trial_the_other_lines_are_tried_at_once() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -116,8 +116,8 @@ def test_after_a_successful_trial_the_others_follow_at_once() -> None:
         unopened.opened(line)
 
 
-def test_a_trial_prefers_our_own_share_and_its_success_clears_the_rest() -> None:
-    """Another gateway's line would not stay here after a trial."""
+def test_a_trial_prefers_assigned_lines_and_its_success_clears_the_rest() -> None:
+    """A line that is assigned to another gateway would not come back after a trial."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abcd":
@@ -126,12 +126,12 @@ def test_a_trial_prefers_our_own_share_and_its_success_clears_the_rest() -> None
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"a", "c", "d"}
     unopened.opened("b")
-    assert unopened.named() == frozenset()  # d is on trial at once
+    assert unopened.named() == frozenset()  # the trial of d starts immediately
     unopened.opened("d")
     assert unopened.named() == frozenset()
 
 
-def test_a_trial_ends_if_the_line_does_not_come_back() -> None:
+def test_a_trial_ends_after_a_minute_if_the_line_does_not_come_back() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     failed(unopened, "a")
@@ -142,37 +142,37 @@ def test_a_trial_ends_if_the_line_does_not_come_back() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_reported_lines_fit_into_a_lease_record() -> None:
+def test_only_lines_that_fit_into_a_lease_record_are_reported() -> None:
     unopened = UnopenedLines(HandClock())
     for number in range(MOST_BYTES):
         failed(unopened, f"line-{number}")
     assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
 
 
-# ---- who gets them ----
+# ---- which gateway gets reported lines ----
 
 LINES = [f"line-{number}" for number in range(60)]
 SHARED = assign(LINES, ["a", "b", "c"])
 OF_A = {line for line, name in SHARED.items() if name == "a"}
 
 
-def test_only_reported_lines_move_to_the_same_gateway_for_all() -> None:
+def test_only_reported_lines_move_and_all_gateways_agree_where() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
     assert set(found.values()) == {"b", "c"}
     assert {line for line in LINES if found[line] != SHARED[line]} == OF_A
     assert found == hand_over(dict(reversed(SHARED.items())), {"c": [], "b": [], "a": sorted(OF_A)})
 
 
-def test_a_line_that_no_gateway_can_open_stays() -> None:
+def test_a_line_that_no_gateway_can_open_is_not_moved() -> None:
     assert hand_over(SHARED, {"a": LINES, "b": LINES, "c": LINES}) == SHARED
 
 
-def test_a_line_goes_to_a_gateway_that_has_not_tried_it() -> None:
+def test_a_reported_line_moves_to_a_gateway_that_has_not_tried_it() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_without_a_list_of_unopened_lines_gets_none() -> None:
-    """Another version would not take lines handed over to it."""
+def test_a_gateway_without_a_list_of_unopened_lines_gets_no_others() -> None:
+    """Such a gateway has another version, which would not take lines that are handed over."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

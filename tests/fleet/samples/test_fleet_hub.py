@@ -1,4 +1,4 @@
-"""The hub: all rows of the stream in a sink, once, with their position; alarms for errors."""
+"""The hub: a sink gets each row of the stream once, with its position; errors raise alarms."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ async def say(
 
 
 async def say_all(path: ServerPath, first: int, end: int) -> None:
-    """Publish the messages `first` to `end` - 1, of five exchanges each."""
+    """Publish the messages `first` to `end` - 1, each with five exchanges."""
     for number in range(first, end):
         await say(path, number, message(number * 5))
 
 
 class Memory:
-    """A sink that stores commits, and fails on request before or after storing one."""
+    """A sink in memory that stores commits. On request it fails before or after storing one."""
 
     def __init__(self, fates: str = "") -> None:
         self.commits: list[Commit] = []
@@ -110,7 +110,7 @@ class Memory:
 
 
 async def read_all(path: ServerPath, sink: SampleSink, place: int, every: float = 0.02) -> HubState:
-    """Run a hub until it has kept so much."""
+    """Run a hub until it has stored the message at this position; return its state."""
     hub = SampleHub(path, sink, every=every)
     task = asyncio.create_task(hub.run())
     try:
@@ -126,7 +126,7 @@ async def read_all(path: ServerPath, sink: SampleSink, place: int, every: float 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_behind_for", [3, 10_000], ids=["looks", "ever"])
-def test_a_lagging_server_does_not_end_a_full_read(
+def test_a_lagging_server_does_not_end_a_read_early(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_behind_for: int
 ) -> None:
     looks = itertools.count()
@@ -154,7 +154,7 @@ def test_a_lagging_server_does_not_end_a_full_read(
 
 @pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
-async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: str) -> None:
+async def test_after_any_failure_each_row_is_stored_once(running: Cluster, fates: str) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 31)
         sink = Memory(fates)
@@ -165,7 +165,9 @@ async def test_after_any_failure_each_row_is_kept_once(running: Cluster, fates: 
 
 
 @pytest.mark.slow
-async def test_several_answers_are_stored(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_messages_from_several_answers_are_stored_once(
+    running: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
     async with empty_stream(running) as path:
         await say_all(path, 1, 12)
@@ -181,7 +183,7 @@ async def test_several_answers_are_stored(running: Cluster, monkeypatch: pytest.
 async def test_a_commit_ends_at_its_memory_limit(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
-    """Few rows may have long names, and ignored messages were read too."""
+    """Few rows may have long names, and ignored messages were read into memory too."""
     monkeypatch.setattr(hub_module, "MOST_READ", 1)
     monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
     sink = Memory()
@@ -194,7 +196,7 @@ async def test_a_commit_ends_at_its_memory_limit(
 
 
 @pytest.mark.slow
-def test_missing_or_doubled_messages_are_logged_and_counted(
+def test_missing_and_duplicated_messages_are_logged_and_counted(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> HubState:
@@ -263,7 +265,7 @@ def kept_in_files(path: ServerPath, folder: Path, place: int) -> Any:
 
 
 @pytest.mark.long
-async def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path) -> None:
+async def test_hub_files_are_read_by_history_and_duckdb(running: Cluster, tmp_path: Path) -> None:
     duckdb = require_module("duckdb")
     async with empty_stream(running) as path:
         await say_all(path, 1, 6)
@@ -293,7 +295,7 @@ async def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path
 
 
 async def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
-    """A killed hub leaves one: the rows are read again."""
+    """A killed hub leaves such a file, and reads its rows again."""
     async with empty_stream(running) as path:
         await say(path, 1, message(5))
         await kept_in_files(path, tmp_path, 1)
@@ -363,7 +365,7 @@ extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, driv
 
 
 @pytest.mark.long
-async def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres) -> None:
+async def test_rows_in_postgresql_equal_those_in_the_stream(running: Cluster, empty: Postgres) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 6)
         sink = PostgresSink(empty.where)
@@ -381,7 +383,7 @@ async def test_rows_come_back_from_postgresql(running: Cluster, empty: Postgres)
 
 
 @pytest.mark.long
-def test_partly_missing_values_read_back(empty: Postgres) -> None:
+def test_partly_missing_values_are_read_back_from_postgresql(empty: Postgres) -> None:
     sink = PostgresSink(empty.where)
     sink.begin("then")
     table = unpack(message(0, 1))
@@ -402,7 +404,7 @@ def test_partly_missing_values_read_back(empty: Postgres) -> None:
 
 
 @pytest.mark.slow
-def test_samples_have_their_units(empty: Postgres) -> None:
+def test_samples_in_postgresql_have_their_units(empty: Postgres) -> None:
     import pyarrow as pa
 
     sink = PostgresSink(empty.where)
@@ -421,7 +423,7 @@ def test_samples_have_their_units(empty: Postgres) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Postgres) -> None:
+def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
     assert one.begin("then") == KeptPlace(0, {})
     with pytest.raises(SinkError, match="another hub writes into this database; waiting until it ends"):
@@ -439,11 +441,11 @@ def test_a_second_hub_of_one_database_waits_for_the_end_of_the_first(empty: Post
 
 @pytest.mark.slow
 def test_rows_after_a_moved_position_are_refused(empty: Postgres) -> None:
-    """Several hubs may share one lock behind a connection pooler."""
+    """Behind a connection pooler, several hubs may share one lock."""
     sink = PostgresSink(empty.where)
     sink.begin("then")
     empty.ask("update multidrop.hub set place = 7 returning place")
-    for first in (1, 7, 9):  # behind it, and where messages would be passed over
+    for first in (1, 7, 9):  # behind the position, and where messages would be skipped
         with pytest.raises(SinkError, match="another hub writes into this database: stop one of them"):
             sink.write(commit_of(first=first, last=first))
     sink.close()
@@ -460,7 +462,7 @@ def test_a_missing_database_is_one_sentence(empty: Postgres) -> None:
 
 
 @pytest.mark.long
-def test_insufficient_rights_are_one_sentence(empty: Postgres) -> None:
+def test_insufficient_database_rights_are_one_sentence(empty: Postgres) -> None:
     empty.ask("drop role if exists reader; create role reader login")
     sink = PostgresSink(empty.where.replace("user=multidrop", "user=reader"))
     with pytest.raises(SinkError, match="PostgreSQL: permission denied for database postgres"):

@@ -1,4 +1,4 @@
-"""The forwarder against real servers: in order, each message once, whatever is lost on the way."""
+"""The forwarder with real servers: in order, each message once, whatever the network loses."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ async def until(is_so: Any) -> None:
 
 
 async def stored(path: ServerPath) -> list[StreamMessage]:
-    """Return all messages of the stream."""
+    """Return all messages in the stream."""
     found: list[StreamMessage] = []
     while more := await read_after(path, found[-1].place if found else 0, 3, 1 << 20):
         found += more
@@ -79,12 +79,12 @@ def filled(folder: Path, messages: int) -> Spool:
 
 
 async def store(spool: Spool, first: int) -> None:
-    """Append five exchanges to the spool, and wait until they are a message on the disk."""
+    """Append five exchanges to the spool, and wait until they are on the disk as a message."""
     spool.append(numbered(first, 5))
     assert await asyncio.to_thread(spool.sync, PATIENCE_S)
 
 
-async def test_messages_are_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
+async def test_messages_are_stored_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
     spool = filled(tmp_path / "spool", 7)
     async with empty_stream(running) as path, forwarding(spool, path) as forwarder:
         await until(lambda: forwarder.last == 7)
@@ -117,7 +117,7 @@ async def test_a_restarted_gateway_continues_after_the_last_stored_message(
 
 
 class Lossy:
-    """A path whose answers to messages are lost, before or after the stream has stored them."""
+    """A path that loses messages, or the stream's answers to them."""
 
     def __init__(self, path: ServerPath, fates: str) -> None:
         self._path, self._fates = path, iter(fates)
@@ -127,9 +127,9 @@ class Lossy:
 
     async def request(self, subject: str, data: bytes = b"", *details: Any, **more: Any) -> Any:
         fate = next(self._fates, "ok") if not subject.startswith("$JS") else "ok"
-        if fate == "b":  # lost before it was stored
+        if fate == "b":  # the message is lost
             raise Unsure("no answer")
-        if fate == "l":  # late: it arrives after it was sent again
+        if fate == "l":  # late: the message arrives after its copy
             asyncio.get_running_loop().call_later(0.05, self._late, subject, data, *details)
             raise Unsure("no answer")
         answer = await self._path.request(subject, data, *details, **more)
@@ -143,19 +143,19 @@ class Lossy:
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
-async def test_after_any_doubt_each_message_is_there_once(
+async def test_after_lost_messages_or_answers_each_message_is_stored_once(
     running: Cluster, tmp_path: Path, fates: str
 ) -> None:
     spool = filled(tmp_path / "spool", 6)
     async with empty_stream(running) as path, forwarding(spool, Lossy(path, fates)) as forwarder:
         await until(lambda: forwarder.last == 6)
-        await asyncio.sleep(0.1)  # for late ones to be refused
+        await asyncio.sleep(0.1)  # until late messages were refused
         assert [one.sequence for one in await stored(path)] == [1, 2, 3, 4, 5, 6]
     spool.close()
 
 
-async def test_server_answers_within_a_log_are_skipped(running: Cluster, tmp_path: Path) -> None:
-    """Any client may direct a server's answer to this subject; messages are sent once as usual."""
+async def test_server_answers_within_a_log_are_ignored(running: Cluster, tmp_path: Path) -> None:
+    """Any client may direct a server's answer to this subject. The log's messages are still sent once."""
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
@@ -172,7 +172,7 @@ async def test_server_answers_within_a_log_are_skipped(running: Cluster, tmp_pat
 
 
 class Refusing(Lossy):
-    """A path on which the stream rejects the first messages for lack of room, as full servers do."""
+    """A path on which the stream refuses the first messages, as servers without room do."""
 
     async def request(self, subject: str, data: bytes = b"", *details: Any, **more: Any) -> Any:
         if not subject.startswith("$JS") and next(self._fates, ""):
@@ -180,7 +180,7 @@ class Refusing(Lossy):
         return await self._path.request(subject, data, *details, **more)
 
 
-async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
+async def test_a_refusing_stream_is_logged_once_until_it_accepts_a_message(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
@@ -194,7 +194,7 @@ async def test_a_refusing_stream_is_logged_once_until_it_takes_a_message(
     ]
 
 
-async def test_dropped_messages_of_the_spool_are_skipped(running: Cluster, tmp_path: Path) -> None:
+async def test_messages_that_the_spool_has_dropped_are_skipped(running: Cluster, tmp_path: Path) -> None:
     filled(tmp_path / "spool", 5).close()
     spool = Spool(tmp_path / "spool", "gateway-1", most=1)
     await store(spool, 25)
@@ -216,7 +216,7 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
         spool.close()
         (tmp_path / "spool" / "000000000002-50.arrows").unlink()
         spool = Spool(tmp_path / "spool", "gateway-1")
-        for number in (100, 200):  # first as long as the stream, and then longer
+        for number in (100, 200):  # first a log as long as the stream's, then a longer one
             async with forwarding(spool, path) as forwarder:
                 await until(lambda forwarder=forwarder: forwarder.trouble)
             await store(spool, number)
@@ -247,11 +247,11 @@ async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pyte
     spool.close()
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
     assert told[0].startswith("samples are not forwarded: ")
-    # The fourth may have come before the server was gone, and its answer not.
+    # The stream may have stored the fourth message without answering.
     assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
 
 
-async def test_the_largest_message_comes_back(running: Cluster) -> None:
+async def test_the_largest_message_is_stored_and_read_back(running: Cluster) -> None:
     async with empty_stream(running) as path:
         data = random.Random(1).randbytes(MOST_BYTES)
         headers = {samples_stream.SEQUENCE: "7", samples_stream.DIGEST: digest_of(data)}
@@ -265,7 +265,7 @@ async def test_the_largest_message_comes_back(running: Cluster) -> None:
 
 
 @pytest.mark.slow
-async def test_a_missing_stream_is_reported_and_awaited(running: Cluster, tmp_path: Path) -> None:
+async def test_a_missing_stream_is_reported_and_waited_for(running: Cluster, tmp_path: Path) -> None:
     async with empty_stream(running) as path:
         await samples_stream._ask(path, "STREAM.DELETE.samples", {})
         for asked in (about(path), last_of(path, "samples.a.b")):

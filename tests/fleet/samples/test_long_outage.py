@@ -1,4 +1,4 @@
-"""A long outage: the spool keeps what its limit allows, and all sides agree about the rest."""
+"""A long outage: the spool keeps as much as its limit allows, and the hub knows which rows are lost."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def filled(folder: Path, first: int, most: int) -> Spool:
 
 @pytest.fixture
 def most(tmp_path: Path) -> int:
-    """Return the bytes of about ten messages."""
+    """Return a limit of about ten messages, in bytes."""
     spool = Spool(tmp_path / "one", "gateway-1")
     spool.append(numbered(0, EXCHANGES))
     assert spool.sync(PATIENCE_S)
@@ -65,8 +65,8 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 
 @pytest.mark.long
-async def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, most: int) -> None:
-    """Rows that are kept, and rows that the spool counts as lost, are all that there were."""
+async def test_after_an_outage_stored_and_lost_rows_add_up(tmp_path: Path, most: int) -> None:
+    """The outage outlasts the spool's limit: each row is stored, or counted as lost by the spool."""
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:
 
@@ -82,7 +82,7 @@ async def test_nats_is_away_for_longer_than_the_spool_can_keep(tmp_path: Path, m
         state, spooled = await live()
     assert 8 <= 40 - state.missing <= 10
     assert state.rows + spooled.lost == MESSAGES * EXCHANGES * 10
-    assert (state.alarms, state.doubled) == (2, 0)  # missing messages, and rows that the gateway says it lost
+    assert (state.alarms, state.doubled) == (2, 0)  # messages are missing; rows are lost
     with History(tmp_path / "hub") as history:
         rows = sorted(tuple(row) for batch in history.read() for row in batch)
     assert exchanges_in(rows) == list(range(state.missing * EXCHANGES, MESSAGES * EXCHANGES))

@@ -1,4 +1,4 @@
-"""Messages of samples: any Arrow reader opens them, and invalid bytes are refused."""
+"""Messages of samples: any Arrow reader can open them, and invalid bytes are rejected."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
 
 
 @pytest.mark.slow
-def test_rows_read_back_unchanged() -> None:
+def test_rows_are_read_back_unchanged_from_a_message() -> None:
     (message,) = packed(example())
     assert message.rows == len(EXAMPLE)
-    wanted = [(*row[:2], row[2] and 1000, *row[3:], None) for row in EXAMPLE]  # 7 ns, rounded up to 1 us
+    wanted = [(*row[:2], row[2] and 1000, *row[3:], None) for row in EXAMPLE]  # 7 ns are rounded up to 1 us
     assert rows_of(unpack(message.data)) == sorted(wanted, key=lambda row: (row[0], row[3:5]))
 
 
 @pytest.mark.slow
 def test_pyarrow_opens_a_message() -> None:
-    """By the table in the module's docstring, and no function of ours."""
+    """The test uses the table in the module's docstring, and none of our functions."""
     (message,) = packed(example())
     with pa.ipc.open_stream(message.data) as reader:
         table = reader.read_all()
@@ -52,7 +52,7 @@ def test_pyarrow_opens_a_message() -> None:
         "unit",
     ]
     assert set(table.column("clock_ns").to_pylist()) == {UTC_0}
-    found = table.drop_columns(["time"]).to_pylist()  # pyarrow gives nanoseconds by pandas alone
+    found = table.drop_columns(["time"]).to_pylist()  # pyarrow needs pandas to return nanoseconds
     assert [(row["register"], row["drive"], row["value"]) for row in found][:2] == [
         ("output_frequency", "pump-1", 49.99),
         ("output_frequency", 'fan, the "old" one', None),
@@ -61,7 +61,7 @@ def test_pyarrow_opens_a_message() -> None:
     assert table.column("time").type == pa.timestamp("ns", "UTC")
 
 
-def test_values_are_kept_bit_for_bit() -> None:
+def test_values_are_stored_bit_for_bit() -> None:
     numbers = [-0.0, 0.0, 1e300, 5e-324, 0.1, -1 / 3]
     columns = Columns(len(numbers))
     for at, number in enumerate(numbers):
@@ -78,7 +78,7 @@ def test_values_are_kept_bit_for_bit() -> None:
 
 @table(("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)])
 def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
-    """Fifty minutes are more than 32 bits of microseconds hold, and than any request lasts."""
+    """Fifty minutes exceed 32 bits of microseconds, and any request's duration."""
     columns = Columns(1)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND + ns, words=(1,)), UTC_0)
     (message,) = packed(Batch(columns, DRIVES, REGISTERS))
@@ -108,11 +108,11 @@ def test_rows_of_another_poller_are_not_mixed_in() -> None:
     assert not buffer.add(numbered(10, 10, Names(["fan-1", "fan-2", "fan-3", "fan-4"])).columns())
     assert buffer.rows == 100
     more = Names([f"pump-{number}" for number in range(1, 7)])
-    assert buffer.add(numbered(10, 10, more).columns())  # the same poller, which knows more drives
+    assert buffer.add(numbered(10, 10, more).columns())  # the same poller, with more drives
 
 
 @pytest.mark.long
-def test_damaged_bytes_end_in_a_sentence() -> None:
+def test_damaged_bytes_raise_message_errors_only() -> None:
     (message,) = packed(numbered(0, 40))
     whole = unpack(message.data)
     dice = random.Random(7)
@@ -120,7 +120,7 @@ def test_damaged_bytes_end_in_a_sentence() -> None:
         damaged = bytearray(message.data)
         for _ in range(dice.randrange(1, 4)):
             damaged[dice.randrange(len(damaged))] = dice.randrange(256)
-        with suppress(MessageError):  # and no other error
+        with suppress(MessageError):  # no other error
             assert unpack(bytes(damaged)).schema == whole.schema
     for length in range(0, len(message.data) - 8, 7):
         with pytest.raises(MessageError, match=f"^{length} bytes are not a message of samples"):
@@ -141,7 +141,7 @@ NAMELESS = pa.DictionaryArray.from_arrays(pa.array([0, 1], pa.int32()), pa.array
 
 
 def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) -> bytes:
-    """Return a message of two rows as another writer than ours would write it, with these columns."""
+    """Return a message of two rows with these columns, as another program might write it."""
     columns = {
         "time": times(UTC_0, UTC_0),
         "clock_ns": pa.array([5, 5], pa.int64()),
@@ -191,7 +191,7 @@ def test_rows_of_another_arrow_writer_are_accepted() -> None:
 
 
 def alike(rows: int) -> dict[str, Any]:
-    """Return the columns of this many equal rows."""
+    """Return columns of this many equal rows."""
     names = ("drive", "register", "status", "unit")
     return {
         "time": pa.repeat(times(UTC_0)[0], rows),
@@ -212,19 +212,19 @@ def test_a_message_with_too_many_rows_is_rejected() -> None:
 
 BOMB = 1 << 28  # bytes
 ZSTD = pa.ipc.IpcWriteOptions(compression="zstd")
-OF_ONE_TEXT = {  # of so many rows: small as they are sent, and as they lie in memory, until they are cast
+OF_ONE_TEXT = {  # columns of this many rows: small in the message and in memory, but not after a cast
     "unit": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array(["f" * 9000])),
     "value": lambda rows: pa.DictionaryArray.from_arrays(pa.repeat(0, rows), pa.array(["1" * 9000])),
     "clock_ns": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array([5])),
 }
 
 
-POOLS: list[pa.MemoryPool] = []  # memory of one test may outlive it
+POOLS: list[pa.MemoryPool] = []  # kept alive, because a test's memory may outlive it
 
 
 @pytest.fixture
 def most_allocated() -> Iterator[Callable[[], int]]:
-    """Return a function that reports pyarrow's peak memory since this call."""
+    """Yield a function that returns pyarrow's peak memory since this call."""
     before = pa.default_memory_pool()
     pool = pa.proxy_memory_pool(pa.system_memory_pool())
     POOLS.append(pool)
@@ -234,7 +234,7 @@ def most_allocated() -> Iterator[Callable[[], int]]:
 
 
 def bomb(compression: str) -> bytes:
-    """Return a message with a large name that is mostly missing."""
+    """Return a message with a large name, most of whose bytes are missing."""
     options = pa.ipc.IpcWriteOptions(compression=compression)
     data = written(options, drive=named("f" * BOMB, "fan"))
     assert len(data) < BOMB / 200
@@ -263,7 +263,7 @@ def test_columns_that_grow_by_a_cast_are_rejected(column: str, most_allocated: C
     assert most_allocated() - before < 8 << 20
 
 
-def test_rows_without_bytes_are_limited_too(most_allocated: Callable[[], int]) -> None:
+def test_rows_that_need_no_bytes_are_limited_too(most_allocated: Callable[[], int]) -> None:
     schema = pa.schema([("time", pa.null())])
     rows = pa.RecordBatch.from_arrays([pa.Array.from_buffers(pa.null(), 1 << 30, [None])], schema=schema)
     sink = pa.BufferOutputStream()
@@ -275,15 +275,15 @@ def test_rows_without_bytes_are_limited_too(most_allocated: Callable[[], int]) -
 
 
 def test_an_older_format_version_is_rejected() -> None:
-    """It marks compressed buffers differently."""
+    """The older version marks compressed buffers differently."""
     options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
     with pytest.raises(MessageError, match="another version of the format"):
         unpack(written(options))
 
 
 @pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
-def test_the_size_equals_the_buffers_that_pyarrow_unpacks(options: pa.ipc.IpcWriteOptions | None) -> None:
-    """Equal texts are compressed, random numbers are not, and empty lists have no bytes."""
+def test_the_unpacked_size_equals_that_of_pyarrows_buffers(options: pa.ipc.IpcWriteOptions | None) -> None:
+    """Equal texts are stored compressed, random numbers uncompressed, and empty lists have no bytes."""
     dice = random.Random(3)
     data = written(
         options,
@@ -303,7 +303,7 @@ def test_the_size_equals_the_buffers_that_pyarrow_unpacks(options: pa.ipc.IpcWri
 
 
 def test_a_message_is_split_before_it_is_too_large_to_be_unpacked() -> None:
-    """Long names of many drives compress well."""
+    """Long names of many drives compress well, so a small message may be large when unpacked."""
     drives = Names([f"{number:0900d}" for number in range(6000)])
     columns = Columns(6000)
     for number in range(6000):

@@ -48,7 +48,7 @@ def record(load: str) -> Record:
 
 
 def changed(folder: Path) -> PolledUnits:
-    """Return units of a line whose first register is in volts up to exchange 20, and then in amperes."""
+    """Return the units of a line whose first register is in volts until exchange 20, and then in amperes."""
     units = PolledUnits()
     units.note(line_of(record('unit = "V"'), folder), 0)
     units.note(line_of(record(AMPERES), folder), 20 * STEP)
@@ -62,7 +62,7 @@ def tables(units: PolledUnits | None, first: int = 0) -> list[pa.Table]:
 
 
 def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
-    """Return the exchanges of pump-1 in order, and the unit of this register in each."""
+    """Return pump-1's exchanges in order, each with its number and the unit of this register."""
     columns = [table.column(name).to_pylist() for name in ("drive", "register", "unit")]
     times = table.column("time").cast("int64").to_pylist()
     rows = zip(times, *columns, strict=True)
@@ -70,19 +70,19 @@ def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
 
 
 def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
-    """Also those that are packed after the change, in one message with rows of the other unit."""
+    """This includes rows that are packed after the change, in one message with rows of the new unit."""
     (table,) = tables(changed(tmp_path))
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
     assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]
     assert units_in(table, "value_3") == [(at, "") for at in range(0, 40, 4)]
-    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # without a description
+    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # rows without a description
 
 
 def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
     units = PolledUnits()
     lines = FleetLines(Mastership(), tmp_path, units)
     lines._take(record('unit = "V"'))
-    with pytest.raises(ValueError, match="line-1"):  # it is polled, and stays as it is
+    with pytest.raises(ValueError, match="line-1"):  # the line is polled already and stays unchanged
         lines._take(record('unit = "kW"'))
     lines.poller.remove_line("line-1")
     before_ns = time.monotonic_ns()
@@ -95,7 +95,7 @@ def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_merged_files_keep_the_units_beside_rows_without(tmp_path: Path) -> None:
+def test_merged_files_keep_units_beside_rows_without_units(tmp_path: Path) -> None:
     require_module("duckdb")
     sink = ParquetSink(tmp_path)
     hour = 3600 * 10**9 // STEP
@@ -120,7 +120,7 @@ def test_units_are_named_as_in_a_history() -> None:
 
 @pytest.fixture(params=["as they came", "merged"])
 def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """The folder of a hub, with a change within its first file, and later rows without units."""
+    """Return a hub's folder with a change of units within its first file, and later rows without units."""
     require_module("duckdb")
     folder, units = tmp_path / "kept", changed(tmp_path / "lines")
     sink = ParquetSink(folder)
@@ -141,7 +141,7 @@ BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [1, 120])
-def test_plots_do_not_mix_units(kept: Path, points: int) -> None:
+def test_a_plot_never_mixes_units(kept: Path, points: int) -> None:
     with History(kept) as history:
         found = history.buckets([f"pump-1.value_{at}" for at in (1, 2, 3, 4)], BEGIN, END, points)
         before = history.buckets("pump-1.value_1", BEGIN, BEFORE, points)["pump-1.value_1"]
@@ -156,7 +156,7 @@ def test_plots_do_not_mix_units(kept: Path, points: int) -> None:
 
 
 @pytest.mark.long
-def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path: Path) -> None:
+def test_rows_of_a_hubs_folder_have_one_column_per_unit(kept: Path, tmp_path: Path) -> None:
     with History(kept) as history:
         rows = history.read("pump-1.value_1", BEGIN, END)
         about = rows.metadata["drives"]["pump-1"]["registers"]
@@ -175,6 +175,6 @@ def test_rows_of_a_hubs_folder_have_a_column_for_each_unit(kept: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_a_single_file_of_a_hub_is_refused(kept: Path) -> None:
+def test_opening_a_single_file_of_a_hub_is_refused(kept: Path) -> None:
     with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder with"):
         multidrop.open_recording(min((kept / "rows").iterdir()))

@@ -1,4 +1,4 @@
-"""The gateway and number of a message in the stream, whatever its writer put into the headers."""
+"""The gateway and number of a message in the stream are right, whatever headers its writer has set."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ HOSTILE = {
 
 
 async def _as_mail(self: Client, headers: bytes | None) -> dict[str, str] | None:
-    """Parse headers as nats-py did until 2.14, by Python's parser for e-mails."""
+    """Parse headers as nats-py did until 2.14, with Python's e-mail parser."""
     parsed = BytesParser().parsebytes((headers or b"").partition(b"\r\n")[2])
     return {name.strip(): str(value).strip() for name, value in parsed.items()} or None
 
 
 def say_with(url: str, subject: str, headers: str) -> None:
-    """Publish a message with headers that no client library would write."""
+    """Publish a message with headers that no client library would send."""
     block = b"NATS/1.0\r\n" + headers.encode("latin-1") + b"\r\n"
     address = urlsplit(url)
     with socket.create_connection((address.hostname, address.port)) as link, link.makefile("rb") as answers:

@@ -49,7 +49,7 @@ def store(spool: Spool, first: int, exchanges: int) -> None:
 
 
 def filled(folder: Path, messages: int, exchanges: int = 5) -> None:
-    """Store messages of so many exchanges each."""
+    """Write this many messages, with this many exchanges each."""
     spool = Spool(folder, GATEWAY)
     for number in range(messages):
         store(spool, number * exchanges, exchanges)
@@ -65,13 +65,13 @@ def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None
 
 
 @pytest.mark.slow
-def test_rows_become_a_message_after_a_second(spool: Spool, folder: Path) -> None:
+def test_rows_are_written_as_a_message_after_a_second(spool: Spool, folder: Path) -> None:
     spool.append(numbered(0, 3))
     until(lambda: spool.state().written == 30)
     assert [file.name for file in folder.glob("*.arrows")] == ["000000000001-30.arrows"]
 
 
-def test_16384_rows_are_a_message_at_once(
+def test_16384_rows_are_written_as_a_message_immediately(
     spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(spool_module, "ENOUGH_S", 3600.0)
@@ -82,7 +82,7 @@ def test_16384_rows_are_a_message_at_once(
     assert len(list(folder.glob("*.arrows"))) == 1
 
 
-def test_a_log_continues_after_its_newest_message(folder: Path) -> None:
+def test_a_reopened_log_continues_after_its_newest_message(folder: Path) -> None:
     filled(folder, 3)
     log = json.loads((folder / "spool.json").read_text())["log"]
     spool = Spool(folder, GATEWAY)
@@ -93,7 +93,7 @@ def test_a_log_continues_after_its_newest_message(folder: Path) -> None:
     assert exchanges_in(rows_in(folder)) == list(range(20))
 
 
-def test_a_new_folder_is_a_new_log(tmp_path: Path) -> None:
+def test_a_new_folder_starts_a_new_log(tmp_path: Path) -> None:
     logs = set()
     for name in ("a", "b"):
         filled(tmp_path / name, 1)
@@ -106,17 +106,17 @@ def test_a_new_folder_is_a_new_log(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("step", usually(83, 1))
-def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
+def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:
-    """A disk that kept the name and not the bytes leaves it so; a file without its name is there too."""
+    """The disk stored such a file's name, but not all of its bytes. A file without a name is there too."""
     whole = tmp_path / "whole"
     filled(whole, 3, exchanges=2)
     newest = max(whole.glob("*.arrows"))
     data = newest.read_bytes()
     before = rows_in(whole)
     ends = [size for size in range(0, len(data), step) if _is_whole(data[:size])]
-    assert all(size >= len(data) - 8 for size in ends)  # an end marker adds no row
+    assert all(size >= len(data) - 8 for size in ends)  # cutting only the end marker loses no row
     for size in range(0, len(data), step):
         folder = tmp_path / "cut"
         shutil.copytree(whole, folder)
@@ -130,7 +130,7 @@ def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
         assert [row for row in before if row not in found] == lost
         assert exchanges_in(found)[-2:] == [6, 7]
         assert not list(folder.glob(".*.tmp"))
-        assert (folder / "000000000004-20.arrows").exists()  # the number of the cut one is not given again
+        assert (folder / "000000000004-20.arrows").exists()  # the number of the cut file is not reused
         assert list(folder.glob("*.damaged")) == (
             [] if size in ends else [folder / "000000000003-20.damaged"]
         )
@@ -140,7 +140,7 @@ def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
 
 
 def test_the_number_of_a_damaged_message_is_not_reused(folder: Path) -> None:
-    """The stream may have had it whole: another one of this number would be taken for its copy."""
+    """The stream may have the whole message, and would take another one of this number for its copy."""
     filled(folder, 2, exchanges=2)
     newest = max(folder.glob("*.arrows"))
     newest.write_bytes(newest.read_bytes()[:100])
@@ -197,8 +197,8 @@ def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pyt
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (12, 0.6)))
-def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None:
-    """Each run has its own numbers; all reported rows are there once, in order, without a gap."""
+def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, longest_s: float) -> None:
+    """Each run has its own numbers. All reported rows are stored once, in order, without a gap."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(spooled.__file__).parents[1].iterdir()))
     told = []
@@ -207,7 +207,9 @@ def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None
         here = {**os.environ, "PYTHONPATH": support}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             assert child.stdout is not None
-            least = [int(child.stdout.readline()) for _ in range(2)][1]  # none yet, and the first that are
+            least = [int(child.stdout.readline()) for _ in range(2)][
+                1
+            ]  # the second report has the first stored rows
             time.sleep(dice.uniform(0, longest_s))
             child.kill()
             said = child.stdout.read().split("\n")[:-1]
@@ -221,7 +223,7 @@ def test_kills_at_any_moment(folder: Path, kills: int, longest_s: float) -> None
     assert not list(folder.glob("*.damaged"))
 
 
-# ---- bounds ----
+# ---- limits ----
 
 
 def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
@@ -241,14 +243,14 @@ def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
     left = sorted(int(file.name[:12]) for file in folder.glob("*.arrows"))
     assert left == list(range(state.oldest, 13))
     assert state.oldest >= 7
-    assert state.lost == (state.oldest - 1 - 3) * 50  # the first three were forwarded
+    assert state.lost == (state.oldest - 1 - 3) * 50  # the first three messages were forwarded
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
     assert "the spool is full at" in caplog.text
 
 
-def test_removals_before_the_first_answer_are_counted_later(folder: Path) -> None:
+def test_removals_before_the_streams_first_answer_are_counted_later(folder: Path) -> None:
     filled(folder, 6)
-    spool = Spool(folder, GATEWAY, most=1)  # the newest stays
+    spool = Spool(folder, GATEWAY, most=1)  # the newest message is always kept
     store(spool, 30, 5)
     until(lambda: spool.state().oldest == 7)
     assert spool.state().lost == 0
@@ -332,7 +334,7 @@ def test_a_full_disk_keeps_unsent_messages_and_the_newest(
     assert (spool.state().newest, spool.state().lost) == (4, 0)
 
 
-def test_a_hanging_disk_delays_no_poller(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hanging_disk_does_not_delay_the_poller(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     goes_on, stands = threading.Event(), threading.Event()
     really = os.fsync
 
@@ -399,7 +401,7 @@ def test_names_invalid_in_subjects_are_rejected(folder: Path, name: str) -> None
         Spool(folder, name)
 
 
-def test_a_stored_batch_reads_back_unchanged(spool: Spool, folder: Path) -> None:
+def test_a_stored_batch_is_read_back_unchanged(spool: Spool, folder: Path) -> None:
     batch = numbered(0, 20)
     spool.append(batch)
     assert spool.sync(30.0)

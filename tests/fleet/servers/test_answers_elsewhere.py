@@ -1,7 +1,7 @@
 """Requests whose answers would go to another user's subjects: no answer leaves the user's account.
 
 Each attempt is made twice: with the accounts as written, and with one account for all users, in which every
-answer arrives.
+answer arrives. The second run proves that the attempts are valid.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ STREAMS = ("KV_plant", "KV_lease_0", "KV_own_0", STREAM)
 
 
 def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
-    """Return reply subjects, all with the user's name."""
+    """Return subjects of other users to give as reply subjects. Each contains the name of `user`."""
     return [
         *(f"$KV.plant.{user}", f"$KV.lease_0.{user}.gw-b", f"$KV.own_0.{user}", f"{STREAM}.gw-b.{user}"),
         *(f"stop.{user}", f"cmd.{user}", f"do.gw-b.{user}", f"gateway.gw-b.{user}"),
@@ -41,7 +41,7 @@ def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
 
 
 async def make_streams(servers: SecuredCluster) -> None:
-    """Make a fleet's buckets and its stream of samples."""
+    """Create a fleet's buckets and its stream of samples."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
     await create_stream(operator[0], replicas=len(servers.nodes))
@@ -51,7 +51,7 @@ async def make_streams(servers: SecuredCluster) -> None:
 
 @asynccontextmanager
 async def connected(servers: SecuredCluster, url: str) -> AsyncIterator[Mapping[str, Client]]:
-    """Yield a connection of each user to one server."""
+    """Yield a connection to this server for each user."""
     clients = {user: Client() for user in (*GATEWAYS, *OTHERS)}
     try:
         for user, client in clients.items():
@@ -63,7 +63,7 @@ async def connected(servers: SecuredCluster, url: str) -> AsyncIterator[Mapping[
 
 
 def questions(user: str) -> Iterator[tuple[str, bytes]]:
-    """Yield the requests to the store that a user may send; each is answered."""
+    """Yield the requests to stored data that a user may send. Each of them is answered."""
     stream, key = (STREAM, f"{STREAM}.gw-b.log") if user == "hub" else ("KV_own_0", "$KV.own_0.last")
     yield f"$JS.API.DIRECT.GET.{stream}", json.dumps({"last_by_subj": key}).encode()
     yield f"$JS.API.STREAM.INFO.{stream}", b""
@@ -74,13 +74,13 @@ def questions(user: str) -> Iterator[tuple[str, bytes]]:
 
 
 def all_inboxes(servers: SecuredCluster) -> dict[str, str]:
-    """Return where each user's answers come, without the last word."""
+    """Return the prefix of each user's inboxes."""
     public = {user: public_key(servers.key(user).read_text().strip()) for user in (*GATEWAYS, *OTHERS)}
     return {user: inbox_of(key) for user, key in public.items()}
 
 
 def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
-    """Return each user's forbidden reply subjects."""
+    """Return the reply subjects for each user to which that user may not publish."""
     rights, inboxes = rights_of(GATEWAYS), all_inboxes(servers)
     return {
         user: [
@@ -93,16 +93,17 @@ def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
 
 
 async def arrivals(servers: SecuredCluster, wanted: Set[str]) -> set[str]:
-    """Let each user request answers elsewhere from each server; return the subjects that got one.
+    """Let each user request answers on forbidden subjects; return the subjects that got one.
 
-    Those that are wanted are waited for: servers do not answer in order.
+    Requests go to each server. Answers on the `wanted` subjects are waited for, because servers do not answer
+    in order.
     """
     await make_streams(servers)
     return set[str]().union(*[await arrivals_at(servers, url, wanted) for url in servers.urls])
 
 
 async def arrivals_at(servers: SecuredCluster, url: str, wanted: Set[str]) -> set[str]:
-    """Do that at one server."""
+    """Return the arrivals as above, for requests to one server."""
     heard: set[str] = set()
 
     async def hear(message: Msg) -> None:
@@ -130,19 +131,19 @@ async def arrivals_at(servers: SecuredCluster, url: str, wanted: Set[str]) -> se
 
 
 async def stored(client: Client, stream: str) -> set[str]:
-    """Return the subjects of all that a stream holds."""
+    """Return all subjects in a stream."""
     answer = await client.request(f"$JS.API.STREAM.INFO.{stream}", b'{"subjects_filter": ">"}', PATIENCE_S)
     return set(json.loads(answer.data)["state"].get("subjects", ()))
 
 
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_no_answer_leaves_its_askers_account(tmp_path: Path, number: int) -> None:
+def test_no_answer_leaves_the_requesters_account(tmp_path: Path, number: int) -> None:
     with secured_cluster(tmp_path, number, GATEWAYS) as servers:
         assert asyncio.run(arrivals(servers, set())) == set()
 
 
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_in_one_account_each_answer_arrives(tmp_path: Path, number: int) -> None:
+def test_in_one_account_for_all_each_answer_arrives(tmp_path: Path, number: int) -> None:
     with secured_cluster(tmp_path, number, GATEWAYS, in_one_account) as servers:
         wanted = {subject for subjects in foreign(servers).values() for subject in subjects}
         assert asyncio.run(arrivals(servers, wanted)) == wanted

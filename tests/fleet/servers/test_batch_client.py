@@ -1,4 +1,4 @@
-"""Many answers at once: which are accepted, and how missing ones end."""
+"""Many answers at a time: which are accepted, and what a missing answer causes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SERVERS = (
 
 @pytest.fixture(params=["taken at once", "nats-py's own way", "another nats-py"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Use the fast path, with that of nats-py, and with a changed nats-py; return a unique name."""
+    """Use the fast path, nats-py's own path, or a changed nats-py; return a unique name."""
     if request.param == "nats-py's own way":
         monkeypatch.delattr(BatchClient, "_process_msg")
     elif request.param == "another nats-py":
@@ -45,8 +45,8 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     return f"way-{request.param_index}"
 
 
-def test_nats_py_has_the_place_where_answers_are_taken() -> None:
-    """Answers go a way that costs more if this fails: find the new place, or name that nats-py too new."""
+def test_nats_py_still_has_the_method_that_receives_answers() -> None:
+    """If this fails, answers take a slower path. Find the new method, or declare this nats-py too new."""
     names = ["self", "sid", "subject", "reply", "data", "headers"]
     assert list(inspect.signature(Client._process_msg).parameters) == names
     assert inspect.iscoroutinefunction(Client._process_msg)
@@ -63,7 +63,7 @@ async def test_answers_bypass_the_queue_of_nats_py(one: Cluster, monkeypatch: py
 
 
 def _rested(path: ServerPath) -> None:
-    """Let a path have all there is to spare, as after some time at rest."""
+    """Fill the path's budget for repeated reads, as after some time without load."""
     for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
         path.spare.note(is_late=False)
         path.spare.learn(0.01)
@@ -79,7 +79,7 @@ def _rested(path: ServerPath) -> None:
         b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
     ],
 )
-def test_server_headers_take_precedence_over_the_writers(writers: bytes) -> None:
+def test_server_headers_take_precedence_over_the_writers_headers(writers: bytes) -> None:
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 
@@ -92,7 +92,7 @@ def test_server_headers_take_precedence_over_the_writers(writers: bytes) -> None
         b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
     ],
 )
-def test_other_headers_end_an_answer(headers: bytes) -> None:
+def test_headers_without_a_message_end_an_answer(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
@@ -108,14 +108,14 @@ async def test_a_record_like_an_end_marker_does_not_hide_later_ones(one: Cluster
         await client.flush()
         await client.close()
         while f"{way}-b" not in [record.key for record in await bucket.changes(0)]:
-            await asyncio.sleep(0.05)  # no answer says that it is stored
+            await asyncio.sleep(0.05)  # the write has no answer to wait for
         await bucket.put(f"{way}-c", OWNER, 0)
         found = await bucket.changes(0)
         keys = [record.key for record in found if record.key.startswith(way)]
         assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
 
 
-async def test_each_of_many_records_is_replaced_at_its_own_revision_or_not(one: Cluster, way: str) -> None:
+async def test_each_of_many_records_is_replaced_only_at_its_revision(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_1", lambda: path)
         a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"
@@ -142,7 +142,7 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
     info = Request("$JS.API.INFO", b"")
     found = await client.replies([mute, nobody, info], 0.2)
     assert found[0] is None
-    assert found[1] == b""  # the server says so
+    assert found[1] == b""  # the server reports that there is no receiver
     assert found[2] is not None
     assert found[2].startswith(b"{")
     with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
@@ -174,7 +174,7 @@ async def test_reads_lost_on_a_cut_off_server_are_repeated(
                 await other.flush()
 
         await other.subscribe("moody", cb=answer)
-        await other.flush()  # this ping may leave before the subscription, the next one does not
+        await other.flush()  # this flush's ping may precede the subscription; the second one's does not
         await other.flush()
         if is_told:
             assert await path.collect("moody", b"") == []
@@ -185,7 +185,7 @@ async def test_reads_lost_on_a_cut_off_server_are_repeated(
         await other.close()
 
 
-async def test_reads_of_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
+async def test_reads_on_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
     paths = paths_of(one.urls)
     await asyncio.gather(*(path.open() for path in paths))
     asked: list[Request] = []
@@ -213,7 +213,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
         asked.put_nowait(message.reply)  # type: ignore[attr-defined]
 
     await other.subscribe("slow", cb=keep)
-    await other.flush()  # this ping may leave before the subscription, the next one does not
+    await other.flush()  # this flush's ping may precede the subscription; the second one's does not
     await other.flush()
     assert await client.replies([Request("slow", b"first")], 0.2) == [None]
     second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))
@@ -231,7 +231,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
 async def test_a_late_pong_does_not_end_reading(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     given_up = asyncio.get_running_loop().create_future()
-    given_up.cancel()  # as a flush leaves it that timed out
+    given_up.cancel()  # as after the timeout of a flush
     await client._send_ping(given_up)
     await client.flush(30)
     assert client.is_reading

@@ -1,4 +1,4 @@
-"""Direct gets in simulated time: the order of requests, and the answer that counts."""
+"""Direct gets in simulated time: the order of their requests, and which answer is used."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REQUEST = Request("questions", b"")
 
 
 class SlowWay:
-    """A path that answers each request after this time, or fails."""
+    """A path that answers its requests after these delays in s, or fails."""
 
     def __init__(
         self, name: str, *delays: float, failure: FleetError | None = None, pause: float = 0
@@ -26,7 +26,7 @@ class SlowWay:
         self.asked: list[float] = []
         self._delays = [*delays]
         self._failure = failure
-        self._pause = pause  # between messages
+        self._pause = pause  # in s, between messages
         self.under_way = 0
 
     async def gather(self, request: Request, get: DirectGet) -> None:
@@ -45,7 +45,7 @@ class SlowWay:
 
 
 def answer(*ways: SlowWay) -> tuple[str, float]:
-    """Return whose answer was used, and after how long (s). No request stays in flight."""
+    """Return which path's answer was used, and after how many s. No request may stay in flight."""
 
     async def main() -> tuple[str, float]:
         found = await first_answer(ways, REQUEST, full())
@@ -58,7 +58,7 @@ def answer(*ways: SlowWay) -> tuple[str, float]:
 
 
 def full() -> Spare:
-    """Return what there is to spare after some time at rest."""
+    """Return a full budget, as after some time without load."""
     spare = Spare()
     for _ in range(round(MOST_SPARE / EARNED)):
         spare.note(is_late=False)
@@ -70,25 +70,25 @@ def asked(ways: Sequence[SlowWay]) -> list[list[float]]:
     return [way.asked for way in ways]
 
 
-def test_a_prompt_answer_needs_one_request() -> None:
+def test_a_prompt_answer_takes_one_request() -> None:
     ways = [SlowWay("a", 0.01), SlowWay("b", 0.01), SlowWay("c", 0.01)]
     assert answer(*ways) == ("a", 0.01)
     assert asked(ways) == [[0.0], [], []]
 
 
 def test_an_unanswered_read_is_repeated_on_all_paths() -> None:
-    """By chance a server passes it on to the one that is cut off."""
+    """The server may have forwarded the request to one that is cut off."""
     ways = [SlowWay("a"), SlowWay("b", NEVER, 0.01), SlowWay("c")]
     assert answer(*ways) == ("b", 0.21)
     assert asked(ways) == [[0.0, 0.2], [0.1, 0.2], [0.1, 0.2]]
 
 
-def test_a_late_first_answer_counts_after_a_repeat() -> None:
+def test_a_late_first_answer_is_used_even_after_a_repeat() -> None:
     ways = [SlowWay("a", 0.15), SlowWay("b")]
     assert answer(*ways) == ("a", 0.15)
 
 
-def test_a_long_answer_is_not_requested_again_while_it_arrives() -> None:
+def test_a_long_answer_is_not_requested_again_while_parts_arrive() -> None:
     ways = [SlowWay("a", 0.01, pause=0.09), SlowWay("b", 0.01)]
     assert answer(*ways) == ("a", 0.28)
     assert asked(ways) == [[0.0], []]
@@ -99,7 +99,7 @@ def test_a_failed_path_is_not_waited_for() -> None:
     assert answer(*ways) == ("b", 0.01)
 
 
-def test_a_failure_of_all_paths_is_raised_at_once() -> None:
+def test_a_failure_of_all_paths_is_raised_immediately() -> None:
     for number in (1, 2, 3):
         ways = [SlowWay("a", 0.01, failure=Unsure("it ended with 503")) for _ in range(number)]
         with pytest.raises(Unsure, match="503"):
@@ -114,7 +114,7 @@ def test_a_forbidden_read_is_not_repeated() -> None:
     assert asked(ways) == [[0.0], []]
 
 
-def test_an_unanswered_read_ends() -> None:
+def test_an_unanswered_read_raises_after_its_repeats() -> None:
     ways = [SlowWay("a"), SlowWay("b"), SlowWay("c")]
 
     async def main() -> float:
@@ -128,7 +128,7 @@ def test_an_unanswered_read_ends() -> None:
 
 
 class LateWay(SlowWay):
-    """A path that always answers after so long."""
+    """A path that always answers after `delay` seconds."""
 
     def __init__(self, delay: float) -> None:
         super().__init__("late")
@@ -140,7 +140,7 @@ class LateWay(SlowWay):
 
 
 def questions(reads: int, ways: Sequence[LateWay], spare: Spare) -> int:
-    """Return how many questions so many reads are, one after the other."""
+    """Return how many requests are sent for this many reads, one after another."""
     before = sum(map(len, asked(ways)))
 
     async def main() -> None:
@@ -151,8 +151,8 @@ def questions(reads: int, ways: Sequence[LateWay], spare: Spare) -> int:
     return sum(map(len, asked(ways))) - before
 
 
-def test_no_read_is_repeated_before_timely_answers() -> None:
-    """Many gateways that start together each read a lot."""
+def test_reads_are_not_repeated_before_timely_answers_were_seen() -> None:
+    """Many gateways that start together read a lot, and repeats would slow them down more."""
     assert questions(100, [LateWay(0.9) for _ in range(3)], Spare()) == 100
 
 
@@ -165,7 +165,7 @@ def test_a_slow_cluster_gets_no_repeats() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [2, 5, 20])
-def test_occasional_late_reads_cause_few_repeats(late: int) -> None:
+def test_reads_that_are_late_now_and_then_cause_few_repeats(late: int) -> None:
     ways, spare = [LateWay(0.9) for _ in range(3)], full()
     questions(300, ways, spare)
     count = 0
@@ -182,12 +182,12 @@ def test_timely_answers_earn_repeats() -> None:
     for way in ways:
         way.delay = 0.01
     assert questions(round(2 / EARNED), ways, spare) == 2 / EARNED
-    ways[0].delay = NEVER  # it is lost now
+    ways[0].delay = NEVER  # this path no longer answers
     assert questions(1, ways, spare) == 3
 
 
 def test_the_budget_lasts_until_a_dead_route_is_dropped() -> None:
-    """A gateway reads some 100 times within these 3 s, and a third of its questions is lost."""
+    """A gateway reads about 100 times within these 3 s, and a third of its requests is lost."""
     ways, spare = [LateWay(0.01) for _ in range(3)], full()
     took = []
 
@@ -203,7 +203,7 @@ def test_the_budget_lasts_until_a_dead_route_is_dropped() -> None:
     assert max(took) < 0.12
 
 
-def test_a_failed_read_without_budget_ends() -> None:
+def test_a_failed_read_without_budget_raises() -> None:
     spare = Spare()
     ways = [SlowWay("a", 0.01, failure=Unsure("it ended with 503")), SlowWay("b", 0.01)]
 
@@ -216,7 +216,7 @@ def test_a_failed_read_without_budget_ends() -> None:
 
 
 def test_slow_answers_delay_repeats() -> None:
-    """Many gateways that start together each read the whole plant beside small records."""
+    """Many gateways that start together read the whole plant as well as small records."""
     way, others, spare = LateWay(0.2), [SlowWay("b"), SlowWay("c")], full()
 
     async def main() -> None:
@@ -224,7 +224,7 @@ def test_slow_answers_delay_repeats() -> None:
             await first_answer([way, *others], REQUEST, spare)
 
     run_controlled(main())
-    assert asked(others) == [[0.1], [0.1]]  # of the first read alone
+    assert asked(others) == [[0.1], [0.1]]  # repeats of the first read only
 
 
 def test_lost_reads_are_repeated_soon_once_answers_are_fast() -> None:

@@ -1,4 +1,4 @@
-"""Lease terms: which buckets are handed over while a server is silent, with fake servers."""
+"""Raft terms of the lease buckets: which are handed over while a server is silent, with fake servers."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from multidrop.fleet.servers.leaders import (
 
 SERVERS = ("n1", "n2", "n3")
 PATH: Any = None
-ASKS_S = 4.0  # a server that hears no one may ask for votes after this time
+ASKS_S = 4.0  # a server without contact may ask for votes after this time
 
 
 class Servers:
-    """Three servers; each bucket has a leader and a term."""
+    """Three servers. Each bucket has a leader and a Raft term."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.leaders = dict(zip((*names.LEASES, *names.OWNERS), 2 * SERVERS, strict=True))
         self.terms = dict.fromkeys(names.LEASES, 1)
         self.silent: set[str] = set()
-        self.unheard_ns = 0  # never, by this leader
+        self.unheard_ns = 0  # time since the leader last heard the server; 0 for never
         self.lagging: set[str] = set()
-        self.stuck: set[str] = set()  # buckets without a leader after a hand-over
+        self.stuck: set[str] = set()  # buckets that have no leader after a hand-over
         self.under_way = 0
         self.now = 0.0
         self.found = LeaseTerms(lambda: self.now)
@@ -68,7 +68,7 @@ class Servers:
         return {"cluster": {"leader": leader, "replicas": peers}}
 
     def pass_s(self, seconds: int) -> None:
-        """Keep ahead once a second."""
+        """Let this time pass, with one round of hand-overs per second."""
 
         async def main() -> None:
             for _ in range(seconds):
@@ -84,19 +84,19 @@ def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
     return Servers(monkeypatch)
 
 
-def test_no_hand_over_while_all_servers_are_present(servers: Servers) -> None:
+def test_nothing_is_handed_over_while_no_server_is_silent(servers: Servers) -> None:
     servers.pass_s(100)
     assert set(servers.terms.values()) == {1}
 
 
-def test_a_lagging_server_causes_no_hand_over(servers: Servers) -> None:
+def test_nothing_is_handed_over_because_a_server_lags(servers: Servers) -> None:
     servers.lagging = {"n3"}
     servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
 
 
 @pytest.mark.parametrize(("unheard_ns", "is_due"), [(1_900_000_000, False), (2_100_000_000, True), (0, True)])
-def test_a_server_is_silent_when_it_was_not_heard_for_two_heartbeats(
+def test_a_server_is_silent_after_two_missed_heartbeats(
     servers: Servers, unheard_ns: int, is_due: bool
 ) -> None:
     servers.silent, servers.unheard_ns = {"n3"}, unheard_ns
@@ -111,7 +111,7 @@ def test_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Serve
         for bucket in names.LEASES[:2]:
             assert servers.terms[bucket] > 1 + second // 4
             assert servers.leaders[bucket] in ("n1", "n2")
-    assert servers.terms[names.LEASES[2]] == 1  # it has no leader that could hand it over
+    assert servers.terms[names.LEASES[2]] == 1  # the bucket has no leader that could hand it over
     assert HAND_OVER_S < ASKS_S
 
 
@@ -137,7 +137,7 @@ def test_a_long_silent_server_is_ignored_until_it_returns(servers: Servers) -> N
     assert all(servers.terms[bucket] > before[bucket] for bucket in names.LEASES)
 
 
-def test_after_a_failed_hand_over_no_other_follows(servers: Servers) -> None:
+def test_after_a_failed_hand_over_no_other_bucket_is_handed_over(servers: Servers) -> None:
     servers.silent, servers.stuck = {"n3"}, set(names.LEASES)
     servers.leaders[names.LEASES[2]] = "n1"
     servers.pass_s(1)
@@ -150,7 +150,7 @@ def test_a_single_server_hands_nothing_over(servers: Servers) -> None:
     assert set(servers.terms.values()) == {1}
 
 
-def test_a_silent_leader_does_not_delay_the_others(servers: Servers) -> None:
+def test_a_silent_leader_does_not_delay_other_hand_overs(servers: Servers) -> None:
     servers.silent = {"n2"}
 
     async def main() -> None:
@@ -167,7 +167,7 @@ def test_a_silent_leader_does_not_delay_the_others(servers: Servers) -> None:
 def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
     cut_after_s: float, servers: Servers
 ) -> None:
-    """Its leaders do not answer, and the others report after 2 s that it is silent."""
+    """Leaders on the cut-off server do not answer. The other leaders report after 2 s that it is silent."""
 
     async def main() -> None:
         keeping = asyncio.create_task(
@@ -184,8 +184,8 @@ def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
     run_controlled(main())
 
 
-def test_leaders_return_home(servers: Servers) -> None:
-    """A leader that was handed over for a silent server returns home afterwards."""
+def test_leaderships_return_to_their_home_servers(servers: Servers) -> None:
+    """This includes a leadership that was handed over because of a silent server."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}
 

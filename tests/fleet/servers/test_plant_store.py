@@ -1,4 +1,4 @@
-"""A plant in the bucket: each line read from its record equals the line of the plant file."""
+"""A plant in the bucket: each line read from its record equals that line of the plant file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ address = 3
 
 
 def lines_again(path: Path, folder: Path) -> list[Any]:
-    """Return the lines as another machine has them, which gets the records as JSON."""
+    """Return the lines of a plant file as another computer reads them from their records in JSON."""
     _, records = read_plant(path)
     shipped: dict[str, Any] = json.loads(json.dumps(records))
     return [line_of(Record(name, 7, value), folder) for name, value in shipped.items()]
@@ -67,14 +67,14 @@ def as_text(line: Any) -> str:
     )
 
 
-def test_stored_lines_equal_the_plants(tmp_path: Path) -> None:
+def test_lines_read_from_their_records_equal_the_plant_files(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT, "utf-8")
     again = lines_again(path, tmp_path / "gateway")
     assert [as_text(line) for line in again] == [as_text(line) for line in Plant.load(path).lines]
 
 
-def test_a_family_file_goes_with_its_line(tmp_path: Path) -> None:
+def test_a_family_file_is_stored_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "families").mkdir()
     head = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'
     (tmp_path / "families" / "own.toml").write_text(f'{head}[reading]\nvoltage = {{ at = 3, unit = "V" }}\n')
@@ -89,14 +89,14 @@ def test_a_family_file_goes_with_its_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../escape.toml", "/escape.toml", "a/../../b.toml"])
-def test_a_record_writes_no_file_outside_of_its_folder(tmp_path: Path, name: str) -> None:
+def test_a_record_writes_no_file_outside_its_folder(tmp_path: Path, name: str) -> None:
     value = {"line": {"name": "hall"}, "files": {name: "text"}}
     with pytest.raises(ValueError, match="outside of its folder"):
         line_of(Record("hall", 1, value), tmp_path / "gateway")
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-async def test_unchanged_lines_keep_their_revision() -> None:
+async def test_unchanged_lines_keep_their_records_revision() -> None:
     memory = MemoryBucket("plant")
     bucket: Any = memory
     first = {name: {"line": {"name": name}, "files": {}} for name in ("a", "b", "c")}
@@ -110,7 +110,7 @@ async def test_unchanged_lines_keep_their_revision() -> None:
     assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
 
 
-def test_a_lines_record_has_only_its_own_lists(tmp_path: Path) -> None:
+def test_a_lines_record_has_only_its_own_permissions(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT)
     _, before = read_plant(path)
@@ -122,4 +122,4 @@ def test_a_lines_record_has_only_its_own_lists(tmp_path: Path) -> None:
     assert records["hall-2"]["may"] == {"verbs": ["other.reset_fault", "other.start"]}
     assert all("may" not in record for record in before.values())
     path.write_text(f'{PLANT}\n[fleet.may]\nverbs = ["other.start"]\n')
-    assert read_plant(path)[1]["hall-1"] == before["hall-1"]  # and so it is polled on
+    assert read_plant(path)[1]["hall-1"] == before["hall-1"]  # the record is unchanged, so polling continues

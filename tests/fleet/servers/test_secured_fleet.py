@@ -1,4 +1,4 @@
-"""A whole fleet with the rights of `fleet rights`, and an error if they are missing."""
+"""A whole fleet with the rights that `fleet rights` writes, and the error if a right is missing."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ address = 1
 
 @pytest.fixture(scope="module")
 def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster]:
-    """Return one server with a fleet's buckets, and rights."""
+    """Yield one server with a fleet's buckets and rights."""
     folder = tmp_path_factory.mktemp("nats")
     (folder / "plant.toml").write_text(LINE)
     with secured_cluster(folder, 1) as running:
@@ -77,18 +77,18 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster
 
 
 def told(servers: SecuredCluster, user: str, *words: str) -> str:
-    """Return the one sentence that a command ends with."""
+    """Return the one sentence with which a command fails."""
     said = multidrop(servers, user, *words)
     assert said.returncode == 1, said
     lines = said.stderr.splitlines()
-    assert len(lines) == 1 + (words[0] == "hub")  # a hub logs it too
+    assert len(lines) == 1 + (words[0] == "hub")  # a hub logs the sentence too
     return lines[-1]
 
 
-@pytest.mark.slow  # the longest file of its room starts first
+@pytest.mark.slow  # the longest file of its folder starts first
 @pytest.mark.long
 def test_a_route_to_a_silent_server_is_dropped_soon(tmp_path: Path) -> None:
-    """By itself NATS takes a minute and more, and hands that server questions for so long."""
+    """With its defaults, NATS needs more than a minute, and forwards requests to that server all the time."""
 
     def routes(node: SecuredNode) -> int:
         with urllib.request.urlopen(f"http://127.0.0.1:{node.monitor}/routez", timeout=5) as answer:
@@ -137,7 +137,7 @@ def test_a_missing_right_is_one_sentence(
 def test_a_stored_message_directed_into_anothers_samples_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Servers with one account for all users send stored messages to any subject that a client names."""
+    """With one account for all users, servers would send stored messages to any subject named."""
 
     async def main(servers: SecuredCluster) -> None:
         made = multidrop(servers, "operator", "fleet", "init")
@@ -228,13 +228,13 @@ def test_mistaken_credentials_are_one_sentence(
     assert (ended, out) == (status, "")
     [line] = err.splitlines()
     assert sentence in line
-    assert status == 1 or not (tmp_path / "h").exists()  # a mistake of the call makes no folder
+    assert status == 1 or not (tmp_path / "h").exists()  # a mistake in the command creates no folder
 
 
 @pytest.mark.long
 @pytest.mark.slow
 def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredCluster, tmp_path: Path) -> None:
-    """Otherwise a man in the middle could read and relay the login."""
+    """Otherwise an attacker in between could read and relay the login."""
     with cluster(tmp_path / "plain", 1) as plain:
         url = plain.urls[0].replace("nats://", "tls://")
         key, ca = str(servers.key("viewer")), str(servers.tls.ca)
@@ -264,7 +264,7 @@ def test_tls_trusts_only_the_given_authority(servers: SecuredCluster) -> None:
 
 
 def assert_told_while_it_goes_on(fleet: SecuredFleet) -> None:
-    """A stop that the drive refuses is repeated; who asked for it hears so, and then how it ended."""
+    """Check that the sender of a stop hears that the drive refuses it, and then how it ended."""
     fleet.hall.refusing.add("line-1")
     asker = subprocess.Popen(
         [sys.executable, "-m", "multidrop", "fleet", "stop", "drive-line-1"],
@@ -275,7 +275,7 @@ def assert_told_while_it_goes_on(fleet: SecuredFleet) -> None:
     )
     assert asker.stderr
     told = asker.stderr.readline()
-    while "the stop was sent" not in told:  # the machine may be too busy to send it in half a second
+    while "the stop was sent" not in told:  # a busy machine may take more than half a second to send it
         assert told.startswith("under way: "), told
         told = asker.stderr.readline()
     assert told.startswith("under way: drive-line-1: the stop was sent, but is not yet confirmed")
@@ -286,8 +286,8 @@ def assert_told_while_it_goes_on(fleet: SecuredFleet) -> None:
 
 
 @pytest.mark.long
-def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
-    """Cold start, a dead gateway's lines, a drain, the hub, and no denial in anybody's log."""
+def test_a_whole_fleet_works_with_the_rights_as_written(tmp_path: Path) -> None:
+    """Cold start, a dead gateway's lines, a drain and the hub; no log reports a denial."""
     with secured_fleet(tmp_path) as fleet:
         fleet.wait_for_polling()
         until(lambda: all(one["lines"] for one in fleet.status()["gateways"].values()), "shares")
@@ -318,20 +318,20 @@ def test_all_works_with_the_rights_as_written(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_revoked_key_is_logged_and_its_lines_are_taken_over(tmp_path: Path) -> None:
-    """The servers reload their rights, and drop connections of removed users."""
+    """The servers reload their rights, and disconnect users that were removed."""
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
         fleet.servers.give_rights_to(["gw-b"])
         until(lambda: "refuses these credentials" in fleet.log("gw-a"), "the sentence")
         until(lambda: "all lines are closed" in fleet.log("gw-a"), "silence")
         fleet.wait_for_polling()
-        assert fleet.running["gw-a"].poll() is None  # and tries again
-        assert fleet.log("gw-a").count("admits nobody") < 10  # each connection says it once
+        assert fleet.running["gw-a"].poll() is None  # the gateway retries
+        assert fleet.log("gw-a").count("admits nobody") < 10  # logged once per connection
 
 
 @pytest.mark.long
 def test_a_new_gateway_shares_the_lines_and_ends_no_session(tmp_path: Path) -> None:
-    """The servers read its rights while all others continue, and commands reach it.
+    """The servers read its rights while the other gateways continue, and commands reach it.
 
     NATS 2.15 gives a new account its imports only at the second reload.
     """
@@ -355,7 +355,7 @@ def test_a_new_gateway_shares_the_lines_and_ends_no_session(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_a_stolen_gateway_key_can_only_silence_lines(tmp_path: Path) -> None:
-    """A thief of gw-c's key ends the others' sessions again and again; they start new ones."""
+    """A thief with gw-c's key ends the others' sessions again and again. They start new ones."""
     with secured_fleet(tmp_path, 1) as fleet:
         fleet.wait_for_polling()
         fleet.running["gw-c"].kill()
@@ -384,12 +384,12 @@ def test_a_stolen_gateway_key_can_only_silence_lines(tmp_path: Path) -> None:
         assert fleet.hall.overlaps() == 0
 
 
-# ---- bad surroundings ----
+# ---- wrong clocks, namesakes, too few servers ----
 
 
 @pytest.mark.long
 def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
-    """One of two gateways is an hour ahead; each takes over the lines of the other."""
+    """One of two gateways is an hour ahead. Each takes over the lines of the other."""
     (tmp_path / "ahead").mkdir()
     (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)
     ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}
@@ -414,8 +414,8 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_two_gateways_of_one_name_on_two_machines(tmp_path: Path) -> None:
-    """The second one has another folder, as on another machine: it waits, says so, and goes on alone."""
+def test_a_second_machine_with_a_gateways_name_waits_for_it(tmp_path: Path) -> None:
+    """The second one has another folder, as on another machine. It waits, reports that, and takes over."""
     with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
         fleet.wait_for_polling()
         fleet.start("gw-a", "second")

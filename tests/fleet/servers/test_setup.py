@@ -1,4 +1,4 @@
-"""`fleet init` on real servers: created buckets, and refusals."""
+"""`fleet init` on real servers: the buckets that it creates, and the servers that it refuses."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ async def _init(urls: list[str]) -> dict[str, object]:
 
 
 @pytest.mark.slow
-def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
+def test_buckets_are_created_on_all_three_servers(nats: Cluster) -> None:
     made = asyncio.run(_init(nats.urls))
     assert made["replicas"] == 3
     assert set(made["servers"]) == {"n1", "n2", "n3"}
-    assert asyncio.run(_init(nats.urls)) == made  # a second run keeps all
+    assert asyncio.run(_init(nats.urls)) == made  # a second run keeps the buckets
 
 
 @pytest.mark.slow
-async def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluster) -> None:
+async def test_paths_and_leaders_are_spread_over_all_servers(fleet: Cluster) -> None:
     paths = paths_of(fleet.urls)
     await setup.open_all(paths)
     assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
@@ -59,7 +59,7 @@ async def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: 
 
 
 class Deaf:
-    """A path with this answer from the leaders of some buckets of masters, or none."""
+    """A path on which the leaders of some master buckets give this answer, or none."""
 
     server_name = "n1"
 
@@ -91,7 +91,7 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 def test_a_cluster_that_grants_a_key_twice_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An old server fails the test, even if its version is ignored."""
+    """An old server fails the contest, even if its version is ignored."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
         sentence = re.escape("claimants at once: no lease is safe there")
@@ -102,7 +102,7 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
 def test_servers_that_ignore_other_writers_records_are_refused(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Such ones would give a lease to its gateway and to who ends it. Some answers may come too late."""
+    """Such servers would grant a lease to two gateways. Some of their answers may come too late."""
     monkeypatch.setattr(LeaseBucket, "_all_of", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"gave one revision of a key to [2-6] of 6 claimants at once"):
         asyncio.run(_init(nats.urls))
@@ -112,7 +112,7 @@ def test_servers_that_ignore_other_writers_records_are_refused(
 def test_an_unanswered_removal_is_checked_and_repeated(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A busy leader may be late with its answer to the end of the contest."""
+    """A busy leader may answer late when the contest's bucket is removed."""
     removals = []
 
     async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:
@@ -132,7 +132,7 @@ def test_an_unanswered_removal_is_checked_and_repeated(
 @pytest.mark.long
 @pytest.mark.slow
 def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
-    """Buckets created without it would stay on two servers: the failure of either ends all polling."""
+    """Otherwise buckets would be created on two servers, and the failure of either would end all polling."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]
@@ -147,7 +147,7 @@ def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
-        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant may be stored in the meantime
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant can be stored meanwhile
 
 
 @pytest.mark.long
@@ -167,7 +167,9 @@ NO_LEADER = (
 
 
 @pytest.mark.slow
-def test_undecided_servers_have_no_quorum(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servers_that_cannot_decide_are_reported_as_no_quorum(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
 
     async def refuse(self: ServerPath, subject: str, *rest: object) -> SimpleNamespace:
@@ -182,7 +184,7 @@ def test_undecided_servers_have_no_quorum(nats: Cluster, monkeypatch: pytest.Mon
 def test_a_plant_that_cannot_be_read_yet_is_waited_for(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A direct get of a new bucket may find no server."""
+    """For a new bucket, a direct get may find no server."""
     collect, failures = ServerPath.collect, [Unsure("it ended with 503")] * 2
 
     async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
@@ -213,8 +215,10 @@ def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.slow
-def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A server that is alone answers some seconds after the others' death, and names no leader."""
+def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that is left alone answers some seconds after the others' death, and names no leader."""
     told = setup.ask
 
     async def without_leader(path: ServerPath, subject: str) -> dict[str, Any]:
@@ -230,7 +234,7 @@ def test_a_bucket_without_a_leader_is_no_quorum(fleet: Cluster, monkeypatch: pyt
 
 @pytest.mark.slow
 def test_an_election_in_progress_is_waited_for(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bucket has no leader for a moment after its leader died, though most servers run."""
+    """After its leader died, a bucket has no leader for a moment, although most servers run."""
     told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
 
     async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
@@ -269,7 +273,7 @@ async def _check(fleet: Cluster) -> None:
 
 
 @pytest.mark.long
-def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
+def test_a_path_moves_to_another_server_and_returns_home(tmp_path: Path) -> None:
     with cluster(tmp_path, 3) as three:
 
         async def main() -> None:
@@ -293,7 +297,7 @@ def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-async def test_a_silent_home_server_delays_releases_for_a_minute_at_most(tmp_path: Path) -> None:
+async def test_a_silent_home_server_delays_releases_for_at_most_a_minute(tmp_path: Path) -> None:
     with cluster(tmp_path, 2) as two:
         two.nodes[0].pause()
 

@@ -95,9 +95,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
                             spare.note(is_late=number > 0)
                         return get.messages
                     failure = failed
-            is_refused = isinstance(
-                failure, NoRight
-            )  # and so on all paths: all servers have one list of rights
+            is_refused = isinstance(failure, NoRight)  # by all servers: their rights are the same
             if not gets and (number or not ways[1:] or is_refused):
                 break
         raise failure
