@@ -207,9 +207,7 @@ def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, long
         here = {**os.environ, "PYTHONPATH": support}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             assert child.stdout is not None
-            least = [int(child.stdout.readline()) for _ in range(2)][
-                1
-            ]  # the second report has the first stored rows
+            least = [int(child.stdout.readline()) for _ in range(2)][1]  # the second report: some rows
             time.sleep(dice.uniform(0, longest_s))
             child.kill()
             said = child.stdout.read().split("\n")[:-1]
