@@ -1,6 +1,6 @@
-"""The command line: runs one command; a failure becomes a sentence on stderr and an exit status.
+"""The command line: runs one command. A failure is printed as a sentence on stderr, with an exit status.
 
-A command's module is imported when it runs: `multidrop --help` imports none.
+Each command's module is imported only when the command runs, so `multidrop --help` imports none of them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ STOPS = (
     "stop",
     "coast",
     "emergency-stop",
-)  # sent despite SIGHUP, and despite mistakes in arguments other than the drive's name
-HARD_WIRED = "use the hard-wired stop"  # advice if a stop could not be sent
+)  # commands that are sent despite SIGHUP, and despite mistakes in arguments other than the drive's name
+HARD_WIRED = "use the hard-wired stop"  # advice to the user when a stop could not be sent
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
-COMMANDS = {  # name: module in this package, and help
+COMMANDS = {  # by command: its module in this package, and its help
     "demo": ("demo", "poll simulated drives of every family on one line"),
     "models": ("models", "list the families, or one family's registers"),
     "check": ("check", "check a family file or a plant file; opens no port"),
@@ -122,7 +122,7 @@ def _replace_closed_streams() -> None:
 
 
 def _describe_itself(words: list[str]) -> int:
-    """Print the version, or the help if there are no words."""
+    """Print the version; or print the help, if there are no words or it was requested."""
     if words[:1] == ["--version"]:
         from importlib.metadata import version
 
@@ -134,9 +134,9 @@ def _describe_itself(words: list[str]) -> int:
 
 @contextmanager
 def _without_wrappers() -> Iterator[None]:
-    """Raise KeyboardInterrupt again that Python or argparse has turned into another exception.
+    """Raise the KeyboardInterrupt that Python or argparse has turned into another exception.
 
-    Python does so in `__set_name__` while a class is made, as in an import.
+    Python does so in `__set_name__`, which runs when a class is created, for example during an import.
     """
     try:
         yield
@@ -153,17 +153,17 @@ def _guarded(run: Callable[[], int]) -> int:
         with _without_wrappers():
             status = run()
         sys.stdout.flush()
-    except KeyboardInterrupt as interruption:  # its notes list the requests that were sent
-        with suppress(KeyboardInterrupt):  # a second Ctrl-C in quick succession
+    except KeyboardInterrupt as interruption:  # the exception's notes list the requests that were sent
+        with suppress(KeyboardInterrupt):  # a second Ctrl-C may follow immediately
             return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
         return INTERRUPTED
-    except BrokenPipeError:  # such as of `multidrop models | head`
+    except BrokenPipeError:  # as with `multidrop models | head`
         _abandon_output()
         return DONE
     except (ValueError, TypeError, Unsupported) as mistake:
         return _fail(str(mistake), MISTAKE)
     except OSError as failure:
-        if failure.strerror is None:  # raised by multidrop
+        if failure.strerror is None:  # multidrop's own error, not the system's
             return _fail(str(failure), FAILED)
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""
@@ -171,7 +171,7 @@ def _guarded(run: Callable[[], int]) -> int:
     except BusError as failure:
         return _fail(str(failure), FAILED)
     except ImportError as missing:
-        if missing.name != "nanoarrow":  # optional on some machines
+        if missing.name != "nanoarrow":  # this library does not exist for some machines
             raise
         return _fail(str(missing), MISTAKE)
     return status
@@ -202,7 +202,7 @@ def _run(command: str, words: list[str]) -> int:
     module.add_arguments(parser)
     try:
         arguments, left_out = _parsed(parser, words, command)
-    except SystemExit:  # --help was printed
+    except SystemExit:  # raised by argparse after --help
         return DONE
     except ValueError as mistake:
         if command in STOPS:
@@ -231,9 +231,10 @@ def _parsed(
 ) -> tuple[argparse.Namespace, list[str]]:
     """Return the parsed arguments, and the words that a stop ignores. Raises ValueError for a mistake.
 
-    A stop also ignores the word after an unknown option, because that may be the option's value, not a drive.
+    A stop ignores unknown options. It also ignores the word after such an option, because that may be the
+    option's value instead of a drive.
     """
-    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may come between positionals
+    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may be between positionals
     if not unknown:
         return arguments, []
     if command not in STOPS:
@@ -256,6 +257,6 @@ def _fail(sentences: str, status: int) -> int:
 
 
 def _abandon_output() -> None:
-    """Redirect stdout to /dev/null: otherwise the interpreter fails to flush it at exit."""
+    """Redirect stdout to /dev/null, because the interpreter would fail to flush it at exit."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,6 +1,6 @@
-"""`multidrop check`: prints a family file's contents, its gaps, and the requests that will be refused.
+"""`multidrop check`: prints a family file's contents, its unknown facts, and the requests that are refused.
 
-It checks a plant file too, except its table `[serve]`: `multidrop serve --check` does that.
+It also checks a plant file, except its table `[serve]`, which `multidrop serve --check` checks.
 """
 
 from __future__ import annotations
@@ -70,7 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _is_plant(file: Path) -> bool:
-    """Return True for a plant file; False for an unreadable file, whose loading as a family says why."""
+    """Return True for a plant file.
+
+    Return False for an unreadable file too: loading it as a family reports the reason.
+    """
     try:
         return "line" in read_document(file, "file")
     except ValueError:
@@ -100,7 +103,7 @@ def _check_plant(arguments: argparse.Namespace) -> int:
 
 
 def _family(file: Path) -> type[Drive]:
-    """Return the family in a file, or the shipped family with this name. Raises ValueError for neither."""
+    """Return the family in a file, or the built-in family of this name. Raises ValueError for neither."""
     name = str(file)
     if name in MODELS:
         raise ValueError(f"{name} is built in and has no file; see `multidrop models {name}`")
@@ -128,7 +131,7 @@ def _verdict(family: type[Drive], file: Path) -> str:
 # ---- remarks ----
 
 
-Remark = tuple[str, str]  # a register or a key, and the sentence about it
+Remark = tuple[str, str]  # name of a register or key, and a sentence about it
 
 _OF_A_MOTOR = {
     "remote": "the keypad settings that let the line command the motor",
@@ -137,7 +140,7 @@ _OF_A_MOTOR = {
 
 
 def unknown(family: type[Drive]) -> Iterator[Remark]:
-    """Yield each key that the file leaves out, with a sentence about the unknown fact."""
+    """Yield each key that the family file leaves out, with a sentence about the fact that is unknown."""
     drive = family(family.addresses[0])
     registers = family.registers.values()
     for register in registers:
@@ -171,7 +174,7 @@ def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
 
 
 def crowded(plant: Plant) -> Iterator[Remark]:
-    """Yield each line with more drives than one of their manuals allows."""
+    """Yield each line that has more drives than one of the drives' manuals allows, with a sentence."""
     for line in plant.lines:
         stated = [polled.drive for polled in line.drives if polled.drive.most_devices]
         strictest = min(stated, key=lambda drive: drive.most_devices, default=None)
@@ -188,7 +191,7 @@ def _some(names: list[str]) -> str:
 
 
 def refused(family: type[Drive]) -> Iterator[Remark]:
-    """Yield the requests that are not sent to a drive of this family, and why."""
+    """Yield the requests that are never sent to a drive of this family, each with the reason."""
     drive = family(family.addresses[0])
     for register in family.registers.values():
         if register.access is not Access.READING:

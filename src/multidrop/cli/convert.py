@@ -1,4 +1,4 @@
-"""`multidrop convert`: copies a recording into the format of another suffix."""
+"""`multidrop convert`: copies a recording into another file format, which the new file's suffix names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop decode`: converts a capture into a recording or text."""
+"""`multidrop decode`: converts a capture of a line's traffic into a recording or text."""
 
 from __future__ import annotations
 

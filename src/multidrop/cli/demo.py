@@ -60,7 +60,7 @@ def _operator(poller: Poller) -> Operator:
 
 
 def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
-    """Yield one line for each simulated line, the counts, and the next commands."""
+    """Yield the summary as text: a row per simulated line, the numbers of samples, the next commands."""
     rows = [("LINE", "DRIVES", "EXCHANGES/S", "WIRE USED", "MISSES")]
     for name, line in summary["lines"].items():
         rate = line["exchanges"] / line["seconds"] if line["seconds"] else 0.0
@@ -76,7 +76,7 @@ def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
 
 
 class NextCommand(NamedTuple):
-    """A command to try next, its effect, and the extra that it needs."""
+    """A command for the user to try next, its effect, and the optional extra that it needs."""
 
     words: tuple[str, ...]
     effect: str
@@ -84,7 +84,7 @@ class NextCommand(NamedTuple):
 
     @property
     def lacks(self) -> bool:
-        """Return whether a library of the extra is missing."""
+        """Return True if a library of the command's extra is missing."""
         return not all(map(find_spec, LIBRARIES[self.extra]))
 
 
@@ -99,7 +99,7 @@ WEB_NEXT = (
 
 
 def _next(commands: Sequence[NextCommand]) -> Iterator[str]:
-    """Yield the next commands, with the program as it was typed."""
+    """Yield the next commands as text, with the program's name as the user typed it."""
     typed = sys.argv[0]
     program = typed if Path(typed).name == "multidrop" and which("multidrop") != typed else "multidrop"
     rows = [(f"  {command_line([program, *one.words])}", one.effect) for one in commands]
@@ -110,7 +110,7 @@ def _next(commands: Sequence[NextCommand]) -> Iterator[str]:
 
 
 def _check_web(arguments: argparse.Namespace) -> None:
-    """Raise ValueError for options that --web ignores: it serves until Ctrl-C without recording."""
+    """Raise ValueError for options that have no effect with --web, which serves without recording."""
     given = {
         "--seconds": arguments.seconds != SECONDS,
         "--out": str(arguments.out) != OUT,
@@ -123,15 +123,15 @@ def _check_web(arguments: argparse.Namespace) -> None:
 
 
 def _make_room(out: Path) -> None:
-    """Remove an earlier demo's recording. Raises ValueError for any other file."""
-    with suppress(ValueError, TypeError, OSError):  # no file, or not a recording
+    """Remove the recording of an earlier demo. Raises ValueError if there is any other file at `out`."""
+    with suppress(ValueError, TypeError, OSError):  # no file, or a file that is not a recording
         if set(open_recording(out).metadata.get("drives", ())) == set(DRIVES):
             out.unlink()
     refuse_overwriting(out)
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
-    """Return whether the monitor can show the demo: no captures are wanted, and it has a terminal."""
+    """Return True if the monitor can show the demo: it has a terminal, and no capture or JSON is wanted."""
     if arguments.capture or arguments.flight_recorder:
         return False
     return not arguments.json and is_possible()

@@ -64,7 +64,7 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange
 
-NOBODY = 247  # an unused address: only an echo may answer it
+NOBODY = 247  # an address without a drive: only an echo of the request may come back
 SETTING_UP_COM = "while the port is open, multidrop makes it raw and sets each drive's baud rate and format"
 SETTING_UP = (
     "while the port is open, multidrop locks it against programs that respect such locks, makes it raw, sets "
@@ -116,9 +116,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
-    """Yield the named line with all its drives, or the named drive; without a name yield every line.
+    """Yield the named line with all its drives, or the named drive. Without a name, yield every line.
 
-    Raises ValueError for options that belong to a port without a plant file.
+    Raises ValueError for options that are allowed only for a port without a plant file.
     """
     for name in ("model", "address", "baudrate", "format", "framing"):
         if getattr(arguments, name) is not None:
@@ -145,7 +145,7 @@ def _by_hand(arguments: argparse.Namespace) -> _Target:
 
 
 def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
-    """Yield the findings about a port. Unless it is the only one, failing to open it is also a finding."""
+    """Yield the findings about a port. If there are several ports, failing to open one is a finding too."""
     try:
         yield from _findings(target)
     except LineError as failure:
@@ -185,7 +185,7 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    elif not speaks_tcp(port):  # without drives, silence in the other framing is not conclusive
+    elif not speaks_tcp(port):  # without drives, silence in the other framing proves nothing
         yield other_way_finding(port, nobody, settings)
 
 
@@ -209,7 +209,7 @@ def _remote(port: str) -> Iterator[Finding]:
 
 
 def _local(port: str, rs485: RS485) -> Iterator[Finding]:
-    line = Line(port, rs485=rs485).open()  # raises LineError, with the reason, if the port cannot be opened
+    line = Line(port, rs485=rs485).open()  # raises LineError with the reason if it fails
     try:
         yield from _opened_com(port) if sys.platform == "win32" else _opened(port, rs485)
     finally:
@@ -217,7 +217,7 @@ def _local(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _opened_com(port: str) -> Iterator[Finding]:
-    """Yield the facts that Windows states about an open COM port."""
+    """Yield the facts about an open COM port that Windows reports."""
     yield Finding("port", f"{port} is a serial port")
     yield Finding("set here", SETTING_UP_COM)
     yield Finding("adapter", com_description(port) or "the system lists none")
@@ -229,7 +229,7 @@ def _opened_com(port: str) -> Iterator[Finding]:
 
 
 def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
-    """Examine a port that multidrop has open."""
+    """Yield findings about a device, which multidrop has open in the meantime."""
     device = str(Path(port).resolve())
     link = f", which is {device}" if device != port else ""
     if is_pseudo_terminal(device):
@@ -256,7 +256,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
-    """Read from an unused address: only an echo of the request may come back."""
+    """Read from an unused address, and return a finding: only an echo of the request may come back."""
     request = Message(NOBODY, 0x03, 0, 1)
     try:
         found = ask_once(port, request, settings, rs485, 4 * LEAST_TIMEOUT)
@@ -269,7 +269,7 @@ def _text(findings: list[Finding]) -> Iterator[str]:
     width = max(len(finding.topic) for finding in findings) + 2
     for finding in findings:
         yield from wrapped(finding.what, f"{finding.topic:<{width}}", " " * width)
-        if finding.advice:  # may contain a command to copy
+        if finding.advice:  # may contain a command to copy, so words are not broken
             indent = " " * width
             yield from wrapped(finding.advice, f"{indent}-> ", f"{indent}   ", breaks_words=False)
 
@@ -277,14 +277,17 @@ def _text(findings: list[Finding]) -> Iterator[str]:
 # ---- the round trip ----
 
 
-UNANSWERED = 5  # requests to a silent drive
-MOST_S = 5.0  # limit of all rounds, for slow and silent drives
+UNANSWERED = 5  # requests to a drive that does not answer
+MOST_S = 5.0  # time limit of all requests, for slow and silent drives
 RETRY_S = 0.05  # pause before a delayed request is tried again
-OF_GATEWAYS = (0x0A, 0x0B)  # no path, and no response from the device (application protocol V1.1b3, 7)
+OF_GATEWAYS = (0x0A, 0x0B)  # codes: no path; no response from the device (application protocol V1.1b3, 7)
 
 
 def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tuple[Finding, bool]:
-    """Measure a drive's response delay; return the finding, and whether anything answered in this framing."""
+    """Measure a drive's response delay.
+
+    Return the finding, and whether anything answered in the port's framing.
+    """
     if drive is None:
         return Finding(
             "round trip",
@@ -298,7 +301,8 @@ def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tupl
         bus.attach(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))
-    # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
+    # `wire` is the time in s of the request and the reply's first character. On a network and on a
+    # pseudo-terminal, the actual time on the wire is unknown.
     sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
     wire = (sent + 1) * drive.settings.character
     shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
@@ -322,12 +326,12 @@ def _bad_bytes(completions: Sequence[Completion]) -> str:
 
 
 def _exception(framing: Framing, request: Message, done: Completion) -> int:
-    """Return the exception code of a reply, the drive's or a gateway's; 0 if there is none."""
+    """Return the exception code of a reply, from the drive or from a gateway; 0 if it is no exception."""
     if done.result > 0:
         return done.reply.exception
     if framing is not Framing.TCP:
         return 0
-    _, reply = parse_reply(framing, done.raw, request)  # the core counts a gateway's exception as silence
+    _, reply = parse_reply(framing, done.raw, request)  # the core reports a gateway's exception as no reply
     return reply.exception if reply else 0
 
 
@@ -339,8 +343,8 @@ def _is_from_gateway(drive: Drive, done: Completion) -> bool:
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
     """Send up to ROUNDS requests within MOST_S; yield their outcomes.
 
-    A request that was held back, because an earlier reply may still come, does not count. A drive that never
-    answers gets only UNANSWERED requests.
+    A request that was held back, because the reply to an earlier one may still come, does not count. A drive
+    that never answers gets only UNANSWERED requests.
     """
     end = time.monotonic() + MOST_S
     count, is_silent = 0, True
@@ -354,16 +358,16 @@ def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
             time.sleep(RETRY_S)
 
 
-# ---- the other framing ----
+# ---- the other framing: Modbus TCP instead of RTU, or the reverse ----
 
 
-TIMEOUT = 2.0  # s; includes the time that a gateway waits for its drives
+TIMEOUT = 2.0  # in s; a gateway waits for its drives in the meantime
 
 
 def ask_once(
     port: str, request: Message, settings: Settings, rs485: RS485 = RS485.OFF, timeout: float = TIMEOUT
 ) -> Completion:
-    """Send one read in the port's framing of Modbus; return its outcome. Raises LineError."""
+    """Send one read in the framing that the port's URL implies; return its outcome. Raises LineError."""
     is_tcp = speaks_tcp(port)
     exchange = Exchange(
         Framing.TCP if is_tcp else Framing.RTU,
@@ -382,14 +386,14 @@ def ask_once(
 
 
 def other_way_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Return whether the far end answers in the other framing, as a finding."""
+    """Return a finding: whether the far end answers in the other framing."""
     other = other_port(port)
     way = spoken_on(other)
     try:
         found = ask_once(other, request, settings)
     except LineError as failure:
         return Finding("other framing", f"{way} was not tested: {failure.reason}")
-    if found.result > 0 or mixed_up(port, found.raw):  # other bytes are not conclusive
+    if found.result > 0 or mixed_up(port, found.raw):  # other bytes prove nothing
         return Finding(
             "other framing",
             f"the far end speaks {way}, not {spoken_on(port)}",
@@ -400,7 +404,7 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
 
 
 def unit_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Return how a Modbus TCP port answers for an unused unit id, as a finding."""
+    """Return a finding: how a Modbus TCP port answers a request to an unused unit id."""
     try:
         found = ask_once(port, request, settings)
     except LineError as failure:

@@ -1,4 +1,4 @@
-"""Findings about a port, its adapter and its line: a sentence each, with advice if there is any."""
+"""Findings about a port, its adapter and its line: one sentence each, with advice if there is any."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import of_name
 
-LATENCY_MS = 1  # a larger latency timer is worth changing
+LATENCY_MS = 1  # advise to change a larger latency timer
 ROUNDS = 20
-SLOW_S = 0.005  # a delay that exceeds the drive's usual one by more than this is reported
+SLOW_S = 0.005  # advise if the delay exceeds the family's usual one by more than this
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
@@ -30,11 +30,14 @@ class Finding:
     topic: str
     what: str
     advice: str = ""
-    is_failure: bool = False  # a drive does not answer, or not always
+    is_failure: bool = False  # True if a drive does not answer, or not to every request
 
 
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
-    """Describe the adapter; `lasting` is its device name by serial number, or the port if there is none."""
+    """Describe the adapter.
+
+    `lasting` is its device name that contains the serial number, or the port if there is no such name.
+    """
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
     return Finding("adapter", str(adapter), advice if lasting != port else "")
 
@@ -91,7 +94,10 @@ def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF) -> Finding:
 
 
 def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Return whether the adapter echoes, judged by the outcome of the request `sent` to an unused address."""
+    """Return a finding: whether the adapter echoes, judged by what came back from an unused address.
+
+    `found` is the outcome of the request whose bytes are `sent`.
+    """
     if found.result > 0:
         return _answered_finding(found, sent, settings)
     received = found.raw
@@ -107,7 +113,7 @@ def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
 
 
 def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Return the finding for a valid reply from the unused address."""
+    """Return the finding for a valid reply from an address that should be unused."""
     reply = found.reply
     how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
     echo = "the adapter receives its own requests" if found.skipped == len(sent) else "none"
@@ -127,12 +133,12 @@ def round_trip_finding(
     refusals: Collection[int] = (),
     came: str = "",
 ) -> Finding:
-    """Judge the delays of the replies to `asked` requests.
+    """Return a finding about the delays of the replies to `asked` requests.
 
     `delays` are sorted, in s, from the request's last bit to the reply's first. If the port does not show
-    bits, such as on a network, they start when the request was handed over; `wire` is then the time, in s, of
-    the request and the first character on a wire. `refusals` are the codes of exception replies; a gateway's
-    have no delay. `came` describes the bytes received instead of valid replies.
+    bits, as on a network, they count from handing over the request. `wire` is then the time in s that the
+    request and one character take on a wire. `refusals` are the codes of exception replies; those of a
+    gateway have no delay. `came` describes the bytes that were received instead of valid replies.
     """
     codes = ", ".join(f"{code:02X}" for code in sorted(set(refusals)))
     if not delays:
@@ -176,10 +182,10 @@ def round_trip_finding(
 
 SYSFS = Path("/sys")
 
-# linux/serial.h, asm-generic/ioctls.h
+# ioctl requests from linux/serial.h and asm-generic/ioctls.h
 TIOCGSERIAL, TIOCGRS485 = 0x541E, 0x542E
-SERIAL_STRUCT = 72  # bytes of struct serial_struct, at most
-FLAGS_AT = 4  # index among its ints
+SERIAL_STRUCT = 72  # upper limit of the size of struct serial_struct, in bytes
+FLAGS_AT = 4  # position of the field `flags` among its ints
 LOW_LATENCY = 1 << 13
 RS485_STRUCT = struct.Struct("=III5I")
 RS485_ENABLED, RS485_RX_DURING_TX = 1 << 0, 1 << 4
@@ -189,13 +195,13 @@ _LACKING = {errno.ENOTTY, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS, errno.EI
 
 @dataclass(frozen=True)
 class Adapter:
-    """Facts from sysfs; unknown ones are empty or None."""
+    """Facts about an adapter from sysfs. A fact that is unknown is empty or None."""
 
-    name: str  # of the tty, such as ttyUSB0
+    name: str  # the terminal's name, such as ttyUSB0
     driver: str = ""
     product: str = ""
     usb_id: str = ""
-    latency_timer: int | None = None  # ms
+    latency_timer: int | None = None  # in ms
     latency_path: Path | None = None
 
     def __str__(self) -> str:
@@ -227,8 +233,8 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 
 def com_description(port: str) -> str:
-    """Return Windows' description of a COM port's adapter, "" if it lists none."""
-    with suppress(ImportError, AttributeError, OSError):  # incomplete in Wine
+    """Return Windows' description of a COM port's adapter; "" if Windows lists none."""
+    with suppress(ImportError, AttributeError, OSError):  # incompletely implemented in Wine
         from serial.tools.list_ports import comports
 
         return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")
@@ -236,7 +242,7 @@ def com_description(port: str) -> str:
 
 
 def _usb_device(tty: Path) -> Path | None:
-    """Return the nearest parent directory that names a USB product."""
+    """Return the nearest parent directory that belongs to a USB device: it names a product."""
     if not tty.exists():
         return None
     above = tty.resolve()
@@ -251,19 +257,19 @@ def _text(path: Path) -> str:
 
 
 def rs485_mode(fd: int) -> RS485Mode | None:
-    """Return the driver's RS-485 mode; None if it has none."""
+    """Return the RS-485 mode that the driver reports; None if the driver has none."""
     answer = _ask(fd, TIOCGRS485, RS485_STRUCT.size)
     return None if answer is None else decoded_rs485(answer)
 
 
 def decoded_rs485(answer: bytes) -> RS485Mode:
-    """Decode a struct serial_rs485."""
+    """Return the mode in the bytes of a struct serial_rs485."""
     flags = RS485_STRUCT.unpack(answer)[0]
     return RS485Mode(bool(flags & RS485_ENABLED), bool(flags & RS485_RX_DURING_TX))
 
 
 def low_latency(fd: int) -> bool | None:
-    """Return the driver's low-latency flag; None if it has none."""
+    """Return the low-latency flag that the driver reports; None if the driver has none."""
     answer = _ask(fd, TIOCGSERIAL, SERIAL_STRUCT)
     return None if answer is None else bool(array.array("i", answer)[FLAGS_AT] & LOW_LATENCY)
 
@@ -272,7 +278,7 @@ def _ask(fd: int, request: int, size: int) -> bytes | None:
     """Return the driver's answer to an ioctl; None if it does not know the request."""
     if sys.platform != "linux":
         return None
-    import fcntl  # missing on Windows
+    import fcntl  # does not exist on Windows
 
     answer = bytearray(size)
     try:

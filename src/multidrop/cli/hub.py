@@ -1,4 +1,4 @@
-"""The `hub` command: keeps the samples of a fleet in Parquet files or in PostgreSQL."""
+"""`multidrop hub`: stores the samples of a fleet in Parquet files or in PostgreSQL."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
 
     async with samples_path(arguments.servers, options) as path:
         hub = SampleHub(path, sink, every=arguments.every)
-        if arguments.parquet:  # PostgreSQL needs no merging
+        if arguments.parquet:  # PostgreSQL needs no compaction
             supervisor().keep("compaction", compact_for_ever(arguments.parquet))
         reading = asyncio.ensure_future(hub.run(once=arguments.once))
         failing = asyncio.ensure_future(supervisor().has_dead.wait())

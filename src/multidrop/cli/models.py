@@ -1,4 +1,4 @@
-"""`multidrop models`: lists the families, or everything that one family declares."""
+"""`multidrop models`: lists the families, or prints everything that one family declares."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _installed() -> Iterator[type[Drive]]:
-    """Yield the families of other packages; warn of those that cannot be loaded."""
+    """Yield the families that other packages have installed; warn of those that cannot be loaded."""
     for name in installed_models():
         try:
             yield find_model(name)
@@ -152,7 +152,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
     }
 
 
-_REGISTER_KEYS = (  # in the order of output
+_REGISTER_KEYS = (  # keys of a register in JSON, in the order of output
     *("name", "table", "address", "access", "unit", "step", "offset", "span", "at_least", "at_most"),
     *("values", "wire", "order", "part", "invalid", "scale_register"),
     *("kept", "ram_address", "default", "while_running", "broadcast", "moves", "harmless", "never_together"),
@@ -160,7 +160,7 @@ _REGISTER_KEYS = (  # in the order of output
 )
 
 
-INDENT = 16  # columns before a family's facts
+INDENT = 16  # column at which a family's facts start
 
 
 def sheet(family: type[Drive]) -> str:
@@ -182,7 +182,7 @@ def sheet(family: type[Drive]) -> str:
     notes = inspect.cleandoc(family.__doc__ or "")
     for block in notes.split("\n\n") if notes else ():
         lines.append("")
-        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line stays a line
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line is not joined with others
             item = "  " if paragraph[:2] in ("- ", "* ") else ""
             first = " " * (len(paragraph) - len(paragraph.lstrip()))
             lines += wrapped(" ".join(paragraph.split()), first, first + item)
@@ -223,7 +223,10 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
 
 
 def gain_of(family: type[Drive]) -> ReadingGain | None:
-    """Return the time saved at default settings if a user's own class states which gaps may be read."""
+    """Return the time that would be saved at default settings, if a gap between registers may be read.
+
+    None for a built-in family: only users' own classes can allow it.
+    """
     drive = family(family.addresses[0])
     if not is_users_own(family):
         return None
@@ -247,7 +250,7 @@ def _silence(family: type[Drive], framing: Framing) -> str:
 
 
 def needed_silence(family: type[Drive], framing: Framing) -> float:
-    """Return the silence in s at the family's default baud rate."""
+    """Return the silence between frames at the family's default baud rate, in s."""
     return family(family.addresses[0], framing=framing).needed_silence()
 
 
@@ -285,7 +288,7 @@ def _table_heading(table: Table, family: type[Drive]) -> str:
 
 
 def _registers(family: type[Drive], table: Table) -> Iterator[str]:
-    """Yield a row for each register, with remarks below it."""
+    """Yield a table row for each register, followed by remarks on the register."""
     registers = [register for register in family.registers.values() if register.table is table]
     rows = aligned([_row(register) for register in registers], "<<<<<")
     for register, row in zip(registers, rows, strict=True):
@@ -342,7 +345,7 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
 
 
 def _word(register: Register[Any], raw: int) -> str:
-    """Return the name of a raw count, or the word if the names of its bits are too long."""
+    """Return the name of a raw count, or the raw count if the names of its bits are too long."""
     name = register.format(register.decode(raw))
     return name if len(name) <= 2 * LONGEST_NAME else f"{raw:04X}H"
 

@@ -45,8 +45,8 @@ from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 
 DRAW_S = 0.25
-SCROLL_S = 2.0  # between two pictures that scroll
-PAGE = 10  # lines
+SCROLL_S = 2.0  # between two pictures on a terminal that scrolls
+PAGE = 10  # lines per press of a page key
 _STOP_KEYS = ("s", "S")
 STILL_STOPPING = "waiting for a stop in progress; press Ctrl-C repeatedly to leave, and watch the motors"
 
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def is_possible() -> bool:
-    """Return whether stdin and stdout are a terminal whose keys can be read."""
+    """Return True if stdin and stdout are a terminal whose keys can be read."""
     return sys.platform != "win32" and sys.stdin.isatty() and sys.stdout.isatty()
 
 
@@ -82,8 +82,8 @@ def watch(
 ) -> dict[str, Any]:
     """Poll the plant and show it until the user quits or `seconds` have passed; return the poller's summary.
 
-    `beside` is in effect while it polls. Closing the terminal ends the monitor too. Stops in progress are
-    always finished first.
+    `beside` is a context that is entered while the plant is polled. Closing the terminal ends the monitor
+    too. Stops in progress are always finished before it ends.
     """
     screen = Screen()
     _check_size(screen)
@@ -94,29 +94,29 @@ def watch(
             try:
                 monitor.show(seconds)
             finally:
-                failures = monitor.await_stops()  # before the ports close, because a stop may still be unsent
+                failures = monitor.await_stops()  # while ports are open: a stop may not have been sent yet
         for sentence in failures:
             warn(sentence)
     return session.poller.summary()
 
 
 class Monitor:
-    """The screen of a polled plant: draws the newest values and obeys keys."""
+    """Draws the newest values of a polled plant on the screen, and carries out the user's keys."""
 
     def __init__(self, plant: LivePlant, session: PollingSession, screen: Screen) -> None:
         self._screen = screen
         self._session = session
         self._plant = plant
         self._at = Position()
-        self._on_yes: Callable[[], None] | None = None  # called if the question is answered with y
-        self._stops: list[threading.Thread] = []  # in progress or done
-        self._stop_results: dict[str, tuple[int, int]] = {}  # by line: drives that stopped, drives in all
+        self._on_yes: Callable[[], None] | None = None  # called if the user answers the question with y
+        self._stops: list[threading.Thread] = []  # threads that carry out stops
+        self._stop_results: dict[str, tuple[int, int]] = {}  # by line: drives that stopped, all drives
         self._has_left = False
         self._side_reader = SideReader(session.poller)
         self._blocks = BLOCKS if screen.has_blocks else PLAIN_BLOCKS
 
     def show(self, seconds: float | None) -> None:
-        """Draw and obey keys until the user quits, a signal comes, or `seconds` have passed."""
+        """Draw and react to keys until the user quits, a signal comes, or `seconds` have passed."""
         begun = next_draw = next_tick = next_point = time.monotonic()
         # Warnings on stderr would overwrite the screen.
         every = SCROLL_S if self._screen.scrolls else DRAW_S
@@ -150,7 +150,7 @@ class Monitor:
         self._at.message = text
 
     def await_stops(self) -> list[str]:
-        """Keep recording until no stop is in progress; return the failures that were not acknowledged."""
+        """Record until no stop is in progress; return the failures that the user has not acknowledged."""
         if self._is_stopping:
             warn(STILL_STOPPING)
         while self._is_stopping:
@@ -176,9 +176,9 @@ class Monitor:
     # ---- keys ----
 
     def _obey(self, key: str) -> None:
-        if self._on_yes and key not in _STOP_KEYS:  # stop keys replace the question
+        if self._on_yes and key not in _STOP_KEYS:  # a stop key replaces the pending question
             on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
-            if key in ("y", "Y"):  # also with caps lock on
+            if key in ("y", "Y"):  # Y is accepted for caps lock
                 on_yes()
             else:
                 self._at.message = "nothing was sent"
@@ -220,7 +220,7 @@ class Monitor:
             self._turn_page()
 
     def _acknowledge(self) -> None:
-        """Remove the failures that were shown, so that the other ones are shown next."""
+        """Remove those failures that were on the screen, so that the others are shown."""
         del self._at.failures[: self._at.failures_shown]
 
     def _leave(self) -> None:
@@ -244,9 +244,10 @@ class Monitor:
         self._on_yes = self._stop_lines
 
     def _stop_lines(self) -> None:
-        """Stop all lines in parallel, so that no line waits for the ramps of another.
+        """Stop all lines in parallel, so that no line waits for the deceleration of another.
 
-        If threads cannot be started, send the stops of every remaining line first, and only then wait.
+        If some threads cannot be started, first send a stop to each line that has none, and only then wait
+        for them.
         """
         self._stop_results = {}
         stops = {
@@ -255,7 +256,7 @@ class Monitor:
         }
         left = [line for line, stop in stops.items() if not self._begin(*stop)]
         for line in left if len(left) > 1 else ():
-            with suppress(Exception):  # a failure is reported below, when the stop is repeated
+            with suppress(Exception):  # the failure is reported when the stop is repeated below
                 self._session.poller.bus(line).stop_all(seconds=0.0)
         for line in left:
             self._carry_out(*stops[line])
@@ -277,7 +278,7 @@ class Monitor:
         return True
 
     def _carry_out(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop; its failures stay on the screen until acknowledged."""
+        """Carry out a stop. Its failures stay on the screen until the user acknowledges them."""
         try:
             self._at.message, failures = work()
         except Exception as failure:  # the user must see every failure of a stop
@@ -301,7 +302,7 @@ class Monitor:
 
 
 UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
-KEYS = {  # escape sequences and letters that terminals send
+KEYS = {  # keys by the escape sequences and letters that terminals send
     b"\x1b[A": UP,
     b"\x1bOA": UP,
     b"k": UP,
@@ -315,18 +316,18 @@ KEYS = {  # escape sequences and letters that terminals send
     b"\n": ENTER,
 }
 UNKNOWN = "unknown"
-# Other escape sequences, and their starts: F4's ends in S, which must not stop motors.
+# Any other escape sequence, and the start of one. F4's sequence ends in S, which must not stop motors.
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
 _BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
-SPLIT_S = 0.05  # how long to wait for the rest of a sequence
-MOST_BYTES = 4  # of a character in UTF-8
+SPLIT_S = 0.05  # how long to wait for the rest of an escape sequence
+MOST_BYTES = 4  # bytes of a character in UTF-8
 # Letters of the Russian and Ukrainian layouts, and the Latin letters on the same keys.
 LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 
 
 @contextmanager
 def terminal_keys() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits up to n seconds for a key and returns its name or letter, or "".
+    """Yield a function that waits up to n seconds for a key and returns its name or letter; "" for none.
 
     The function raises OSError if the terminal is closed.
     """
@@ -337,7 +338,7 @@ def terminal_keys() -> Iterator[Callable[[float], str]]:
     fd = sys.stdin.fileno()
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)
-    pressed = b""  # not returned yet
+    pressed = b""  # bytes that were read but not returned yet
 
     def read() -> bytes:
         found = os.read(fd, 64)
@@ -357,7 +358,7 @@ def terminal_keys() -> Iterator[Callable[[float], str]]:
     try:
         yield wait_for_key
     finally:
-        with suppress(termios.error):  # the terminal is closed
+        with suppress(termios.error):  # fails if the terminal is closed
             termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
@@ -372,7 +373,7 @@ def next_key(pressed: bytes) -> tuple[str, bytes]:
 
 
 def is_begun(pressed: bytes) -> bool:
-    """Return True for the start of a key or letter whose rest may still come."""
+    """Return True for the start of a key or letter whose remaining bytes may still come."""
     with suppress(UnicodeDecodeError):
         return bool(_BEGUN.fullmatch(pressed)) or (
             pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""

@@ -1,6 +1,6 @@
-"""The pictures of the monitor, as lines of text for a width and a height.
+"""The pictures of the monitor, as lines of text for a given width and height.
 
-Important states are shown in words and marks as well as in colours.
+Important states are shown by words and marks, not only by colours.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
-WIDE, WIDEST = 100, 110  # columns that have room for more
-OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside registers
+WIDE, WIDEST = 100, 110  # widths in columns from which more is shown
+OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside a register's value
 NEVER = "never"
-LEAST_VALUE, AROUND = 12, 13  # columns: of a register's value; of its age and the blanks together
-OLD = "?"  # before an old value
-HISTORY = "LAST MINUTE"  # heading
+LEAST_VALUE, AROUND = 12, 13  # columns for a register's value; columns for its age and all blanks
+OLD = "?"  # mark before an old value
+HISTORY = "LAST MINUTE"  # table heading
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 STOPS = "s stop   S stop all   q quit"
 ACKNOWLEDGE = (f"a acknowledge FAILURES   {STOPS}",)
@@ -32,15 +32,15 @@ PAGE_HELP = (f"up/down choose   PgUp/PgDn scroll   Enter back   {STOPS}", f"PgUp
 
 @dataclass
 class Position:
-    """The user's place in the monitor, and pending questions and failures."""
+    """The user's selection in the monitor, a pending question, and unacknowledged failures."""
 
     chosen: int = 0  # index of the chosen drive
-    page: bool = False  # one drive's registers are shown, not all drives
-    scrolled: int = 0  # lines above the visible part of the page
+    page: bool = False  # True while one drive's registers are shown, instead of all drives
+    scrolled: int = 0  # number of the page's lines above the visible part
     question: str = ""
     message: str = ""
     failures: list[str] = field(default_factory=list)  # unacknowledged failures of stops
-    failures_shown: int = 0  # how many had room on the screen
+    failures_shown: int = 0  # number of failures that had room on the screen
 
 
 def overview(
@@ -67,7 +67,10 @@ def overview(
 def page(
     shown: LiveDrive, others: Mapping[str, SideRead], at: Position, size: tuple[int, int], now_ns: int
 ) -> list[TextLine]:
-    """Draw every register of one drive; `others` has the side reads of unpolled registers."""
+    """Draw every register of one drive.
+
+    `others` has the values of unpolled registers, which side reads have fetched.
+    """
     width, height = size
     drive = shown.polled.drive
     head = f" {shown.name}  {drive.title or drive.model}  address {drive.address}  "
@@ -84,7 +87,7 @@ def page(
     longest = max(map(len, names), default=0)
     cells = [_register(shown, name, others, now_ns) for name in names]
     notes = max((len(note) for *_, note in cells), default=0)
-    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # for values; notes are not cut
+    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # columns for values; notes are not shortened
     values = max(LEAST_VALUE, min(room, max((columns_of(value) for value, *_ in cells), default=0)))
     rows = [
         _register_row(f"{name:<{longest}}", *cell, values, width)
@@ -104,7 +107,7 @@ def page(
     ]
 
 
-# ---- parts of both ----
+# ---- parts of both pictures ----
 
 
 def _title(plant: LivePlant, width: int, now_ns: int) -> TextLine:
@@ -133,7 +136,7 @@ def _misses(reasons: Mapping[str, int]) -> str:
 
 
 def _pace(drive: LiveDrive) -> str:
-    """Describe the recent rate of exchanges, and the delays and losses so far."""
+    """Describe a drive's recent rate of exchanges, and its delays and losses since the start."""
     so_far, delays = drive.so_far, drive.so_far.delays
     parts = [f"{drive.recent.exchanges_per_second:.1f} exchanges/s"]
     if delays.replies:
@@ -150,7 +153,7 @@ def _ms(seconds: float) -> str:
 
 
 def _columns(plant: LivePlant, width: int) -> dict[str, int]:
-    """Return column widths by heading; fault and history share the rest of the line."""
+    """Return the widths of the columns by heading. Fault and history share the rest of the line."""
     state = 12 if width >= WIDE else 10
     columns = {"DRIVE": 5, "STATE": state, "FREQUENCY": 10, "CURRENT": 10, "FAULT": 8, "AGE": 7}
     if width >= WIDEST:
@@ -226,12 +229,12 @@ def _register_row(name: str, value: str, age: str, note: str, value_width: int, 
 
 
 def _alarms(at: Position, size: tuple[int, int]) -> list[TextLine]:
-    """Draw the unacknowledged failures, the oldest first, as many as fit."""
+    """Draw as many unacknowledged failures as fit, the oldest first."""
     width, height = size
     most = max(2, (height - 8) // 2)
     lines: list[str] = []
     at.failures_shown = 0
-    failures = list(at.failures)  # a stop thread may add one
+    failures = list(at.failures)  # a copy, because a stop's thread may add a failure
     for failure in failures:
         wrapped = textwrap.wrap(printable(failure), width - 4, break_long_words=True)
         if lines and len(lines) + len(wrapped) > most - 1:
@@ -269,10 +272,11 @@ def _age(seconds: float | None) -> str:
 def sparkline(
     history: Iterable[float | None], width: int, blocks: str = BLOCKS, points: int | None = None
 ) -> str:
-    """Draw a history in at most `width` columns, from its smallest value to its largest; None is a gap.
+    """Draw a history in at most `width` columns, from its smallest value to its largest. None is a gap.
 
-    If it has more points, a column is their mean. `points` is the number of points so far, including those
-    that the history has dropped: the same points share a column in each picture.
+    If the history has more points than columns, each column shows the mean of several points. `points` counts
+    all points so far, including those that the history has dropped. So the same points share a column in each
+    picture.
     """
     values = list(history)
     share = max(1, ceil(len(values) / width)) if width > 0 else 0
@@ -285,6 +289,6 @@ def sparkline(
     means = [sum(column) / len(column) if column else None for column in columns.values()][-width:]
     there = [mean for mean in means if mean is not None]
     low, high = min(there, default=0.0), max(there, default=0.0)
-    low = min(low, 0.0)  # otherwise a steady value would look like zero, and noise like a swing
+    low = min(low, 0.0)  # otherwise a steady value would look like zero, and noise like large changes
     scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
     return "".join(" " if mean is None else blocks[round((mean - low) * scale)] for mean in means)

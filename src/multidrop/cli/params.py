@@ -29,7 +29,7 @@ from multidrop.families.registry import find_model
 from multidrop.params import ParameterSet, files
 from multidrop.printable import printable
 
-ACTIONS = {  # name: module in this package ("": this one), and help
+ACTIONS = {  # by action: its module in this package ("" for this module), and its help
     "save": ("", "read all parameters of a drive into a new TOML or CSV file"),
     "diff": ("", "compare files and drives; exit status 1 if they differ"),
     "apply": ("", "write a file's parameters to a stopped drive, if they differ"),
@@ -117,7 +117,7 @@ def _diff(arguments: argparse.Namespace) -> int:
     else:
         one, words = _side(arguments, words)
         if isinstance(one, Target) and len(words) == 1 and not params.is_parameter_file(words[0]):
-            words = [one.words[0], *words]  # another drive of the same plant
+            words = [one.words[0], *words]  # the second side may be another drive of the same plant
         other, words = _side(arguments, words)
         _check_no_more(arguments, words)
         first, second = _both(one, other)
@@ -135,14 +135,14 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 
 def _side(arguments: argparse.Namespace, words: list[str]) -> tuple[Target | ParameterSet, list[str]]:
-    """Return the drive or the file that the next words name, and the words after it."""
+    """Return the drive or parameter file that the first words name, and the remaining words."""
     if words and _is_file(words):
         return params.load(words[0]), words[1:]
     return _drive_of(arguments, words)
 
 
 def _is_file(words: list[str]) -> bool:
-    """Return True if the first word is a parameter file, or a missing file that cannot be a plant's."""
+    """Return True if the first word names a parameter file, or a missing file that cannot be a plant file."""
     first = words[0]
     if "://" in first or Path(first).suffix.lower() not in (".toml", ".csv"):
         return False
@@ -150,7 +150,7 @@ def _is_file(words: list[str]) -> bool:
 
 
 def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[ParameterSet, ParameterSet]:
-    """Return both sides; of a drive that is compared with a file, only the file's parameters are read."""
+    """Return the parameters of both sides. From a drive, only those of the other side's file are read."""
     models = [each.drive.model if isinstance(each, Target) else each.model for each in (one, other)]
     if all(models) and models[0] != models[1]:
         names = [each.drive.name if isinstance(each, Target) else each.source for each in (one, other)]
@@ -162,7 +162,7 @@ def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[Par
 
 
 def _family_of(one: Target | ParameterSet, other: Target | ParameterSet, first: ParameterSet) -> Any:
-    """Return the class that gives names and units; None for a model that is not known here."""
+    """Return the class that has the parameters' names and units; None for a model that is unknown here."""
     for side in (one, other):
         if isinstance(side, Target):
             return type(side.drive)
@@ -260,7 +260,7 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _drive_of(arguments: argparse.Namespace, words: Sequence[str]) -> tuple[Target, list[str]]:
-    """Return the drive that the first of these words name, and the words after it."""
+    """Return the drive that the first words name, and the remaining words."""
     return target_of(argparse.Namespace(**vars(arguments) | {"words": [*words]}))
 
 

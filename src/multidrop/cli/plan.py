@@ -1,4 +1,4 @@
-"""`multidrop plan`: predicts the rates of a plant file's lines, and suggests changes if they do not fit.
+"""`multidrop plan`: predicts the polling rates of a plant's lines, and suggests changes if they do not fit.
 
 No port is opened.
 """
@@ -20,8 +20,8 @@ from multidrop.planning.suggestions import Suggestions, duration_text, reading_g
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine, planned_on
 
-LONG_CYCLE = 1.0  # s; a longer cycle of all readings is probably not intended
-_NAMES = 3  # registers named in a sentence
+LONG_CYCLE = 1.0  # in s; a longer cycle of all readings is probably not intended
+_NAMES = 3  # limit of registers named in a sentence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 class _PredictedLine:
     line: PlantLine
     prediction: Prediction
-    suggestions: Suggestions | None  # None: the plan fits
+    suggestions: Suggestions | None  # None if the plan fits
 
 
 def _plan(line: PlantLine) -> _PredictedLine:
@@ -54,7 +54,7 @@ def _plan(line: PlantLine) -> _PredictedLine:
 
 
 def _misfits(plan: _PredictedLine) -> list[str]:
-    """Return a sentence for each rate that is not reached."""
+    """Return a sentence for each polling rate that cannot be reached."""
     return [_misfit(rate, rate.every) for rate in plan.prediction.rates if rate.every and not rate.fits]
 
 
@@ -71,7 +71,7 @@ def _warnings(plan: _PredictedLine) -> list[str]:
 
 
 def _gains(plan: _PredictedLine) -> list[str]:
-    """Return sentences about the time that is saved if users' own classes state the gaps that may be read."""
+    """Return sentences about the bus time that is saved if users' own classes declare readable gaps."""
     gains = {
         polled.drive.name: reading_gain(polled.drive, polled.wanted)
         for polled in plan.line.drives
@@ -81,7 +81,7 @@ def _gains(plan: _PredictedLine) -> list[str]:
 
 
 def _long_cycle(plan: _PredictedLine) -> list[str]:
-    """Warn if all readings are polled, which is the default, and a cycle takes long."""
+    """Return a warning if all readings are polled, which is the default, and a cycle of them takes long."""
     whole = [
         polled.drive
         for polled in plan.line.drives

@@ -1,4 +1,4 @@
-"""`multidrop plot`: plots a recording's values as a picture or an HTML page."""
+"""`multidrop plot`: plots a recording's values as an image or an HTML page."""
 
 from __future__ import annotations
 

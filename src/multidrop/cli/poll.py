@@ -1,4 +1,4 @@
-"""`multidrop poll`: polls, shows the newest values, records, and prints a summary."""
+"""`multidrop poll`: polls a plant, shows the newest values, records, and prints a summary."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from multidrop.printable import printable
 from multidrop.recording import FORMATS
 from multidrop.recording.segments import parse_age, parse_size
 
-_TAKE_S = 0.1  # s between two fetches of new rows
+_TAKE_S = 0.1  # s between two deliveries of new rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,7 +88,10 @@ def follow(
     rotation: Rotation | None = None,
     beside: Callable[[Poller], AbstractContextManager[object]] = nullcontext,
 ) -> dict[str, Any]:
-    """Poll the plant as the polling arguments say, with `beside` in effect; return the summary."""
+    """Poll the plant as the polling arguments require; return the summary.
+
+    `beside` is a context that is entered while the plant is polled.
+    """
     if arguments.capture:
         check_capture(arguments.capture)
     if arguments.flight_recorder and arguments.flight_recorder.is_file():
@@ -113,7 +116,10 @@ def follow(
 
 
 class _Taps:
-    """The taps of --capture and --flight-recorder; `stack` closes their files."""
+    """Writes the traffic of all lines into the files of --capture and --flight-recorder.
+
+    `stack` closes these files.
+    """
 
     def __init__(self, poller: Poller, arguments: argparse.Namespace, stack: ExitStack) -> None:
         lines = list(poller.buses)
@@ -142,7 +148,7 @@ class _Taps:
 
 
 def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namespace) -> int:
-    """Print the poller's summary and the prediction; return the exit status."""
+    """Print the poller's summary beside the predicted rates; return the exit status."""
     summary = {**polled, "recording": str(arguments.out) if arguments.out else None}
     for line in plant.lines:
         summary["lines"][line.name]["comparison"] = compare(line, summary["lines"][line.name])
@@ -201,14 +207,17 @@ _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
 
 
 class LiveTable:
-    """One line per drive: samples and misses so far, and newest values; redrawn in place."""
+    """A table with one line per drive: numbers of samples and misses so far, and newest values.
+
+    It is redrawn in place.
+    """
 
     def __init__(self, plant: Plant, terminal: TextIO) -> None:
         self._plant = LivePlant(plant)
         self._terminal = terminal
         self._samples: Counter[str] = Counter()
         self._misses: Counter[str] = Counter()
-        self._drawn: list[str] = []  # lines of the last drawing
+        self._drawn: list[str] = []  # lines of the previous drawing
         self._next_draw = 0.0
 
     def add(self, rows: Rows) -> None:
@@ -218,7 +227,7 @@ class LiveTable:
             (self._misses if row.value is None else self._samples)[row.drive] += 1
 
     def draw_if_due(self, now: float) -> None:
-        """Draw, unless the last drawing is younger than EVERY."""
+        """Draw the table, unless the previous drawing is younger than EVERY."""
         if now >= self._next_draw:
             self._next_draw = now + EVERY
             self.draw()
@@ -230,10 +239,10 @@ class LiveTable:
         lines = [cut_to(line, columns - 1) for line in shown]
         if len(lines) > height - 1:
             lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
-        # A terminal that was narrowed has wrapped the last drawing.
+        # If the terminal was narrowed since, it has wrapped the lines of the previous drawing.
         rows = sum(max(1, ceil(columns_of(line) / columns)) for line in self._drawn)
         back = _UP_AND_CLEAR.format(min(rows, height - 1)) if self._drawn else ""
-        with suppress(OSError):  # a closed terminal does not end the recording
+        with suppress(OSError):  # recording continues after the terminal is closed
             print(back + "\n".join(lines), file=self._terminal, flush=True)
         self._drawn = lines
 
@@ -261,15 +270,15 @@ Figures = dict[str, Any]
 
 
 def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
-    """Return a line's predictions, with the manuals' and with measured delays, and its measured rates."""
+    """Return a line's measured rates, and its predictions with the manuals' and with measured delays."""
     drives = summary["drives"]
     delays = {
         polled.drive: drives[polled.drive.name]["response_delay_ms"] / 1e3
         for polled in line.drives
-        if drives[polled.drive.name]["exchanges_per_second"]  # a silent drive has no delay
+        if drives[polled.drive.name]["exchanges_per_second"]  # no delay was measured for a silent drive
     }
     polls = [poll for polled in line.drives for poll in polled.polls]
-    is_timed = any(poll.every is not None for poll in polls)  # then a cycle has no measured duration
+    is_timed = any(poll.every is not None for poll in polls)  # if so, cycles have no measured duration
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
     by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {
@@ -297,7 +306,7 @@ def _figures(prediction: Prediction) -> Figures:
 
 
 def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
-    """Format the comparison as a table."""
+    """Yield the comparison as lines of a table."""
     columns = list(found.values())
     cycles = ("-" if column["cycle_ms"] is None else f"{column['cycle_ms']:.1f} ms" for column in columns)
     rows = [
@@ -337,7 +346,7 @@ def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def rotation_of(arguments: argparse.Namespace) -> Rotation | None:
-    """Return how the recording is split into files. Raises ValueError for options that contradict."""
+    """Return how the recording is split into files. Raises ValueError for contradicting options."""
     if arguments.rotate is None:
         if arguments.keep is not None or arguments.most is not None:
             raise ValueError('--keep and --most remove whole files: add --rotate, such as --rotate "1 h"')

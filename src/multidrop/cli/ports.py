@@ -1,4 +1,4 @@
-"""`multidrop ports`: lists this computer's serial ports with their adapters; says who may open each."""
+"""`multidrop ports`: lists this computer's serial ports with their adapters, and who may open each."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NO_PORTS = "no serial port found; plug the adapter in" + (
 
 @dataclass(frozen=True)
 class SerialPort:
-    """A serial port; `name` contains the adapter's serial number if it has one."""
+    """A serial port. If its adapter has a serial number, `name` is the device name that contains it."""
 
     name: str
     device: str
     adapter: str
     may_open: bool
-    advice: str = ""  # how to get the permission
+    advice: str = ""  # how the user gets the permission to open it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +54,7 @@ def _text(port: SerialPort) -> Iterator[str]:
 
 
 def _linux_ports(sysfs: Path = SYSFS, devices: Path = Path("/dev")) -> Iterator[SerialPort]:
-    """Yield the terminals with hardware behind them. The kernel marks an absent UART by type 0."""
+    """Yield the terminal devices that have hardware. For an absent UART, the kernel reports type 0."""
     for tty in sorted((sysfs / "class/tty").glob("*")):
         device, uart = devices / tty.name, tty / "type"
         if not (tty / "device").exists() or (uart.exists() and uart.read_text("ascii").strip() == "0"):
@@ -81,7 +81,7 @@ def _permission_advice(device: Path) -> str:
 
 
 def _other_ports() -> Iterator[SerialPort]:
-    """Yield the ports that pyserial finds on Windows and macOS, where every user may open them."""
+    """Yield the ports that pyserial finds on Windows or macOS, where every user may open them."""
     from serial.tools.list_ports import comports
 
     for port in comports():

@@ -49,18 +49,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _read(drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
-    """Return each register's value, the drive's exception, or None if it has no valid value."""
+    """Return each register's value, the exception that the drive replied, or None if the value is invalid."""
     try:
         found = drive.read_many(wanted)
     except NoValue as lack:
         found = dict(lack.values)
-    except DriveException:  # read one by one to find the register that caused it
+    except DriveException:  # read the registers one by one to find which one caused it
         return {register: _read_one(drive, register) for register in wanted}
     return {register: found.get(register.name) for register in wanted}
 
 
 def _read_one(drive: Drive, wanted: Register[Any] | Text) -> Any:
-    """Return the value of a register or text, the drive's exception, or None if it has no valid value."""
+    """Return the value of a register or text, the drive's exception, or None if the value is invalid."""
     try:
         return drive.read(wanted)
     except NoValue:

@@ -1,4 +1,4 @@
-"""`multidrop scan`: finds the drives on a line with their addresses and settings; writes a plant file."""
+"""`multidrop scan`: finds the drives on a line, with addresses and settings, and writes a plant file."""
 
 from __future__ import annotations
 
@@ -79,7 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.port = declared.port if declared else arguments.port
     rs485, settle = opening_of(arguments, declared)
     families = _families(arguments.model)
-    # A scan for all families has the settings of the built-in ones; more would take much longer.
+    # A scan for all families uses only the settings of the built-in families. Settings of others would make
+    # it much longer.
     planned = _planned(arguments, list(families.values() if arguments.model else MODELS.values()))
     begun = time.monotonic()
     found, finished = _scan(arguments, rs485, settle, planned, list(families.values()))
@@ -108,7 +109,7 @@ def _scan(
     planned: Sequence[Sweep],
     families: Sequence[type[Drive]],
 ) -> tuple[list[Finding], bool]:
-    """Return the findings, and whether the scan finished; after Ctrl-C the findings so far are kept."""
+    """Return the findings, and whether the scan was finished; after Ctrl-C, the findings so far."""
     found: list[Finding] = []
     line = Line(arguments.port, rs485=rs485, settle=settle).open()
     try:
@@ -121,7 +122,7 @@ def _scan(
 
 
 def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
-    """Return families by their names in a plant file, with absolute paths of model files."""
+    """Return families by the names that a plant file would use; model files have absolute paths."""
     named = {}
     for text in models or (*MODELS, *RECOGNISABLE):
         path, colon, name = text.rpartition(":")
@@ -156,16 +157,16 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
     return one_of_each_framing(planned) if fixed else planned
 
 
-# ---- while it runs ----
+# ---- output during the scan ----
 
 
 def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
-    """Print findings as they come, unless silent, and progress on stderr; yield the findings.
+    """Print progress on stderr and, unless `silent`, findings as they come; yield the findings.
 
-    On a terminal progress is one line, redrawn; in a file it is a line for every setting.
+    On a terminal, progress is one line that is redrawn. In a file, it is a line for every setting.
     """
     redraws = sys.stderr.isatty()
-    shown = ""  # the setting of the progress line
+    shown = ""  # the setting in the progress line
     try:
         for finding in findings:
             if isinstance(finding, Progress):
@@ -225,7 +226,7 @@ def sentence(finding: Finding) -> str:
             return at
 
 
-# ---- afterwards ----
+# ---- output after the scan ----
 
 
 def _summary(drives: int, seconds: float, addresses: Sequence[int]) -> str:

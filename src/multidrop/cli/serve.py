@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
     from multidrop.gateway.settings import ServeSettings
 
-DEMO_PORTS = (8750, 0)  # the usual one, or any free port
-END_S = 4.7  # from the signal until the process is killed
+DEMO_PORTS = (8750, 0)  # the usual port, or any free one
+END_S = 4.7  # from the end signal until the process ends itself
 ROLES = ("look", "stop", "write")
 
 
@@ -102,7 +102,7 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
 
 
 def blind_spots(plant: Plant) -> list[str]:
-    """Return a sentence for each drive whose polled registers cannot show a fault."""
+    """Return a sentence for each drive whose faults none of its polled registers can show."""
     found = []
     for line in plant.lines:
         for drive, polled in ((one.drive, [poll.register.name for poll in one.polls]) for one in line.drives):
@@ -175,7 +175,7 @@ def _serve(
 
 
 def _end_by_force() -> None:
-    """End the process after END_S: a thread may hang while reading from a disk."""
+    """End the process after END_S, because a thread may hang while it reads a disk."""
     time.sleep(END_S)
     os._exit(1)
 
@@ -186,7 +186,10 @@ def _url(settings: ServeSettings, port: int) -> str:
 
 
 def _new_token(role: str | None, owner: str | None) -> int:
-    """Print a line for the file of tokens; print the token itself, which is not stored, on stderr."""
+    """Print a line for the file of tokens on stdout; print the token itself only on stderr.
+
+    The token is stored nowhere.
+    """
     from multidrop.gateway.http.rights import Right, new_token
 
     if not role or not owner:

@@ -1,4 +1,4 @@
-"""`multidrop simulate`: simulates the drives of a plant file on pseudo-terminals."""
+"""`multidrop simulate`: simulates the drives of a plant file, on pseudo-terminals or TCP ports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, se
 from multidrop.sim.faults import HELP, Faults
 from multidrop.sim.port import is_dead_link
 
-ANY_TCP = "tcp://127.0.0.1:0"  # any free port of this computer, to simulate a line that is elsewhere
+ANY_TCP = "tcp://127.0.0.1:0"  # any free TCP port of this computer, in place of a port that is not local
 LOOPBACK = ("127.0.0.1", "localhost")
 NO_TERMINALS = (
     "this system has no pseudo-terminals for --ports DIR: remove --ports, and give each line a port such as "
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _speed(text: str) -> float:
-    """Return how fast simulated time passes. Raises ValueError if it is not from 0.1 to 100."""
+    """Return the factor by which simulated time is faster. Raises ValueError unless it is 0.1 to 100."""
     speed = float(text)
     if not 0.1 <= speed <= 100:
         raise ValueError(text)
@@ -80,7 +80,7 @@ def _speed(text: str) -> float:
 
 
 def _has_place(port: str) -> bool:
-    """Return True for a port that needs no --ports: a TCP port of this computer."""
+    """Return True for a TCP port of this computer, which needs no --ports."""
     return speaks_tcp(port) or _is_here(port)
 
 
@@ -94,7 +94,10 @@ def _drives(line: PlantLine) -> list[SimulatedDrive]:
 
 
 def _port(line: PlantLine, directory: Path | None) -> str:
-    """Return the port at which a line is simulated. Raises ValueError if the link to a pty cannot be made."""
+    """Return the port at which a line is simulated.
+
+    Raises ValueError if the link to its pseudo-terminal cannot be created.
+    """
     if speaks_tcp(line.port):
         url = urlsplit(line.port)
         return line.port if url.hostname in LOOPBACK and url.port else ANY_TCP

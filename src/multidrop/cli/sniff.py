@@ -1,4 +1,4 @@
-"""`multidrop sniff`: prints and captures the traffic of a line. It only listens."""
+"""`multidrop sniff`: prints and captures the traffic on a line, and sends nothing."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from multidrop.plant.model import Plant, PlantLine
 from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.open_port import reason_of, unopened
 
-_SILENT_S = 0.5  # longer than any pause within a frame
-_GIVEN_UP_S = 1.5  # longer than any master waits for a reply
+_SILENT_S = 0.5  # silence that is longer than any pause within a frame
+_GIVEN_UP_S = 1.5  # silence after which no reply to a request will come
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,10 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | None:
-    """Return the plant file's line to listen to, or None if it is unknown.
+    """Return the line of the plant file to listen to; None without a plant file, or if it is not found.
 
-    With PLANT.toml instead of PORT, set `arguments.port` to the line's port. With --plant, it is the line
-    with this port, or else the plant's only line.
+    With PLANT.toml instead of PORT, also set `arguments.port` to the line's port. With --plant, return the
+    line with this port, or else the plant's only line.
     """
     named = plant_at(arguments)
     if named is None:
@@ -99,7 +99,7 @@ def _name(port: str) -> str:
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
-    """Return the arguments' settings, completed by those of most of the line's drives."""
+    """Return the arguments' settings, completed by the settings of most of the line's drives."""
     usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)
@@ -114,7 +114,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
             if seconds is not None and now - begun >= seconds:
                 break
             if listener.receive():
-                received_at = time.monotonic()  # not `now`: receiving may have taken long
+                received_at = time.monotonic()  # not `now`, because receiving may have taken long
             listener.stream.end(now - received_at > _SILENT_S)
             printer.show(listener.stream)
             if now - received_at > _GIVEN_UP_S:
@@ -124,18 +124,18 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
     printer.finish()
 
 
-# ---- a port that is only listened to ----
+# ---- a port that is only read ----
 #
-# A device is opened read-only. A URL is opened by pyserial, with its `write` replaced: no bytes are sent to a
-# socket, and only the settings to an rfc2217 server.
+# A device is opened read-only. A URL is opened by pyserial, with its `write` replaced: nothing is sent to a
+# socket, and only the serial settings to an rfc2217 server.
 
 
-LISTEN_S = 0.05  # the longest wait for bytes
-_MOST = 4096  # bytes of one read
+LISTEN_S = 0.05  # longest wait for bytes
+_MOST = 4096  # limit of bytes per read
 
 
 def _open_device(port: str, settings: Settings) -> FileIO:
-    """Open a local device read-only, lock it, and set its baud rate and format."""
+    """Open a local device read-only, lock it, and set its baud rate and character format."""
     if sys.platform == "win32":
         raise LineError(port, "serial devices cannot be sniffed on Windows: use socket://")
     import fcntl
@@ -153,7 +153,7 @@ def _open_device(port: str, settings: Settings) -> FileIO:
 
 
 def _open_url(url: str, settings: Settings) -> Any:
-    """Open a URL, with a `write` that raises."""
+    """Open a URL with pyserial, and replace `write` by a function that raises."""
     port = unopened(url)
     vars(port)["write"] = _refuse
     port.baudrate = settings.baudrate
@@ -170,7 +170,7 @@ def _refuse(data: bytes) -> NoReturn:
 
 
 class Listener:
-    """A port or URL whose bytes go into `stream`. Every failure of the port is a LineError."""
+    """Reads a port or URL into `stream`. Every failure of the port is raised as LineError."""
 
     def __init__(self, port: str, settings: Settings) -> None:
         self.port = port
@@ -186,7 +186,7 @@ class Listener:
             raise LineError(port, reason_of(failure)) from failure
 
     def receive(self) -> int:
-        """Wait for bytes, at most LISTEN_S, and put them into the stream; return their number."""
+        """Wait up to LISTEN_S for bytes, and add them to the stream; return their number."""
         try:
             received = self._read()
         except PORT_FAILURES as failure:
@@ -204,7 +204,7 @@ class Listener:
         """Return the bytes received within LISTEN_S. Raises EOFError if the other end has hung up."""
         try:
             fd = self.fileno()
-        except OSError:  # no descriptor, such as loop://
+        except OSError:  # the port has no file descriptor, such as loop://
             return bytes(self._source.read(1) + self._source.read_all())
         if not select.select([fd], [], [], LISTEN_S)[0]:
             return b""
@@ -236,7 +236,7 @@ _SIDES = {
 
 
 class TrafficPrinter:
-    """Prints the exchanges of one line, and writes its frames into a capture."""
+    """Prints the exchanges on one line, and writes the frames into a capture."""
 
     def __init__(
         self, name: str, line: PlantLine | None, *, as_json: bool, out: CaptureWriter | None
@@ -256,7 +256,7 @@ class TrafficPrinter:
         self._print(self.pairing.pair(spans))
 
     def finish(self) -> None:
-        """Print the pending requests: no reply will come."""
+        """Print the pending requests as unanswered."""
         self._print(self.pairing.flush())
 
     def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
@@ -275,7 +275,7 @@ class TrafficPrinter:
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print the traffic of a capture; return its counts, for `summary`."""
+    """Print the traffic in a capture; return the numbers of exchanges and others for `summary`."""
     printers: list[TrafficPrinter] = []
     for _ in capture:
         printers += [
@@ -289,18 +289,18 @@ def replay(
     return sum((Counter(printer.pairing.counts()) for printer in printers), Counter())
 
 
-_COUNTED = {  # one, many
+_COUNTED = {  # singular and plural
     "exchanges": ("exchange", "exchanges"),
     "broadcasts": ("broadcast", "broadcasts"),
     "unanswered": ("request without a reply", "requests without a reply"),
     "strays": ("reply without a request", "replies without a request"),
     "unknown_bytes": ("unknown byte", "unknown bytes"),
 }
-_ALWAYS = ("exchanges", "unknown_bytes")  # shown even if 0
+_ALWAYS = ("exchanges", "unknown_bytes")  # printed even if 0
 
 
 def summary(counts: Mapping[str, int]) -> str:
-    """Return the counts in words."""
+    """Return the numbers as text."""
     return ", ".join(
         f"{counts.get(name, 0)} {words[counts.get(name, 0) != 1]}"
         for name, words in _COUNTED.items()

@@ -1,6 +1,6 @@
 """`multidrop start`, `stop` and the other verbs: each calls the drive's method of the same name.
 
-`multidrop stop PLANT.toml` stops all drives of a plant, or of one of its lines.
+`multidrop stop PLANT.toml` stops all drives of a plant, or with --line those of one line.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
 
 _DIRECTED = ("start", "jog")
-_FURTHER = {"set-frequency": ("HZ",)}  # arguments behind the drive
-_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print what the motor does if the client dies
-_QUESTIONS = {  # asked before the first request; a stop needs no confirmation
+_FURTHER = {"set-frequency": ("HZ",)}  # further arguments after the drive
+_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print how the motor reacts if this program dies
+_QUESTIONS = {  # asked before the first request; stops need no confirmation
     "start": "Start the motor of",
     "jog": "Turn the motor of",
     "reset-fault": "Reset the fault of",
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _stop_time(text: str) -> float | None:
-    """Parse a number of seconds above 0. If it is invalid, warn and return None: the stop is sent anyway."""
+    """Return the number of seconds in a text. If it is invalid, warn and return None: the stop is sent."""
     try:
         return duration(text)
     except argparse.ArgumentTypeError as mistake:
@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the named drive and the words after it; a stop warns of such words and ignores them."""
+    """Return the named drive and the words after it. A stop ignores such words with a warning."""
     command = arguments.command
     if command not in STOPS:
         target, words = target_of(arguments)
@@ -142,7 +142,7 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 
 
 def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
-    """Open the drive's line. Raises OSError for a stop whose port cannot be opened: it was not sent."""
+    """Return the open bus with the drive. Raises LineError, or OSError for a stop: it was not sent."""
     audit = _audit_file(arguments)
     try:
         return target.open_bus(audit)
@@ -153,7 +153,10 @@ def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
 
 
 def _audit_file(arguments: argparse.Namespace) -> str | None:
-    """Return the audit log's path. If it cannot be opened for a stop, warn and return None."""
+    """Return the path of the audit log; None without one.
+
+    If the log cannot be opened for a stop, warn and return None: the stop is sent anyway.
+    """
     audit: str | None = getattr(arguments, "audit", None)
     if audit and arguments.command in STOPS:
         try:
@@ -166,7 +169,7 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
 
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
-    """Add notes to an interruption: the state of the verb, and the command that stops the motor."""
+    """Add notes to a KeyboardInterrupt: the state of the verb, and the command that stops the motor."""
     try:
         with reporting_interruption(target.drive, command) as known:
             yield known
@@ -177,7 +180,10 @@ def _annotating(command: str, target: Target) -> Iterator[list[str]]:
 
 
 def _setpoint(drive: Drive, hz: float) -> Write | None:
-    """Return the first write of set_frequency; None if its script starts with a read."""
+    """Return the first write of set_frequency, with a value that the register can hold.
+
+    None if the verb starts with a read.
+    """
     step = next(drive.set_frequency.script(hz))
     if not isinstance(step, Write):
         return None
@@ -185,14 +191,17 @@ def _setpoint(drive: Drive, hz: float) -> Write | None:
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Run the script's first step without a port, which raises if the family lacks or forbids the verb."""
+    """Run the verb's script up to its first request, without a port.
+
+    Raises if the family lacks or forbids the verb.
+    """
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
 
 
 def _details(arguments: argparse.Namespace) -> str:
-    """Return the words of a question that name the requested setpoint and direction."""
+    """Return the requested setpoint and direction as words for the question to the user."""
     hz, direction = (getattr(arguments, name, None) for name in ("frequency", "direction"))
     at = "to" if arguments.command == "set-frequency" else "at"
     return ("" if hz is None else f" {at} {hz:g} Hz") + (f", {direction}" if direction else "")
@@ -235,7 +244,7 @@ def _as_json(state: State | None) -> dict[str, Any] | None:
 
 
 def add_plant_stop_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --all and --line, and the usage with only a plant file."""
+    """Add --all and --line, and a usage line with a plant file only."""
     parser.usage = f"{parser.usage}\n       {parser.prog} PLANT.toml [--line LINE] [options]"
     parser.add_argument(
         "--all", action="store_true", help="all drives of the plant; the default if no drive is named"
@@ -251,9 +260,9 @@ def names_plant(arguments: argparse.Namespace) -> bool:
 
 
 def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
-    """Stop the lines in parallel; print each drive's result when its line is done.
+    """Stop the lines in parallel; print the results of each line's drives when the line is done.
 
-    Raises ValueError for mistakes in the plant file or the line's name; then no stop is sent.
+    Raises ValueError for mistakes in the plant file or the line's name. In that case no stop is sent.
     """
     try:
         lines = _lines(plant_of(arguments.words[0], arguments), arguments)
@@ -278,7 +287,7 @@ def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
 
 
 def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
-    """Return the lines to stop. Raises ValueError for a drive beside --all or --line."""
+    """Return the lines to stop. Raises ValueError if a drive is given as well as --all or --line."""
     if arguments.words[1:]:
         option = "--all" if arguments.all else "--line"
         raise ValueError(
@@ -290,7 +299,7 @@ def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
 
 
 def _start_stops(stops: Sequence[_LineStop], finished: SimpleQueue[_LineStop]) -> None:
-    """Stop each line in a thread of its own, so that no line waits for the ports and ramps of another.
+    """Stop each line in its own thread, so that no line waits for another's port or deceleration.
 
     If no more threads can be started, stop the remaining lines here, one after another.
     """

@@ -1,4 +1,4 @@
-"""`multidrop wear`: lists writes to registers that may be stored in EEPROM, and how many are left."""
+"""`multidrop wear`: lists writes to registers that may be stored in EEPROM, and how many writes are left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`multidrop write`: writes one register of one drive and prints the outcome."""
+"""`multidrop write`: writes one register of a drive and prints the outcome."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     if register.never:
         raise refused(drive, register, register.never)
     value = nearest_value(register, register.parse(words[1]))
-    check_plain(drive, register, raw_count(drive, register, value))  # before a port is opened
+    check_plain(drive, register, raw_count(drive, register, value))  # checked before the port is opened
     confirm(f"Write {register.name} = {register.format(value)} to {drive.name} on {target.port}?", arguments)
     with reporting_interruption(drive, "write") as known, target.open_bus(arguments.audit):
         known.clear()

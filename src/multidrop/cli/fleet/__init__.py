@@ -1,9 +1,9 @@
-"""The `fleet` command: several gateways share the lines of one plant through NATS JetStream.
+"""`multidrop fleet`: several gateways share the lines of one plant through NATS JetStream.
 
-Each action is a command of its own, named like the same command outside a fleet.
+Each action is a command, with the name of the similar command for a plant without a fleet.
 """
 
-ACTIONS = {  # name: module in this package, and help
+ACTIONS = {  # by action: its module in this package, and its help
     "demo": ("demo", "kill a gateway of a simulated fleet and show the takeover"),
     "rights": ("rights", "write the servers' configuration, and a key for each user"),
     "init": ("init", "set the NATS servers up, and store the plant"),

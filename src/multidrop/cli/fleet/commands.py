@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # arguments after the drive
+_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # further arguments after the drive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,7 +72,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 
     by = arguments.by or f"{_user()}@{socket.gethostname()}"
     if arguments.command in STOPS:
-        by = printable(by)[:MOST_CHARACTERS]  # a long name must not prevent a stop
+        by = printable(by)[:MOST_CHARACTERS]  # a name that is too long must not prevent a stop
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
         raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
     log, urls = arguments.audit or state_folder() / "commands.jsonl", urls_of(arguments)
@@ -81,7 +81,7 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
 
 @asynccontextmanager
 async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]:
-    """Yield a connected sender of commands. If connecting fails, a stop's error says that it was not sent."""
+    """Yield a connected client for commands. If that fails, a stop's error says that it was not sent."""
     from multidrop.fleet.commands.fleet_commands import HARD_WIRED
     from multidrop.fleet.errors import FleetError
 
@@ -97,13 +97,13 @@ async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]
 
 
 def _user() -> str:
-    with suppress(OSError, KeyError):  # a user id without a name, as in a container
+    with suppress(OSError, KeyError):  # a user id may have no name, as in a container
         return getpass.getuser()
     return str(os.getuid())
 
 
 def _what(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of FleetCommands.request. Raises ValueError if HZ is not a number."""
+    """Return the arguments for FleetCommands.request. Raises ValueError if HZ is not a number."""
     action = arguments.command
     if action == "write":
         return {"register": arguments.register, "value": arguments.value}
@@ -119,9 +119,9 @@ def _what(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 async def _command(arguments: argparse.Namespace) -> int:
-    """Show the command, let a person confirm it, and then send it as a new request.
+    """Show the command, let the user confirm it, and then send it as a new request.
 
-    The gateway's offer for the shown command is valid for only one second; a person takes longer.
+    The gateway's offer is valid for only a second, and a user takes longer to confirm.
     """
     from multidrop.fleet.commands.messages import CommandAnswer
 
@@ -152,7 +152,7 @@ async def _stop(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _annotating(what: str) -> Iterator[None]:
-    """Print that the outcome is unknown if Ctrl-C interrupts the wait for an answer."""
+    """On Ctrl-C during the wait for an answer, print that the outcome is unknown."""
     try:
         yield
     except asyncio.CancelledError:
@@ -169,7 +169,7 @@ def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
 
 
 def _show_news(answer: CommandAnswer) -> None:
-    with suppress(OSError):  # the stop continues even if stderr is closed
+    with suppress(OSError):  # the stop continues after stderr is closed
         print_text(_sentence(answer), file=sys.stderr)
 
 

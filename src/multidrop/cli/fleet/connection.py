@@ -1,4 +1,4 @@
-"""The NATS servers of a fleet: options, addresses, and the connections that an action uses."""
+"""The NATS servers of a fleet: options, URLs, and the connections that an action uses."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def nats_urls(given: str | None) -> list[str]:
-    """Return the servers' URLs: those given, separated by commas, or MULTIDROP_NATS.
+    """Return the servers' URLs from a list separated by commas, or from MULTIDROP_NATS.
 
-    Raises ValueError for an empty list, and for a URL that is not nats:// or tls://.
+    Raises ValueError for an empty list, and for a URL that does not start with nats:// or tls://.
     """
     text = given or os.environ.get("MULTIDROP_NATS") or URLS
     found = [url.strip() for url in text.split(",") if url.strip()]
@@ -48,7 +48,7 @@ def nats_urls(given: str | None) -> list[str]:
 
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
-    """Return the options of a connection. Raises ValueError for a file without a key."""
+    """Return nats-py's options for a connection. Raises ValueError for a file without a key."""
     from multidrop.fleet.servers.credentials import connect_options
 
     logging.getLogger("asyncio").addFilter(_is_news)
@@ -59,7 +59,7 @@ def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Return False for the log line of Python 3.11's asyncio about a TLS connection closed by the far end."""
+    """Return False for a log record of Python 3.11's asyncio about a TLS connection closed by the server."""
     return "eof_received" not in record.getMessage()
 
 
@@ -71,17 +71,17 @@ def _named(variable: str) -> Path | None:
 if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
-STATE = "~/.local/state/multidrop/fleet"  # state_folder(), if XDG_STATE_HOME is not set
+STATE = "~/.local/state/multidrop/fleet"  # state_folder() without XDG_STATE_HOME, for help texts
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of every action that talks to the servers and prints a result."""
+    """Add the options of every action that connects to the servers and prints a result."""
     add_address_arguments(parser)
     add_json_argument(parser)
 
 
 def add_address_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the servers' addresses and credentials."""
+    """Add the options for the servers' URLs and the credentials."""
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
@@ -94,15 +94,16 @@ def urls_of(arguments: argparse.Namespace) -> list[str]:
 
 
 def state_folder() -> Path:
-    """Return the folder of this user's gateways and log of commands.
+    """Return the folder for the state of this user's gateways and the log of commands.
 
-    It is beside the ledger. A user without a home cannot keep a ledger, and stops do not need one.
+    The EEPROM ledger is beside this folder. A user without a home folder cannot keep a ledger, and stops do
+    not need one.
     """
     return default_path().parent / "fleet"
 
 
 def require_fleet() -> None:
-    """Raise ValueError if a library is missing that every action needs."""
+    """Raise ValueError if a library that all actions need is missing."""
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
 
@@ -115,7 +116,7 @@ def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
 
 
 async def open_path(paths: Sequence[ServerPath]) -> ServerPath:
-    """Open the connections; return one that is open. Raises FleetError if no server answers."""
+    """Open all connections; return one that is open. Raises FleetError if no server answers."""
     from multidrop.fleet.servers.setup import open_all
 
     await open_all(paths)
@@ -123,7 +124,7 @@ async def open_path(paths: Sequence[ServerPath]) -> ServerPath:
 
 
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
-    """Run an action with three connections to the servers, and close them afterwards."""
+    """Run an action with three connections to the servers, and close these afterwards."""
 
     async def with_paths() -> int:
         from multidrop.fleet.servers.connections import paths_of

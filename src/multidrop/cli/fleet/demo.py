@@ -28,19 +28,19 @@ GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
 LINES = 12
 DRIVES = 2  # per line
-WAIT_S = 60.0  # timeout of steps that take seconds on an idle computer
-RUN_S = 2.0  # before the kill, and after each step
-KEEP = "100 MB"  # stored samples; each server may store 256 MB
+WAIT_S = 60.0  # time limit of steps that take only seconds on an idle computer
+RUN_S = 2.0  # pause before the kill, and after each step
+KEEP = "100 MB"  # limit of stored samples; each server may store 256 MB in all
 
 Fleet = dict[str, Any]
 
 
 class Stage:
-    """The notes so far, and the newest view of the fleet."""
+    """What the demo shows: its notes so far, and the newest view of the fleet."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
-        self.draw: Callable[[Fleet], object] | None = None  # set if there is a terminal
+        self.draw: Callable[[Fleet], object] | None = None  # None without a terminal
         self.fleet: Fleet = {"gateways": {}, "lines": {}}
         self.updated = asyncio.Event()
         self._started = time.monotonic()
@@ -60,16 +60,16 @@ class Stage:
         return {name: line["master"] for name, line in self.fleet["lines"].items()}
 
     def are_masters(self, gateways: Sequence[str]) -> bool:
-        """Return True if every line has a master, and these gateways are the masters."""
+        """Return True if every line has a master, and the masters are exactly these gateways."""
         return set(self.masters().values()) == set(gateways)
 
     def shares(self) -> str:
-        """Return the number of lines of each gateway, as text."""
+        """Return the number of each gateway's lines, as text."""
         found = list(self.masters().values())
         return ", ".join(f"{name} {found.count(name)}" for name in GATEWAYS if name in found)
 
     async def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait for a view in which the condition holds. Raises OSError after a minute."""
+        """Wait for a view of the fleet that meets the condition. Raises OSError after a minute."""
         try:
             async with asyncio.timeout(WAIT_S):
                 while not condition():
@@ -79,7 +79,7 @@ class Stage:
             raise OSError(f"{what} not within {WAIT_S:.0f} s: the demo has failed") from None
 
     async def calm(self, seconds: float) -> None:
-        """Wait until no line has changed its master for `seconds`, because a view may lag."""
+        """Wait until no line has changed its master for this time: a view may be late."""
         before: dict[str, str | None] | None = None
         while (found := self.masters()) != before:
             before = found
@@ -93,14 +93,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show the takeover. Raises OSError if it takes longer than a minute."""
+    """Show a takeover. Raises OSError if a step takes longer than a minute."""
     require_fleet()
     from multidrop.fleet.servers.connections import OLDEST
 
     program = server_program(OLDEST)
     stage = Stage()
     with temporary_folder() as folder, ExitStack() as stack:
-        none = dict.fromkeys((CREDENTIALS, CA), "")  # ignore the variables of the user's own fleet
+        none = dict.fromkeys((CREDENTIALS, CA), "")  # ignore variables for the user's own fleet
         children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
         stack.callback(children.close)
         demo = Demo(folder, children, stage)
@@ -116,7 +116,7 @@ def drives_of(line: str) -> list[str]:
 
 
 def plant_file(ports: Mapping[str, int]) -> str:
-    """Return a plant file with these lines, on TCP ports of this computer."""
+    """Return a plant file with these lines, which are on TCP ports of this computer."""
     return "\n".join(
         f'[[line]]\nname = "{line}"\nport = "tcp://127.0.0.1:{port}"\n'
         + "".join(
@@ -129,7 +129,7 @@ def plant_file(ports: Mapping[str, int]) -> str:
 
 
 class Demo:
-    """The processes of the demo, from start to end."""
+    """Starts and ends the processes of the demo."""
 
     def __init__(self, folder: Path, children: Children, stage: Stage) -> None:
         self._folder = folder
@@ -138,13 +138,13 @@ class Demo:
         self._urls = ""
 
     def start(self, program: str) -> None:
-        """Start servers, lines and gateways."""
+        """Start servers, simulated lines and gateways."""
         note, children, plant = self._stage.note, self._children, self._folder / "plant.toml"
         lines = [f"line-{at}" for at in range(1, LINES + 1)]
         plant.write_text(plant_file(dict(zip(lines, free_ports(LINES), strict=True))), "utf-8")
         simulator = children.start_multidrop("lines", "simulate", str(plant))
         assert simulator.stdout is not None
-        simulator.stdout.readline()  # the ports are open
+        simulator.stdout.readline()  # printed when the ports are open
         self._urls = ",".join(start_nodes(children, self._folder, program))
         note(f"three NATS servers are ready, in {self._folder}")
         children.run_multidrop("init", "fleet", "init", str(plant), "--keep", KEEP, "--nats", self._urls)
@@ -160,9 +160,9 @@ class Demo:
         )
 
     async def play(self) -> float:
-        """Kill a gateway and start it again; return the seconds until its lines had other masters.
+        """Kill a gateway and start it again; return how many seconds its lines took to get other masters.
 
-        Raises KeyboardInterrupt for a signal.
+        Raises KeyboardInterrupt if a signal comes.
         """
         over = asyncio.Event()
         with end_signals_cancel(), _drawn(self._stage):
@@ -208,7 +208,7 @@ class Demo:
 
 @contextmanager
 def _drawn(stage: Stage) -> Iterator[None]:
-    """Draw on a terminal; print the notes in any case."""
+    """Draw the stage on a terminal until the context ends. Print its notes in any case."""
     if not sys.stdout.isatty():
         yield
         return

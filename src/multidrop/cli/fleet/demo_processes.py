@@ -1,4 +1,4 @@
-"""The processes of `fleet demo`: all processes and files are removed, however the command ends."""
+"""The processes of `fleet demo`. All processes and files are removed, however the command ends."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from tempfile import mkdtemp
 
-PR_SET_PDEATHSIG = 1  # prctl(2)
-# Waits for the end of stdin; then processes that are being killed may still write into the folder.
+PR_SET_PDEATHSIG = 1  # from prctl(2)
+# This shell command removes the folder when stdin is closed. It retries, because processes that are being
+# killed may still write into the folder.
 REMOVE = 'cat; for n in 1 2 3 4 5 6 7 8 9 10; do rm -rf "$0" && exit; sleep 1; done'
-ENDING_S = 10.0  # timeout for a process that was asked to exit
+ENDING_S = 10.0  # time limit for a process that was asked to exit
 NODES = ("n1", "n2", "n3")
-ATTEMPTS = 3  # retries, because another program may take a port that was just free
+ATTEMPTS = 3  # a port that was just free may be taken by another program
 STARTING_S = 20.0
 
 CONFIGURATION = """
@@ -50,7 +51,7 @@ def temporary_folder() -> Iterator[Path]:
 
 
 class Children:
-    """Processes by name, each with a log in this folder and its own session, which Ctrl-C does not reach."""
+    """Child processes by name. Each has its own log in this folder, and its own session without Ctrl-C."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
         self._folder = folder
@@ -59,7 +60,7 @@ class Children:
         self._libc, self._parent = ctypes.CDLL(None), os.getpid()
 
     def _die_with_parent(self) -> None:
-        """Let the kernel kill the new process when this one ends."""
+        """Let the kernel kill this child process when its parent ends."""
         self._libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != self._parent:
             os._exit(1)
@@ -68,7 +69,7 @@ class Children:
         return self._running[name]
 
     def start(self, name: str, *words: str) -> subprocess.Popen[str]:
-        """Start a program; its stderr goes to its log."""
+        """Start a program whose stderr goes to its log."""
         with self._log(name).open("ab") as log:
             self._running[name] = subprocess.Popen(
                 words,
@@ -85,19 +86,19 @@ class Children:
         return self.start(name, sys.executable, "-m", "multidrop", *words)
 
     def run_multidrop(self, name: str, *words: str) -> str:
-        """Run a command, and return its output. Raises OSError with its last line if it fails."""
+        """Run a multidrop command and return its output. Raises OSError with its last line if it fails."""
         out, _ = self.start_multidrop(name, *words).communicate()
         if self._running[name].returncode:
             raise OSError(f"`multidrop {words[0]}` of the demo failed: {self._last_line(name)}")
         return out
 
     def kill(self, name: str) -> None:
-        """Kill a process as a power cut would."""
+        """Kill a process without warning, as a power cut would."""
         self._running[name].kill()
         _reap(self._running[name])
 
     def end(self, *names: str) -> None:
-        """Ask these processes to exit cleanly, and wait for them. Raises OSError if one does not exit."""
+        """Ask these processes to exit, and wait for them. Raises OSError if one does not exit."""
         for name in names:
             self._running[name].terminate()
         for name in names:
@@ -108,7 +109,7 @@ class Children:
                 raise OSError(f"{name} of the demo did not end: {self._last_line(name)}") from None
 
     def close(self) -> None:
-        """Kill all processes that still run."""
+        """Kill all processes that are still running."""
         for process in self._running.values():
             process.kill()
         for process in self._running.values():
@@ -132,7 +133,7 @@ def _reap(process: subprocess.Popen[str]) -> None:
 
 
 def server_program(oldest: tuple[int, int]) -> str:
-    """Return a nats-server of this version or newer: the Python package's, or one on the PATH.
+    """Return the path of a nats-server of at least this version: the Python package's, or one in PATH.
 
     Raises ValueError if there is none.
     """
@@ -156,7 +157,7 @@ def _programs() -> Iterator[str]:
 
 
 def version_of(program: str) -> tuple[int, int]:
-    """Return the version of a nats-server; (0, 0) for any other program."""
+    """Return the version of a nats-server; (0, 0) if it is another program."""
     try:
         said = subprocess.run([program, "--version"], capture_output=True, check=False).stdout
     except OSError:
@@ -166,7 +167,7 @@ def version_of(program: str) -> tuple[int, int]:
 
 
 def start_nodes(children: Children, folder: Path, program: str) -> list[str]:
-    """Start three servers, wait until they have a leader, and return their URLs. Raises OSError."""
+    """Start three servers, wait until they have elected a leader, and return their URLs. Raises OSError."""
     for attempt in range(ATTEMPTS):
         names = [f"{node}-{attempt}" for node in NODES]
         ports, routes, monitors = (free_ports(len(names)) for _ in range(3))
@@ -214,7 +215,7 @@ def _is_healthy(monitor: int) -> bool:
 
 
 def free_ports(number: int) -> list[int]:
-    """Return ports that are free now."""
+    """Return this many ports that are free now."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
     ports = [int(one.getsockname()[1]) for one in sockets]
     for one in sockets:

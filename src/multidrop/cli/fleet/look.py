@@ -1,4 +1,4 @@
-"""`multidrop fleet status` and `lines`: show a fleet, from its records and its gateways' answers."""
+"""`multidrop fleet status` and `lines`: print a fleet's state, from its records and its gateways' answers."""
 
 from __future__ import annotations
 

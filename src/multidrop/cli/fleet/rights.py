@@ -1,4 +1,4 @@
-"""`multidrop fleet rights`: writes the configuration of NATS servers, and a key for each user."""
+"""`multidrop fleet rights`: writes configuration files for NATS servers, and a secret key for each user."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files, and print where each belongs. Secrets are only in the files."""
+    """Write the files, and print on which computer each belongs. Secrets are never printed."""
     require_fleet()
     require_extra("nkeys", "fleet", "fleet rights")
     from multidrop.fleet.servers.files import write_files

@@ -1,6 +1,6 @@
-"""The picture of a fleet, as lines of text for a width and a height.
+"""The picture of a fleet, as lines of text for a given width and height.
 
-Everything important is shown in words as well as in colours. An old view is dim, and shows its age.
+Everything important is shown by words, not only by colours. An old view is dimmed, and shows its age.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ from multidrop.cli.fleet.tables import (
 )
 from multidrop.cli.support.screen import TextLine, cut
 
-OLD_S = 3.0  # a view older than this is drawn dim
-NOTES = 4  # at most so many lines of notes, and as many of problems
-MOVES = 8  # rows of the table of moves, with its head, if the lines need the remaining room
+OLD_S = 3.0  # an older view is dimmed
+NOTES = 4  # limit of the lines for notes, and for problems
+MOVES = 8  # limit of the table of moves, with its head, if the lines need all remaining room
 
 
 def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLine]:
-    """Draw gateways, lines, moves and "notes" of `fleet`, which is as `fleet watch --json` prints it."""
+    """Draw a fleet's gateways, lines, moves and notes.
+
+    `fleet` has the form that `fleet watch --json` prints, and further "notes".
+    """
     width, height = size
     is_old = fleet["age_s"] is None or fleet["age_s"] > OLD_S
     top = [_title(fleet, head, width), _warning(fleet, width)]
@@ -59,7 +62,7 @@ def _body(fleet: FleetState, width: int, room: int) -> list[str]:
 
 
 def _notes(fleet: FleetState, width: int) -> list[str]:
-    """Return the last notes, wrapped, as many whole ones as fit."""
+    """Return the last notes, wrapped: as many whole notes as fit."""
     notes: list[str] = []
     for note in reversed(fleet.get("notes", ())):
         wrapped = textwrap.wrap(note, width - 1, subsequent_indent=" " * 9)
@@ -78,13 +81,13 @@ def _fitting(lines: list[str], room: int) -> list[str]:
     if len(lines) <= room:
         return lines
     kept = room - 1
-    if kept < 2:  # there is room only for the head
+    if kept < 2:  # there is room only for the table's head
         return []
     return [*lines[:kept], f"and {len(lines) - kept} more lines"]
 
 
 def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list[str | int]]:
-    """Return a sort key: lines without a master first, then lines whose master does not answer."""
+    """Return a sort key: lines without a master come first, then lines whose master does not answer."""
     return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from multidrop.cli.support.values import Row, aligned, columns_of, counted
 
-FleetState = Mapping[str, Any]  # a fleet, as `--json` prints it
+FleetState = Mapping[str, Any]  # a fleet's state, as `--json` prints it
 GATEWAYS = (
     "GATEWAY",
     "HOST",
@@ -25,14 +25,14 @@ GATEWAYS = (
     "LOST",
 )
 LINES = ("LINE", "PORT", "MASTER", "SINCE")
-# Columns that are dropped, in this order, if the terminal is too narrow.
+# Columns that are left out if the terminal is too narrow, in this order.
 LEFT_OUT = ("SINCE", "HOST", "SESSION", "SPOOL", "LAG", "LEASE")
 LINES_LEFT_OUT = ("PORT", "SINCE")
 UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def moment(ms: int | None) -> str:
-    """Return a time (ms since 1970) as UTC; "?" for None and for an invalid one."""
+    """Return a time (ms since 1970) as UTC text; "?" for None and for an invalid time."""
     try:
         return "?" if ms is None else time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(ms // 1000))
     except (OverflowError, ValueError, OSError):
@@ -40,13 +40,13 @@ def moment(ms: int | None) -> str:
 
 
 def gateway_table(fleet: FleetState, width: float = inf) -> list[str]:
-    """Return the table of gateways, without some columns if it would be wider than `width`."""
+    """Return the table of gateways. Columns are left out if it would be wider than `width`."""
     rows = [_gateway_row(name, gateway) for name, gateway in fleet["gateways"].items()]
     return _fitting([GATEWAYS, *rows], "<<><<>>>>>>", LEFT_OUT, width)
 
 
 def _fitting(table: list[Row], sides: str, left_out: Iterable[str], width: float) -> list[str]:
-    """Return a table (its first row is the head) as lines of text, with as many columns as fit."""
+    """Return a table as lines of text, with as many columns as fit. Its first row is the head."""
     for column in left_out:
         found = aligned(table, sides)
         if max(map(len, found)) <= width:
@@ -76,7 +76,7 @@ def _gateway_row(name: str, gateway: FleetState) -> Row:
 
 
 def size(number: float) -> str:
-    """Return a number of bytes in the unit that leaves three digits at most."""
+    """Return a number of bytes with a unit, in at most three digits."""
     for unit in UNITS[:-1]:
         if number < 1000:
             return f"{number:.0f} {unit}" if number >= 10 or unit == "B" else f"{number:.1f} {unit}"
@@ -90,7 +90,7 @@ def natural(name: str) -> list[str | int]:
 
 
 def line_table(fleet: FleetState, names: Iterable[str], width: float = inf) -> list[str]:
-    """Return the table of these lines, without some columns if it would be wider than `width`."""
+    """Return the table of these lines. Columns are left out if it would be wider than `width`."""
     silent = silent_gateways(fleet)
     rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
     return _fitting([LINES, *rows], "<<<<", LINES_LEFT_OUT, width)
@@ -103,7 +103,7 @@ def _line_row(name: str, line: FleetState, silent: set[str]) -> Row:
 
 
 def line_columns(fleet: FleetState, names: Iterable[str], width: int) -> list[str]:
-    """Return the lines with their masters in several columns: for a screen without room for the table."""
+    """Return the lines and their masters in several columns, for a screen without room for the table."""
     silent = silent_gateways(fleet)
     rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
     cells = aligned([(name, master) for name, _, master, _ in rows], "<<")
@@ -115,7 +115,7 @@ def line_columns(fleet: FleetState, names: Iterable[str], width: int) -> list[st
 
 
 def silent_gateways(fleet: FleetState) -> set[str]:
-    """Return the gateways that do not answer: their lines may not be polled."""
+    """Return the gateways that do not answer, and so may not poll their lines."""
     return {name for name, gateway in fleet["gateways"].items() if gateway["says"] is None}
 
 
@@ -131,17 +131,17 @@ def unsure_lines(fleet: FleetState) -> list[str]:
 
 
 def lost_lines(fleet: FleetState) -> list[str]:
-    """Return the lines whose master has lost the port: these lines are not polled."""
+    """Return the lines whose master has lost the port, so that they are not polled."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
 
 
 def failing_lines(fleet: FleetState) -> list[str]:
-    """Return the lines on which polling raises exceptions: their values are missing."""
+    """Return the lines on which polling raises exceptions, so that their values are missing."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "failing")]
 
 
 def _lines_in(says: FleetState | None, key: str) -> list[str]:
-    """Return the lines that a gateway's answer lists; none if it has no such list."""
+    """Return the lines that a gateway's answer lists under this key; none if there is no valid list."""
     found = (says or {}).get(key)
     return [line for line in found if isinstance(line, str)] if isinstance(found, list) else []
 
@@ -155,7 +155,7 @@ def count_sentence(fleet: FleetState) -> str:
 
 
 def move_table(moves: Iterable[FleetState], width: float = inf) -> list[str]:
-    """Return a line of text for each move: time, line, former master (if it fits) and new master."""
+    """Return a line of text for each move: time, line, former master (if there is room) and new master."""
     rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
     found = aligned(rows, "<<<<")
     if max(map(len, found), default=0) <= width:
@@ -169,7 +169,7 @@ def _from_to(move: FleetState) -> tuple[str, str]:
 
 
 def trouble_sentences(fleet: FleetState) -> list[str]:
-    """Return the problems that gateways report, a sentence for each."""
+    """Return a sentence for each problem that a gateway reports."""
     found = [
         f"{name} on {gateway['host']} is missing: last seen {moment(gateway['seen_ms'])}"
         for name, gateway in fleet.get("missing", {}).items()

@@ -1,4 +1,4 @@
-"""`multidrop fleet watch`: shows the fleet live on a terminal, or a line of JSON a second."""
+"""`multidrop fleet watch`: shows the fleet live on a terminal, or prints a line of JSON each second."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ async def watch(paths: list[ServerPath], *, is_json: bool) -> int:
 async def follow(watch: FleetWatch, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
     """Show the fleet once a second, with the age of the view, until `over` is set.
 
-    Raises Ended if the task that keeps the connection has ended.
+    Raises Ended if the task that keeps the connection open has ended.
     """
     while not over.is_set():
         supervisor().check()
@@ -77,6 +77,6 @@ def _lines() -> Iterator[Callable[[dict[str, Any]], None]]:
 
 @contextmanager
 def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield a function that draws a fleet on the whole terminal."""
+    """Yield a function that draws a fleet on the full screen of the terminal."""
     with Screen() as screen:
         yield lambda fleet: screen.draw(picture(fleet, screen.size, head))

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True) -> None:
-    """Add --yes and --audit, for commands that may write; `asks`: the command asks before it writes."""
+    """Add --yes and --audit, for commands that may write. `asks` is False if the command never asks first."""
     yes = "do not ask; needed without a terminal" if asks else "no effect: this command never asks"
     parser.add_argument("--yes", action="store_true", help=yes)
     parser.add_argument(
@@ -40,7 +40,7 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def argument(parse: Callable[[str], T], example: str = "") -> Callable[[str], T]:
-    """Return a type for argparse that fails with the message of `parse`, or with an example."""
+    """Return a type for argparse that calls `parse`. Its error is that of `parse`, or shows an example."""
 
     def parsed(text: str) -> T:
         try:
@@ -69,7 +69,7 @@ def add_plant_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def add_port_option(parser: argparse.ArgumentParser) -> None:
-    """Add --port NAME=PORT, for the lines of a plant file."""
+    """Add --port NAME=PORT, which replaces the port of a line of the plant file."""
     parser.add_argument(
         "--port",
         metavar="LINE=PORT",
@@ -82,7 +82,7 @@ def add_port_option(parser: argparse.ArgumentParser) -> None:
 
 
 def plant_of(path: str, arguments: argparse.Namespace) -> Plant:
-    """Load a plant with the ports of --port. Raises ValueError for a mistake in either."""
+    """Load a plant, with the ports of --port. Raises ValueError for a mistake in the file or the options."""
     plant = load_plant(path)
     ports: dict[str, str] = {}
     for name, port in arguments.ports:
@@ -93,14 +93,14 @@ def plant_of(path: str, arguments: argparse.Namespace) -> Plant:
 
 
 def is_plant(word: str) -> bool:
-    """Return True if a word in place of PORT is a plant file, by its suffix."""
+    """Return True if a word in place of PORT names a plant file; only its suffix counts."""
     return "://" not in word and word.lower().endswith(".toml")
 
 
 def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", kind: str = "line") -> None:
-    """Add PORT, or PLANT.toml and the name of a line, which is optional if the plant has one line.
+    """Add PORT, or PLANT.toml and the name of a line, which is optional if the plant has only one.
 
-    `name` is the second argument's name in the help, and `kind` the kinds of things it may name.
+    `name` is the second argument's name in the help, and `kind` is what it may name, such as "line or drive".
     """
     ways = [f"{parser.prog} PORT [options]", f"{parser.prog} PLANT.toml [{name}] [options]"]
     parser.usage = "\n       ".join(ways)
@@ -132,9 +132,9 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[RS485, float]:
-    """Return RS-485 mode and pause in s after opening: the line's, or those of a port without a plant file.
+    """Return the RS-485 mode and the pause in s after opening: the line's, or the options' without a plant.
 
-    Raises ValueError for an invalid mode or pause, and for options beside a plant file.
+    Raises ValueError for an invalid mode or pause, and if these options are given with a plant file.
     """
     if line is None:
         rs485 = RS485(arguments.rs485 or "off")
@@ -147,9 +147,9 @@ def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[R
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:
-    """Return the plant if a plant file is given in place of PORT; None for a port.
+    """Return the plant if a plant file is given in place of PORT; None if a port is given.
 
-    Raises ValueError for mistakes in the plant file, and for a plant's arguments beside a port.
+    Raises ValueError for mistakes in the plant file, and for a plant's options with a port.
     """
     if arguments.port is None:
         raise ValueError(
@@ -168,7 +168,7 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
 
 
 def line_of(plant: Plant, name: str | None) -> PlantLine:
-    """Return the line of this name, or a plant's only line. Raises ValueError."""
+    """Return the line of this name; without a name, the plant's only line. Raises ValueError."""
     if name is not None:
         return plant.find_line(name)
     if len(plant.lines) > 1:
@@ -178,7 +178,7 @@ def line_of(plant: Plant, name: str | None) -> PlantLine:
 
 
 def usual_settings(line: PlantLine | None) -> Settings:
-    """Return the settings of most of a line's drives; 9600 8N1 without a line."""
+    """Return the settings that most of a line's drives have; 9600 8N1 without a line."""
     found = [polled.drive.settings for polled in line.drives] if line else []
     return max(found, key=found.count) if found else Settings(9600, "8N1")
 
@@ -194,12 +194,15 @@ _HEX = re.compile("0[xX][0-9A-Fa-f]+")
 _BY_PORT = ("PORT", "MODEL", "ADDRESS")
 _BY_PLANT = ("PLANT.toml", "DRIVE")
 _STOPS_AND_LOOKS = ("read", "state", "stop", "coast", "emergency-stop")
-_SETTINGS = ("baudrate", "format", "framing")  # options for a drive without a plant file
+_SETTINGS = ("baudrate", "format", "framing")  # options only for a drive that is given without a plant file
 
 
 @dataclass(frozen=True)
 class Target:
-    """A drive, its port, the words that name both on a command line, and its family's name there."""
+    """A drive and its port, as given on the command line.
+
+    `words` are the words that name both there, and `model` is the family's name there.
+    """
 
     drive: Drive
     port: str
@@ -210,14 +213,14 @@ class Target:
     model: str
 
     def open_bus(self, audit: Path | str | None = None) -> Bus:
-        """Open the drive's line, with the drive alone on it. Raises LineError."""
+        """Open the drive's port, and return a bus with only this drive. Raises LineError."""
         bus = Bus(self.port, echo=self.echo, rs485=self.rs485, settle=self.settle, audit=audit)
         bus.attach(self.drive)
         return bus
 
 
 def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None:
-    """Add the two ways to name a drive, and `further` arguments behind them, such as "[REGISTER ...]"."""
+    """Add the two ways to name a drive, and `further` arguments after them, such as "[REGISTER ...]"."""
     ways = [" ".join((parser.prog, *way, *further, "[options]")) for way in (_BY_PORT, _BY_PLANT)]
     parser.usage = "\n       ".join(ways)
     parser.add_argument(
@@ -252,7 +255,7 @@ def add_target_arguments(parser: argparse.ArgumentParser, *further: str) -> None
 
 
 def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the named drive, and the words behind it.
+    """Return the named drive, and the words after it.
 
     Raises ValueError for missing words, and for mistakes in the plant file or the drive's options.
     """
@@ -266,7 +269,7 @@ def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 
 
 def check_words(arguments: argparse.Namespace, words: Sequence[str], names: Sequence[str]) -> None:
-    """Raise ValueError unless there is one word for each name."""
+    """Raise ValueError unless the number of words equals the number of names."""
     if missing := names[len(words) :]:
         raise _mistaken(arguments, f"the following arguments are required: {', '.join(missing)}")
     if words[len(names) :]:
@@ -274,7 +277,7 @@ def check_words(arguments: argparse.Namespace, words: Sequence[str], names: Sequ
 
 
 def number_of(arguments: argparse.Namespace, name: str, text: str) -> float:
-    """Return the number that a word is. Raises ValueError."""
+    """Return the number that a word contains. Raises ValueError if it is not a number."""
     try:
         return plain_number(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The plant of the demos: three simulated lines, and an operator who runs their motors."""
+"""The plant of the demos: three simulated lines, and a simulated operator who runs their motors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from multidrop.drive.state import Condition
 from multidrop.errors import BusError
 from multidrop.families.registry import find_model
 
-LINES = {  # drives by line: name, model, framing
+LINES = {  # by line: name, model and framing of its drives
     "pumps": (
         ("pump-1", "erman-er-g-220", "rtu"),
         ("pump-2", "erman-er-g-220", "rtu"),
@@ -49,24 +49,24 @@ LINES = {  # drives by line: name, model, framing
 }
 DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
-POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line has time for two requests at 9600 bit/s
-SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings that explain terminals
+POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line at 9600 bit/s has time for two requests
+SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings of terminals, polled slowly
 EVERY, SLOW = "450 ms", "2 s"
 MAXIMUM_HZ = 50
-TROUBLE = {  # faults of single drives
+TROUBLE = {  # faults that some drives simulate
     "fan-1": 'trip = "30 s"\nfirst = "3 s"',
     "belt-5": 'trip = "50 s"',
     "belt-6": 'silence = "40 s"\nsilent_for = "3 s"\nfirst = "2 s"',
     "pump-2": 'silence = "70 s"',
     "fan-3": "loss = 0.02",
 }
-DRIFT = 0.25  # of every load
-STEP_S = 0.8  # between two looks of the operator at a drive of each line
-CALM = 3  # of so many looks at a running motor, one changes its setpoint
+DRIFT = 0.25  # share by which every load varies
+STEP_S = 0.8  # pause before the operator turns to the next drive of a line
+CALM = 3  # the operator changes the setpoint at one of this many visits to a running motor
 
 
 def demo_files(folder: Path) -> tuple[Path, Path]:
-    """Write the plant file and the faults' file into a folder; return their paths."""
+    """Write a plant file and a file of simulated faults into a folder; return their paths."""
     plant, faults = folder / "demo.toml", folder / "faults.toml"
     plant.write_text("\n".join(_plant_tables(folder)), "utf-8")
     tables = (f"[drive.{name}]\ndrift = {DRIFT}\n{TROUBLE.get(name, '')}\n" for name in DRIVES)
@@ -89,7 +89,7 @@ def _plant_tables(folder: Path) -> Iterator[str]:
 
 
 def _polled(family: type[Drive]) -> Iterator[str]:
-    """Yield entries of `poll`: registers whose values have a name or a unit, as a column needs."""
+    """Yield entries of `poll`: the registers whose values have a name or a unit."""
     wanted = POLLED_OF.get(family.model, POLLED)
     found = [family.registers[name] for name in wanted if name in family.registers]
     yield from (f'"{one.name}"' for one in found if one.step is not None or one.values is not None)
@@ -107,9 +107,9 @@ def _port(link: Path) -> str:
 
 
 class Operator:
-    """Runs motors during a `with` block: starts them, changes setpoints, resets trips.
+    """Runs motors while its `with` block is active: starts them, changes setpoints, resets trips.
 
-    A motor that another user has stopped stays stopped.
+    A motor that a user has stopped stays stopped.
     """
 
     def __init__(self, buses: Iterable[Bus]) -> None:
@@ -122,7 +122,7 @@ class Operator:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Send no further command. One in progress ends when the poller closes its port."""
+        """Send no further commands. A command in progress ends when the poller closes its port."""
         self._is_over.set()
 
     def _work(self, bus: Bus) -> None:
@@ -136,7 +136,7 @@ class Operator:
                 self._attempt(_look_after, drive)
 
     def _attempt(self, command: Callable[[Drive], None], drive: Drive) -> None:
-        # A drive may be silent, or tripped, or too slow on a busy machine: it gets its next turn later.
+        # A drive may be silent, tripped, or too slow on a busy machine. Its next turn comes later.
         if not self._is_over.is_set():
             with suppress(BusError):
                 command(drive)
@@ -148,7 +148,7 @@ def _start(drive: Any) -> None:
 
 
 def _look_after(drive: Any) -> None:
-    """Reset a trip, start a motor at rest, or change a setpoint."""
+    """Reset the drive's trip, start its stopped motor, or sometimes change its setpoint."""
     condition = drive.state().condition
     if condition is Condition.FAULT:
         drive.reset_fault()
@@ -161,14 +161,15 @@ def _look_after(drive: Any) -> None:
 
 @contextmanager
 def simulator(plant: Path, ports: Path, faults: Path | None = None) -> Iterator[None]:
-    """Simulate in a child process, so that simulator and poller do not share an interpreter."""
+    """Simulate the plant in a child process, so that simulator and poller do not share an interpreter."""
     words = [sys.executable, "-X", "utf8", "-m", __name__, str(plant)]
     if hasattr(os, "openpty"):
         words += ["--ports", str(ports)]
     if faults is not None:
         words += ["--faults", str(faults)]
     pipe = subprocess.PIPE
-    # A session of its own (on Windows a group) shields the child from Ctrl-C: it must outlive the polling.
+    # Ctrl-C must not reach the child, which must run longer than the polling. So it gets its own session, or
+    # on Windows its own process group.
     apart: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
         apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
@@ -184,7 +185,7 @@ def simulator(plant: Path, ports: Path, faults: Path | None = None) -> Iterator[
 
 
 def simulate(words: Sequence[str]) -> int:
-    """Simulate until standard input ends, which happens when the parent process ends."""
+    """Simulate until standard input is closed, which also happens when the parent process ends."""
 
     def end_with_parent() -> None:
         os.read(0, 1)

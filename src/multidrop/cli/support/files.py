@@ -1,4 +1,4 @@
-"""Files that commands read or create, and optional libraries. No command replaces a file."""
+"""Files that commands read or create, and checks for optional libraries. No command replaces a file."""
 
 from __future__ import annotations
 
@@ -17,28 +17,34 @@ if TYPE_CHECKING:
 
 
 def refuse_overwriting(path: Path) -> None:
-    """Raise ValueError if there is a file at this path."""
+    """Raise ValueError if a file exists at this path."""
     if path.is_file():
         raise already_there(path)
 
 
 def check_writable(path: Path) -> None:
-    """Raise ValueError or OSError if no new file can be written there, by creating and removing one."""
+    """Raise ValueError or OSError if no new file can be written at this path.
+
+    The check creates a file and removes it.
+    """
     refuse_overwriting(path)
-    if path.exists() and not path.is_dir():  # a device or a pipe
+    if path.exists() and not path.is_dir():  # a device or a pipe can be written without being created
         return
     new_file(path).close()
     path.unlink()
 
 
 def write_new(path: Path, content: str | bytes) -> None:
-    """Write a whole new file, or leave none. Raises ValueError if it exists, OSError if it does not fit."""
+    """Write a new file completely, or leave none.
+
+    Raises ValueError if the file exists, OSError if it cannot be written completely, as on a full disk.
+    """
     with writing(path):
         file = AppendFile(path)
         try:
             file.append(content.encode() if isinstance(content, str) else content)
         except BaseException:
-            if path.is_file():  # never remove a device
+            if path.is_file():  # do not remove a device
                 path.unlink()
             raise
         finally:
@@ -53,7 +59,7 @@ def check_capture(path: Path) -> None:
 
 
 def warn_truncated(path: Path, rows: int, left_out: int) -> None:
-    """Warn of a recording that ends with `left_out` bytes of an incomplete row."""
+    """Warn that a recording ends with `left_out` bytes of an incomplete row, after `rows` complete rows."""
     if left_out:
         warn(
             f"{path} ends within a row: {counted(rows, 'row')} read, "
@@ -62,7 +68,7 @@ def warn_truncated(path: Path, rows: int, left_out: int) -> None:
 
 
 def check_no_segments(path: Path) -> None:
-    """Raise ValueError if the path is a folder, or names the segments of a recording."""
+    """Raise ValueError if the path is a folder, or a pattern for the segments of a recording."""
     if path.is_dir():
         kept = [*sorted(path.glob("rows/*.parquet")), *sorted(path.glob("rows.*.arrows"))]
         if not kept:
@@ -80,14 +86,17 @@ def _is_folder(path: Path) -> ValueError:
 
 
 def beside(recording: Path, suffix: str) -> Path:
-    """Return a recording's path with another suffix. Raises ValueError for a path that names no file."""
+    """Return a recording's path with another suffix. Raises ValueError if the path does not name a file."""
     if not recording.name:
         raise _is_folder(recording)
     return recording.with_suffix(suffix)
 
 
 def load_recording(path: Path, out: Path, command: str) -> Recording:
-    """Load a recording for a command that draws it into the new file `out`."""
+    """Load a recording for a command that draws it into the new file `out`.
+
+    Raises ValueError if `out` exists, or if `path` is a folder or names segments.
+    """
     require_extra("matplotlib", "plot", command)
     refuse_overwriting(out)
     check_no_segments(path)
@@ -99,7 +108,7 @@ def load_recording(path: Path, out: Path, command: str) -> Recording:
 
 
 def require_extra(library: str, extra: str, command: str) -> None:
-    """Raise ValueError if the library is missing; the error has the command that installs it."""
+    """Raise ValueError if the library is missing. Its message has the command that installs the extra."""
     if importlib.util.find_spec(library) is None:
         raise ValueError(
             f"`multidrop {command}` needs {library}, which is not installed: {install_command(extra)}"

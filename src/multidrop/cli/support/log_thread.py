@@ -1,4 +1,4 @@
-"""A log that writes on its own thread, so that no stop waits for a halted terminal or a full pipe."""
+"""A log handler with its own thread, so that no stop waits for a halted terminal or a full pipe."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from typing import TextIO
 from multidrop.cli.support.output import logging_by
 from multidrop.printable import masked, printable
 
-MOST_WAITING = 10_000  # lines
-ENDING_S = 1.0  # how long `close` waits for the last lines
+MOST_WAITING = 10_000  # limit of the lines in the queue
+ENDING_S = 1.0  # time limit of `close` for the last lines
 
 
 class LogThread(logging.Handler):
-    """Writes records to a stream's file on its own thread; counts those that do not fit into the queue."""
+    """Writes log records to a stream in its own thread. Counts the records that do not fit into the queue."""
 
     def __init__(self, stream: TextIO, formatter: logging.Formatter) -> None:
         super().__init__()
         self.setFormatter(formatter)
         self._stream = self._file = stream
-        with suppress(OSError):  # a stream in memory has no file
-            # A duplicate: Python flushes `stream` at exit, and would wait for a halted one.
+        with suppress(OSError):  # a stream in memory has no file descriptor
+            # A duplicate descriptor, because at exit Python flushes `stream`, and would wait for a halted
+            # terminal.
             own = os.dup(stream.fileno())
             self._file = os.fdopen(own, "w", 1, encoding=stream.encoding, errors="backslashreplace")
         self._waiting: queue.Queue[str | None] = queue.Queue(MOST_WAITING)
@@ -38,21 +39,21 @@ class LogThread(logging.Handler):
         self._thread.start()
 
     def is_alive(self) -> bool:
-        """True while the thread that writes is running."""
+        """Return True while the writing thread is running."""
         return self._thread.is_alive()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue a record without waiting."""
+        """Queue a record without waiting; count it as lost if the queue is full."""
         try:
             self._waiting.put_nowait(self.format(record))
         except queue.Full:
             self._lost += 1
 
     def close(self) -> None:
-        """Wait up to ENDING_S for the last lines."""
+        """Stop the thread; wait up to ENDING_S for the last lines."""
         with suppress(queue.Full):
             self._waiting.put_nowait(None)
-        if self._thread.ident is not None:  # Ctrl-C may have come before its start
+        if self._thread.ident is not None:  # Ctrl-C may come before the thread's start
             self._thread.join(ENDING_S)
         super().close()
 
@@ -70,15 +71,15 @@ class LogThread(logging.Handler):
                 self._file.close()
 
     def _put(self, line: str) -> None:
-        with suppress(OSError, ValueError):  # a full disk, or a closed reader
+        with suppress(OSError, ValueError):  # the disk is full, or the reader is gone
             self._file.write(f"{line}\n")
 
 
-# ---- forms ----
+# ---- formats ----
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line."""
+    """Formats a record as one JSON object on one line."""
 
     def format(self, record: logging.LogRecord) -> str:
         found = {
@@ -93,7 +94,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Time, level and message on one line, escaped; a traceback below it."""
+    """Formats time, level and message on one escaped line, with any traceback below it."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = f"{_time(record)} {record.levelname.lower()} {printable(masked(record.getMessage()))}"
@@ -109,7 +110,7 @@ FORMATTERS = {"text": TextFormatter, "json": JsonFormatter}
 
 @contextmanager
 def logging_to_stderr(form: str, levels: Mapping[str, int]) -> Iterator[LogThread]:
-    """Write the loggers' messages, from the given levels up, to stderr."""
+    """While the context lasts, write these loggers' messages to stderr, from the given levels up."""
     log = LogThread(sys.stderr, FORMATTERS[form]())
     with logging_by(log, levels):
         yield log

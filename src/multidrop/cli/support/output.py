@@ -1,4 +1,4 @@
-"""Output on stdout and stderr: control characters are escaped, and passwords of URLs masked."""
+"""Output on stdout and stderr: control characters are escaped, and passwords in URLs are masked."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from multidrop.printable import masked, printable
 
 
 def spell_out_unencodable() -> None:
-    """Let stdout escape characters that its encoding lacks, as stderr does: pipes on Windows lack many."""
+    """Let stdout escape characters that its encoding lacks, as stderr does. Pipes on Windows lack many."""
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:
-    """Print the text; control characters except \\n are escaped."""
+    """Print the text. Control characters are escaped, except line feeds."""
     print("\n".join(map(printable, masked(str(text)).split("\n"))), file=file, flush=flush)
 
 
 def command_line(words: Sequence[str]) -> str:
-    """Return the words as a command line, quoted for this system's shell."""
+    """Return the words as one command, quoted for this system's shell."""
     if sys.platform == "win32":
         from subprocess import list2cmdline
 
@@ -36,7 +36,7 @@ def command_line(words: Sequence[str]) -> str:
 def warn(sentences: str) -> None:
     """Print each line on stderr, after the program's name.
 
-    A closed stderr is ignored: it must not prevent a stop.
+    A closed stderr is ignored, because it must not prevent a stop.
     """
     with suppress(OSError):
         for sentence in masked(sentences).splitlines():
@@ -54,14 +54,14 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def logging_to(show: Callable[[str], object], logger_name: str, level: int) -> Iterator[None]:
-    """Pass the messages of this logger, from this level up, to `show`."""
+    """While the context lasts, pass this logger's messages to `show`, from this level up."""
     with logging_by(_Handler(show, level), {logger_name: level}):
         yield
 
 
 @contextmanager
 def logging_by(handler: logging.Handler, levels: Mapping[str, int]) -> Iterator[None]:
-    """Pass the loggers' messages, from the given levels up, to a handler; close it at the end."""
+    """While the context lasts, pass these loggers' messages to a handler; close the handler at the end."""
     loggers = {logging.getLogger(name): level for name, level in levels.items()}
     before = {logger: logger.level for logger in loggers}
     for logger, level in loggers.items():

@@ -1,4 +1,4 @@
-"""A polled plant for commands: the session, the state that screens show, and side reads."""
+"""A polled plant for commands: the polling session, the state that screens show, and side reads."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from multidrop.transport.statistics import LineStatistics, Statistics, line_stat
 class PollingSession(NamedTuple):
     poller: Poller  # not started yet
     interruption: Interruption
-    hand_out: Callable[[], None]  # passes new rows to the recording and the consumers
+    hand_out: Callable[[], None]  # passes new rows to the recording and to all consumers
 
 
 class Rotation(NamedTuple):
-    """The splitting of a recording: seconds per segment, and the limits of age and size."""
+    """How a recording is split into segments: seconds per segment, and limits for all segments."""
 
     every: float
-    keep: float | None = None  # limit of age, in s
-    most: int | None = None  # limit of size, in bytes
+    keep: float | None = None  # limit of a segment's age, in s
+    most: int | None = None  # limit of all segments' size, in bytes
 
 
 def _open(out: Path, metadata: Metadata, rotation: Rotation | None) -> RecordingWriter:
@@ -55,11 +55,14 @@ def polling_session(
     *consumers: Callable[[Rows], None],
     rotation: Rotation | None = None,
 ) -> Iterator[PollingSession]:
-    """Open the plant's ports, then its recording; on leaving, record all rows and close both."""
+    """Open the plant's ports, then its recording, and yield the session.
+
+    On leaving, record all remaining rows, and close recording and ports.
+    """
     takers = list(consumers)
     with ExitStack() as stack:
         interruption = stack.enter_context(noting_signals())
-        poller = stack.enter_context(closing(Poller(plant)))  # first: without ports, create no recording
+        poller = stack.enter_context(closing(Poller(plant)))  # first: if it fails, no recording is created
         if out:
             takers.append(stack.enter_context(_open(out, plant.metadata(), rotation)).write)
 
@@ -75,13 +78,13 @@ def polling_session(
         try:
             yield PollingSession(poller, interruption, hand_out)
         finally:
-            hand_out()  # the last rows of the closing poller, also after a failure
+            hand_out()  # rows that the poller delivered while closing, also after a failure
 
 
 POINT_S = 0.25  # s between two points of a history
-HISTORY = 240  # points: the last minute
-RECENT = 5.0  # s over which rates are measured
-MISSED = 1.0  # s after which a value is old if the register was missed since
+HISTORY = 240  # number of points: the last minute
+RECENT = 5.0  # period in s over which rates are measured
+MISSED = 1.0  # a value is old if its register was missed, and the value is older than this, in s
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 
 _NOTHING = Statistics(1.0, Counters())
@@ -89,19 +92,19 @@ _NOTHING = Statistics(1.0, Counters())
 
 @dataclass
 class LiveDrive:
-    """One polled drive."""
+    """A polled drive: its newest values, its misses, its statistics and a history."""
 
     line: PlantLine
     polled: PolledDrive
-    cycle: float = 0.0  # s, of its line, as planned
-    line_utilisation: float = 1.0  # as planned; from 1 on, the polls leave no spare time
-    newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
-    missed: dict[str, Row] = field(default_factory=dict)  # misses newer than the register's sample
-    last_miss: str = ""  # status of the last missed value whose request was sent
+    cycle: float = 0.0  # planned cycle time of its line, in s
+    line_utilisation: float = 1.0  # planned; at 1 or more, polling leaves no spare time
+    newest: dict[str, Row] = field(default_factory=dict)  # newest sample by register
+    missed: dict[str, Row] = field(default_factory=dict)  # misses that are newer than the register's sample
+    last_miss: str = ""  # status of the last miss whose request was sent
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
-    points: int = 0  # ever added to the history
+    points: int = 0  # number of points ever added to the history
 
     def __post_init__(self) -> None:
         self._reader = StateReader(self.polled.drive)
@@ -127,7 +130,7 @@ class LiveDrive:
         return value_text(self.polled.drive.register(name), row.value)
 
     def age(self, now_ns: int) -> float | None:
-        """Return the seconds since the newest sample."""
+        """Return how old the newest sample is, in s; None if there is none."""
         newest = max((row.time_ns for row in self.newest.values()), default=None)
         return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
 
@@ -140,7 +143,7 @@ class LiveDrive:
 
     @property
     def why_silent(self) -> str:
-        """Return the reason for the misses if every polled register is missed, else ""."""
+        """If every polled register is missed, return why; else ""."""
         if not self.missed or len(self.missed) < len(self.polled.polls):
             return ""
         return self.last_miss or max(self.missed.values(), key=lambda row: row.time_ns).status
@@ -152,7 +155,7 @@ class LiveDrive:
 
     @property
     def state_register(self) -> str:
-        """Return the register that shows the state; "" if the drive is silent."""
+        """Return the name of the register that shows the state; "" if the drive is silent."""
         if self.why_silent:
             return ""
         if self.fault:
@@ -162,7 +165,7 @@ class LiveDrive:
 
     @property
     def state(self) -> str:
-        """Return the state as far as the polled registers show it."""
+        """Return the drive's state in a word, as far as the polled registers show it."""
         register = self.state_register
         if register in (STATE, FREQUENCY) and (known := self._known_state()):
             return known
@@ -171,10 +174,10 @@ class LiveDrive:
         if register != FREQUENCY:
             return "fault" if register else "silent"
         row = self.newest.get(FREQUENCY)
-        return "turns" if row and row.value else ""  # 0 Hz may be a stop, or a run at a setpoint of 0
+        return "turns" if row and row.value else ""  # 0 Hz may mean stopped, or running at a setpoint of 0
 
     def _known_state(self) -> str:
-        """Return the state by the family's own rules; "" if they need more than is polled."""
+        """Return the state by the family's own rules; "" if these need registers that are not polled."""
         values = {name: row.value for name, row in self.newest.items() if name not in self.missed}
         state = self._reader.state({name: value for name, value in values.items() if value is not None})
         if state is None or state.condition is Condition.UNKNOWN:
@@ -183,12 +186,12 @@ class LiveDrive:
         return "reverse" if is_reverse else state.condition.value
 
     def _is_bare(self, row: Row) -> bool:
-        """Return True for flags without a set bit, which name no state."""
+        """Return True for a register of flags without a set flag, which names no state."""
         values = self.polled.drive.register(row.register).values
         return not row.value and values is not None and issubclass(values, Flag)
 
     def remember(self) -> None:
-        """Add a point of history: the frequency if it is polled, else the first polled register."""
+        """Add a point to the history: the frequency's value if it is polled, else the first register's."""
         polled = [poll.register.name for poll in self.polled.polls]
         name = FREQUENCY if FREQUENCY in polled else next(iter(polled), "")
         fresh = name in self.newest and name not in self.missed
@@ -199,8 +202,8 @@ class LiveDrive:
 class LivePlant:
     """All drives of a plant, and the statistics of its lines: so far, and of the last RECENT seconds.
 
-    Rows, statistics and times are arguments; the class reads no clock. A screen that marks old values passes
-    `plant.metadata()["planned"]` as `planned`.
+    Rows, statistics and times are arguments, so the class reads no clock. A screen that marks old values
+    passes `plant.metadata()["planned"]` as `planned`.
     """
 
     def __init__(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
@@ -220,7 +223,7 @@ class LivePlant:
             self._by_name[row.drive].add(row)
 
     def tick(self, now: float, statistics: dict[str, LineStatistics]) -> None:
-        """Take the poller's statistics; call this once a second."""
+        """Take the poller's statistics at the time `now`, in s. Call this once a second."""
         self._earlier.append((now, statistics))
         while now - self._earlier[0][0] > RECENT:
             self._earlier.popleft()
@@ -233,28 +236,28 @@ class LivePlant:
             drive.recent = self.recent[drive.line.name].drives[drive.name]
 
     def remember(self) -> None:
-        """Add a point to each drive's history; call this every POINT_S."""
+        """Add a point to each drive's history. Call this every POINT_S."""
         for drive in self.drives:
             drive.remember()
 
 
 # ---- side reads ----
 
-LEAST_PAUSE_S = 0.1  # between two reads
-MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # of a line's time: if it has spare time, and if it is full
+LEAST_PAUSE_S = 0.1  # least pause between two reads
+MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # share of a line's time: with spare time, and on a full line
 
 
 class SideRead(NamedTuple):
-    """One read of a register: its value as text, or why there is none."""
+    """One read of a register: its value as text, or why it has none."""
 
     text: str
-    time: int  # of the end of the read, UTC in ns
+    time: int  # end of the read, UTC in ns
 
 
 class SideReader:
-    """Reads one drive's unpolled registers, one after another, in its own thread.
+    """Reads a drive's registers that are not polled, one after another, in its own thread.
 
-    The reads take at most MOST_SHARE of the line's time, on a full line LEAST_SHARE.
+    The reads take at most MOST_SHARE of the line's time, or LEAST_SHARE if the line has no spare time.
     """
 
     def __init__(self, poller: Poller) -> None:
@@ -264,7 +267,7 @@ class SideReader:
         self._thread: threading.Thread | None = None
 
     def read(self, drive: LiveDrive) -> dict[str, SideRead]:
-        """Return the values so far, by register, and continue reading."""
+        """Return the values that were read so far, by register, and continue to read this drive."""
         if self._drive is not drive:
             self._drive, self._found = drive, {}
         if self._thread is None or not self._thread.is_alive():
@@ -294,7 +297,7 @@ class SideReader:
 
 
 def pause_s(read_s: float, utilisation: float) -> float:
-    """Return the pause in s after a read that took `read_s` on a line with this utilisation."""
+    """Return the pause in s after a read that took `read_s` on a line with this planned utilisation."""
     share = min(MOST_SHARE, max(LEAST_SHARE, 1.0 - utilisation))
     return max(LEAST_PAUSE_S, read_s * (1.0 / share - 1.0))
 

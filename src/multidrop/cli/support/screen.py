@@ -1,4 +1,4 @@
-"""Full-screen pictures on a terminal: styled lines of text, drawn over each other."""
+"""Full-screen pictures on a terminal: styled lines of text, each picture drawn over the previous one."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from multidrop.printable import printable
 
 COLOURS = {"red": "31", "yellow": "33", "white": "37", "on-red": "41"}
 ATTRIBUTES = {"bold": "1", "dim": "2", "underline": "4", "reverse": "7"}
-_OPEN, _CLOSE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # alternate screen, cursor hidden
+_OPEN, _CLOSE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # enter and leave the alternate screen
 _HOME = "\x1b[H"
 
 
 class TextLine(NamedTuple):
-    """One line of a picture."""
+    """A line of text in a picture."""
 
     plain: str = ""
-    style: str = ""  # names of COLOURS and ATTRIBUTES, separated by spaces
+    style: str = ""  # names from COLOURS and ATTRIBUTES, separated by spaces
 
 
 def cut(text: str, width: int) -> str:
-    """Cut a text to a width in columns, without control characters; a ~ marks the cut."""
+    """Cut a text to a width in columns, and remove control characters. A ~ marks the cut."""
     return cut_to(printable(text), width)
 
 
@@ -36,9 +36,9 @@ def filled(text: str, width: int) -> str:
 
 
 class Screen:
-    """A terminal that shows one picture at a time. In a `with` block its former content is kept.
+    """A terminal that shows one picture at a time. After its `with` block, the former content is shown again.
 
-    A terminal without cursor control scrolls: each picture is printed below the previous one.
+    On a terminal without cursor control, each picture is printed below the previous one.
     """
 
     def __init__(self, terminal: TextIO | None = None) -> None:
@@ -50,7 +50,7 @@ class Screen:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Columns and lines of a picture. If it scrolls, the last line of the terminal stays empty."""
+        """Return the columns and lines of a picture. If it scrolls, the terminal's last line stays empty."""
         width, height = shutil.get_terminal_size()
         return width, height - self.scrolls
 
@@ -64,7 +64,7 @@ class Screen:
         self._write("" if self.scrolls else _CLOSE)
 
     def draw(self, lines: Sequence[TextLine]) -> None:
-        """Show the lines, of which each fits the width."""
+        """Show these lines; each must fit the terminal's width."""
         if self.scrolls:
             self._write("".join(f"{self.encodable(line.plain)}\n" for line in lines))
         else:
@@ -80,7 +80,7 @@ class Screen:
     def encodable(self, text: str) -> str:
         """Return the text with a ? for each column of a character that the terminal's encoding lacks.
 
-        An escape instead would be longer, and would move every column behind it.
+        An escape would be longer than the character, and would move all columns after it.
         """
         try:
             text.encode(self._encoding)

@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 @contextmanager
 def handling(handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals) -> Iterator[None]:
-    """Call `handler` for these signals. Outside the main thread this has no effect."""
+    """While the context lasts, call `handler` for these signals. Outside the main thread, do nothing."""
     try:
         before = {number: signal.signal(number, handler) for number in numbers}
     except ValueError:
@@ -35,7 +35,7 @@ def handling(handler: Callable[[int, FrameType | None], object], *numbers: signa
 
 
 def _hangup() -> tuple[signal.Signals, ...]:
-    """Return SIGHUP, or () if the system has none or nohup ignores it."""
+    """Return SIGHUP in a tuple; () if the system has no SIGHUP, or nohup ignores it."""
     if sys.platform == "win32" or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
         return ()
     return (signal.SIGHUP,)
@@ -43,12 +43,12 @@ def _hangup() -> tuple[signal.Signals, ...]:
 
 @contextmanager
 def end_signals_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGTERM too, and on the first SIGHUP."""
+    """While the context lasts, raise KeyboardInterrupt on SIGTERM too, and on the first SIGHUP."""
     is_closed = False
 
     def close(number: int, frame: FrameType | None) -> None:
         nonlocal is_closed
-        if not is_closed:  # several may come: a shell and the system send one each
+        if not is_closed:  # further ones are ignored: a shell and the system may send one each
             is_closed = True
             raise KeyboardInterrupt
 
@@ -57,11 +57,11 @@ def end_signals_interrupt() -> Iterator[None]:
 
 
 class Interruption:
-    """The first signal sets `came`; the second one raises KeyboardInterrupt. No SIGHUP does."""
+    """Notes end signals: the first sets `came`. A second SIGINT or SIGTERM raises KeyboardInterrupt."""
 
     def __init__(self) -> None:
         self.came = False
-        self._is_asked = False  # SIGINT or SIGTERM came: the next one interrupts
+        self._is_asked = False  # True after SIGINT or SIGTERM: the next one raises
 
     def note(self, number: int, frame: FrameType | None) -> None:
         if self._is_asked:
@@ -74,14 +74,14 @@ class Interruption:
 
 @contextmanager
 def outliving_the_terminal() -> Iterator[None]:
-    """Continue after the terminal is closed: a stop is repeated until it is done."""
+    """While the context lasts, ignore SIGHUP, so that a stop is repeated until it is done."""
     with handling(lambda number, frame: None, *_hangup()):
         yield
 
 
 @contextmanager
 def noting_signals() -> Iterator[Interruption]:
-    """Note the first SIGINT or SIGTERM, and each SIGHUP, instead of raising KeyboardInterrupt."""
+    """While the context lasts, note the first SIGINT or SIGTERM, and each SIGHUP, without raising."""
     interruption = Interruption()
     with (
         handling(interruption.note, signal.SIGINT, signal.SIGTERM),
@@ -91,9 +91,9 @@ def noting_signals() -> Iterator[Interruption]:
 
 
 def on_end_signals(end: Callable[[], object]) -> None:
-    """Call `end` in the running asyncio loop, once, at the first SIGINT, SIGTERM or SIGHUP.
+    """Call `end` in the running asyncio loop at the first SIGINT, SIGTERM or SIGHUP, and only once.
 
-    A second SIGINT or SIGTERM cancels this task, and a third raises KeyboardInterrupt.
+    A second SIGINT or SIGTERM cancels the present task, and a third one raises KeyboardInterrupt.
     """
     import asyncio
 
@@ -127,7 +127,7 @@ def on_end_signals(end: Callable[[], object]) -> None:
 
 
 def run_loop(work: Coroutine[Any, Any, T]) -> T:
-    """Run the work as `asyncio.run` does; if a signal cancels it, raise KeyboardInterrupt."""
+    """Run a coroutine as `asyncio.run` does. If a signal cancels it, raise KeyboardInterrupt."""
     import asyncio
 
     try:
@@ -138,9 +138,9 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
 
 @contextmanager
 def end_signals_cancel() -> Iterator[None]:
-    """Cancel the running asyncio task at the first end signal, then raise KeyboardInterrupt.
+    """Cancel the running asyncio task at the first end signal, and then raise KeyboardInterrupt.
 
-    An exception raised inside a task, such as a library's, could leave other tasks waiting for ever.
+    An exception raised directly inside a task, such as a library's, could leave other tasks waiting forever.
     """
     import asyncio
 
@@ -153,9 +153,9 @@ def end_signals_cancel() -> Iterator[None]:
 
 
 def on_reload_signal(reload: Callable[[], object], end: Callable[[], object]) -> None:
-    """Call `reload` in the running asyncio loop at each SIGHUP, or `end` if the terminal was closed.
+    """Call `reload` in the running asyncio loop at each SIGHUP, or `end` if SIGHUP means a closed terminal.
 
-    In the background, and under nohup, a closed terminal does not matter. Windows has no SIGHUP.
+    For a process in the background or under nohup, SIGHUP always means a reload. Windows has no SIGHUP.
     """
     if sys.platform == "win32":
         return

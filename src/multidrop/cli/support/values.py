@@ -1,4 +1,4 @@
-"""Register values as text and as JSON, and text in aligned columns and wrapped lines."""
+"""Register values as text and as JSON; text in aligned columns and in wrapped lines."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from multidrop.drive.register import Register, unnamed_bits
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
 WIDTH = 80  # characters of a line
-LONGEST_NAME = 24  # columns; keeps tables within a terminal
+LONGEST_NAME = 24  # in columns; longer names are shortened so that tables fit a terminal
 _PRECISIONS = {NumberFormat.F16: "half", NumberFormat.F32: "single", NumberFormat.F64: "double"}
 
 
 def aligned(rows: Iterable[Row], alignment: str, between: str = "  ") -> list[str]:
-    """Return one line per row with aligned columns; `alignment` has < or > for each column."""
+    """Return one line of text per row, with aligned columns; `alignment` has < or > for each column."""
     rows = list(rows)
     widths = [max(map(columns_of, column), default=0) for column in zip(*rows, strict=True)]
     return [between.join(map(padded, row, alignment, widths)).rstrip() for row in rows]
 
 
 def columns_of(text: str) -> int:
-    """Return a text's width in terminal columns: some characters take two, and some none."""
+    """Return a text's width in terminal columns. Some characters take two columns, and some none."""
     return sum((not combining(mark)) + (east_asian_width(mark) in "WF") for mark in text)
 
 
 def padded(text: str, side: str, width: int) -> str:
-    """Pad a text to a width in columns; `side` is < for text on the left, > on the right."""
+    """Pad a text to a width in columns. With `side` "<" the text is on the left, with ">" on the right."""
     blank = " " * (width - columns_of(text))
     return text + blank if side == "<" else blank + text
 
 
 def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = True) -> list[str]:
-    """Wrap to WIDTH; `first` is put before the first line, `rest` before the others."""
+    """Wrap a text to WIDTH. `first` is put before the first line, `rest` before the others."""
     return textwrap.wrap(
         text,
         WIDTH,
@@ -51,31 +51,31 @@ def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = 
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Return the count with its noun, such as "1 drive" and "2 drives"; `many`: a plural without s."""
+    """Return a number with its noun, such as "1 drive" or "2 drives". `many` is an irregular plural."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
 
 
 def shortened(name: str) -> str:
-    """Shorten a long name by removing its middle, because names may differ at their ends."""
+    """Shorten a long name by removing its middle, because names often differ only at their ends."""
     if columns_of(name) <= LONGEST_NAME:
         return name
     return f"{_first(name, 12)}...{_first(name[::-1], LONGEST_NAME - 15)[::-1]}"
 
 
 def cut_to(text: str, columns: int) -> str:
-    """Cut a text to a width in columns; a ~ marks the cut."""
+    """Cut a text to a width in columns. A ~ marks the cut."""
     return text if columns_of(text) <= columns else f"{_first(text, columns - 1)}~"[: max(0, columns)]
 
 
 def _first(text: str, columns: int) -> str:
-    """Return the longest start of a text that fits."""
+    """Return the longest start of a text that fits into these columns."""
     return next(text[:n] for n in range(len(text), -1, -1) if columns_of(text[:n]) <= columns)
 
 
 def nearest_value(register: Register[T], value: T) -> T:
-    """Return the nearest value that the register can hold; warn if it differs.
+    """Return the nearest value that the register can hold, and warn if it differs from `value`.
 
-    Raises ValueError for a value outside the register's span.
+    Raises ValueError if `value` is outside the register's range.
     """
     nearest = register.decode(register.encode(value))
     if nearest != value and not (register.is_float and register.parse(_number(register, nearest)) == value):
@@ -88,7 +88,7 @@ def nearest_value(register: Register[T], value: T) -> T:
 
 
 def value_text(register: Register[Any], value: float) -> str:
-    """Return a recorded value as text: a name, a raw count, or a number with its unit."""
+    """Return a recorded value as text: its name, a raw count, or a number with its unit."""
     if register.values is not None:
         return register.format(register.decode(value))
     if register.step is None:
@@ -102,7 +102,7 @@ def _number(register: Register[Any], value: float) -> str:
 
 
 def as_row(register: Register[Any], value: Any) -> Row:
-    """Return name, value, and unit or a remark on the value."""
+    """Return a table row: the register's name, the value, and its unit or a remark."""
     if isinstance(value, Flag | IntEnum):
         return register.name, register.format(value), ""
     number, _, unit = register.format(value).partition(" ")
@@ -112,7 +112,10 @@ def as_row(register: Register[Any], value: Any) -> Row:
 
 
 def as_json(register: Register[Any], value: Any) -> dict[str, Any]:
-    """Return value and unit, or a name and its raw count. Without a scale, `value` is None."""
+    """Return the value as JSON: with its unit, or as a name with its raw count.
+
+    Without a known scale, `value` is None.
+    """
     if isinstance(value, Flag):
         return {"value": [*(member.name for member in value), *unnamed_bits(value)], "raw": value.value}
     if isinstance(value, IntEnum):

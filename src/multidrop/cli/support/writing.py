@@ -13,7 +13,7 @@ from multidrop.printable import printable
 
 
 def confirm(question: str, arguments: argparse.Namespace) -> None:
-    """Unless --yes was given, ask the user; raise WriteForbidden if the answer is not yes."""
+    """Ask the user, unless --yes was given. Raises WriteForbidden if the answer is not yes."""
     if arguments.yes:
         return
     if not sys.stdin.isatty():
@@ -27,19 +27,19 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
         interruption.add_note("nothing was sent")
         raise
     finally:
-        if not answer.endswith("\n"):  # end the question's line
+        if not answer.endswith("\n"):  # end the line of the question after end of input
             print(file=sys.stderr)
     if answer.strip().lower() not in ("y", "yes"):
         raise WriteForbidden("nothing was sent")
 
 
 def _drop_typed_input() -> None:
-    """Drop pending input: a "y" typed before the question does not answer it."""
+    """Drop pending input, so that a "y" typed before the question does not answer it."""
     if sys.platform == "win32":
         return
     import termios
 
-    with suppress(OSError, termios.error):  # not a terminal
+    with suppress(OSError, termios.error):  # stdin is not a terminal
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
 
 
@@ -47,8 +47,8 @@ def _drop_typed_input() -> None:
 def reporting_interruption(drive: Drive, command: str) -> Iterator[list[str]]:
     """On Ctrl-C, add notes about the requests sent so far, also while the port is being opened or closed.
 
-    Yields the list of notes, which at first says that no request was sent; the caller replaces its contents.
-    A failure that was being handled is added to the notes.
+    Yields the list of notes. At first it says that no request was sent; the caller replaces its contents. If
+    another failure was being handled when Ctrl-C came, that failure is added to the notes.
     """
     known = [f"{drive.name}: the {command} was not sent"]
     try:
