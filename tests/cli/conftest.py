@@ -1,4 +1,4 @@
-"""A plant whose line is simulated at the pace of a real one."""
+"""A plant whose line is simulated with the timing of a real one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from multidrop.sim import Simulator, Wire, simulated, wire
 
 @pytest.fixture
 def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A plant file with two drives; only the first is simulated. Replies come in one piece."""
+    """Yield a plant file with two drives, of which only the first is simulated.
+
+    Each reply arrives in one piece.
+    """
     monkeypatch.setattr(wire, "CHUNK", 1.0)
     port = tmp_path / "ports" / "hall-1"
     port.parent.mkdir()

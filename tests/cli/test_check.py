@@ -1,4 +1,4 @@
-"""`multidrop check` and other commands with a family file."""
+"""`multidrop check`, and other commands that are given a family file."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_check_lists_contents_gaps_and_refusals(run: Run, fan: Path) -> None:
     status, out, err = run("check", fan)
     shown = words(out)
     assert (status, err) == (0, "")
-    assert "000FH speed reading 1 rpm" in shown  # as it is sent: the manual counts from 1
+    assert "000FH speed reading 1 rpm" in shown  # 000FH is the address that is sent; the manual counts from 1
     assert "declared by its file, untested" in shown
     unknown, refused = shown.partition(" not known ")[2].split(" will be refused ")
     for told in (
@@ -67,20 +67,20 @@ def test_check_lists_contents_gaps_and_refusals(run: Run, fan: Path) -> None:
         assert told in refused
 
 
-def test_an_address_instead_of_a_file_is_one_sentence(run: Run) -> None:
+def test_check_refuses_an_address_in_place_of_a_file(run: Run) -> None:
     told = "http://10.0.0.7:8750 is an address, and no plant file; a gateway's page is for a browser: "
     for command in ("check", "plan", "poll", "simulate"):
         assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}open it there\n")
 
 
-def test_a_family_that_ships_as_a_file_is_checked_by_its_name(run: Run) -> None:
+def test_check_accepts_the_name_of_a_family_that_ships_as_a_file(run: Run) -> None:
     status, out, _ = run("check", "abb-acs355")
     assert status == 0
     assert "No mistake found in abb-acs355" in words(out)
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_an_unknown_file_name_gets_a_hint(run: Run, tmp_path: Path) -> None:
+def test_check_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> None:
     assert "see `multidrop models innovert-ibd`" in run("check", "innovert-ibd")[2]
     assert "did you mean abb-acs355" in run("check", "abb-acs35")[2]
     (tmp_path / "plant.toml").write_text('[[line]]\nname = "L"\n')
@@ -91,8 +91,8 @@ def test_an_unknown_file_name_gets_a_hint(run: Run, tmp_path: Path) -> None:
     ]
 
 
-def test_a_sheet_is_read_beside_the_manual(run: Run, tmp_path: Path) -> None:
-    """Bits by their numbers, words in hex, names apart from sentences; a watchdog only of what moves."""
+def test_a_sheet_writes_facts_as_the_manuals_do(run: Run, tmp_path: Path) -> None:
+    """Bits have numbers, registers have hex addresses; only a family with verbs has a watchdog."""
     _, out, _ = run("check", "abb-acs355")
     assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
     assert "only verbs write it, except 047EH, 047CH, 0476H" in words(out)
@@ -116,7 +116,7 @@ def test_check_prints_json(run: Run, fan: Path) -> None:
     assert ["identify", "how to recognise this device; read its name plate"] in found["not_known"]
 
 
-def test_all_mistakes_are_printed_with_status_1(run: Run, tmp_path: Path) -> None:
+def test_check_prints_all_mistakes_and_returns_1(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "fan.toml"
     path.write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
     status, out, err = run("check", path)
@@ -129,7 +129,7 @@ def test_all_mistakes_are_printed_with_status_1(run: Run, tmp_path: Path) -> Non
     assert (status, len(json.loads(out)["mistakes"])) == (1, 2)
 
 
-def test_models_says_that_a_file_is_not_tested(run: Run, tmp_path: Path) -> None:
+def test_models_warns_that_a_family_file_is_not_tested(run: Run, tmp_path: Path) -> None:
     path = write_meter(tmp_path)
     status, out, _ = run("models", path)
     assert status == 0
@@ -137,7 +137,7 @@ def test_models_says_that_a_file_is_not_tested(run: Run, tmp_path: Path) -> None
     assert json.loads(run("models", path, "--json")[1])["declared_in"] == "meter.toml"
 
 
-def test_a_model_s_file_with_mistakes_is_a_mistaken_call(run: Run, tmp_path: Path) -> None:
+def test_a_family_file_with_mistakes_makes_models_return_2(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "fan.toml"
     path.write_text("[family]\n")
     status, _, err = run("models", path)
@@ -146,8 +146,8 @@ def test_a_model_s_file_with_mistakes_is_a_mistaken_call(run: Run, tmp_path: Pat
     assert "'manual' is missing" in err
 
 
-def test_a_line_with_too_many_drives_is_warned_of(run: Run, tmp_path: Path) -> None:
-    """ERMAN, section 1: at most 31 devices, the drive included."""
+def test_check_warns_of_a_line_with_too_many_drives(run: Run, tmp_path: Path) -> None:
+    """The manual of ERMAN, section 1, allows at most 31 devices, including the drive itself."""
     plant = tmp_path / "plant.toml"
 
     def check(drives: int, *options: str) -> tuple[int, str, str]:
@@ -171,7 +171,7 @@ def test_a_line_with_too_many_drives_is_warned_of(run: Run, tmp_path: Path) -> N
     assert [name for name, _ in remarks] == ["line L"]
 
 
-def test_mistakes_of_a_family_file_are_reported_once(run: Run, tmp_path: Path) -> None:
+def test_mistakes_of_a_family_file_are_reported_once_for_all_drives(run: Run, tmp_path: Path) -> None:
     (tmp_path / "fan.toml").write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
     drives = "".join(f'[[line.drive]]\nname = "f{at}"\nmodel = "fan.toml"\naddress = {at}\n' for at in (1, 2))
     (tmp_path / "plant.toml").write_text(f'[[line]]\nname = "L"\nport = "/dev/null"\n{drives}')
@@ -182,7 +182,7 @@ def test_mistakes_of_a_family_file_are_reported_once(run: Run, tmp_path: Path) -
     assert all('plant.toml:4: line "L", drive "f1": ' in line for line in reported)
 
 
-def test_a_coil_needs_no_span(run: Run, tmp_path: Path) -> None:
+def test_a_coil_without_a_span_is_no_gap(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "io.toml"
     path.write_text(
         '[family]\ntitle = "IO"\nmanual = "v1"\n[setting]\nlamp = { at = "00001", place = "1" }\n'
@@ -194,7 +194,7 @@ def test_a_coil_needs_no_span(run: Run, tmp_path: Path) -> None:
     assert "together = { coil = 20 }" in " ".join(out.split())
 
 
-def test_two_files_of_one_name_are_not_scanned_for_at_once(run: Run, tmp_path: Path) -> None:
+def test_a_scan_with_two_family_files_of_one_name_is_refused(run: Run, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         write_meter(tmp_path / folder)

@@ -1,4 +1,4 @@
-"""The command line as a whole: help, exit statuses, error sentences; and `models`."""
+"""The command line as a whole: help, exit statuses and error sentences. Also `models`."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.registry import SHIPPED, find_model
 
 
-def test_help_lists_every_command(run: Run) -> None:
+def test_the_help_lists_every_command(run: Run) -> None:
     status, out, err = run("--help")
     assert (status, err) == (0, "")
     assert all(f"\n  {name} " in out for name in COMMANDS)
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_no_command_prints_the_help(run: Run) -> None:
+def test_without_a_command_the_help_is_printed(run: Run) -> None:
     assert run()[0] == 2
 
 
@@ -46,7 +46,7 @@ def test_every_command_has_help_within_80_columns(
 
 
 @pytest.mark.parametrize("name", ["read", "write", "state", "start"])
-def test_the_help_describes_each_argument(run: Run, name: str) -> None:
+def test_each_commands_help_describes_each_argument(run: Run, name: str) -> None:
     words = " ".join(run(name, "--help")[1].split())
     for word in ("PORT: a device", "MODEL: one of", "ADDRESS: the drive's", "PLANT.toml DRIVE: a plant file"):
         assert word in words
@@ -72,7 +72,7 @@ def test_the_help_names_the_defaults_of_options(run: Run, name: str, told: str) 
     assert told in " ".join(run(*name.split(), "--help")[1].split())
 
 
-def test_help_imports_no_command_and_nothing_heavy() -> None:
+def test_the_help_imports_no_command_and_no_large_library() -> None:
     code = (
         "import sys; before = {*sys.modules}; from multidrop.cli import main; main(['--help']); "
         "print(*({*sys.modules} - before))"
@@ -152,11 +152,11 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         ),
     ],
 )
-def test_a_mistake_is_a_sentence_and_status_2(run: Run, words: list[str], sentence: str) -> None:
+def test_a_mistaken_command_is_one_sentence_with_status_2(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_the_version_is_the_package_s(run: Run) -> None:
+def test_the_printed_version_is_the_packages(run: Run) -> None:
     assert run("--version") == (0, f"multidrop {version('multidrop')}\n", "")
 
 
@@ -167,13 +167,13 @@ def test_an_invalid_polling_time_is_one_sentence(run: Run, seconds: str) -> None
     assert f"argument --seconds: '{seconds}' is not a number of seconds above 0" in err
 
 
-def test_a_report_is_a_page_by_its_name(run: Run, tmp_path: Path) -> None:
+def test_a_reports_file_name_must_end_in_html(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.csv").touch()
     status, _, err = run("report", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
     assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name must end in .html\n")
 
 
-def test_a_line_name_with_a_slash_is_not_simulated(run: Run, tmp_path: Path) -> None:
+def test_a_line_with_a_slash_in_its_name_is_not_simulated(run: Run, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(
         '[[line]]\nname = "hall/1"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
@@ -185,7 +185,7 @@ def test_a_line_name_with_a_slash_is_not_simulated(run: Run, tmp_path: Path) -> 
     )
 
 
-def test_a_file_is_refused_as_directory_of_ports(run: Run, tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_directory_of_ports_is_refused(run: Run, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(
         '[[line]]\nname = "a"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
@@ -197,7 +197,7 @@ def test_a_file_is_refused_as_directory_of_ports(run: Run, tmp_path: Path) -> No
     )
 
 
-def test_a_ledger_that_is_named_must_be_there(
+def test_a_missing_ledger_file_is_reported_with_the_default_path(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
@@ -205,7 +205,7 @@ def test_a_ledger_that_is_named_must_be_there(
     assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_sheet_shows_addresses_without_wear(run: Run, tmp_path: Path) -> None:
+def test_a_sheet_shows_addresses_that_do_not_wear_eeprom(run: Run, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "from multidrop.families.invt_che import InvtCHE, parameter\n\n\n"
         'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
@@ -267,7 +267,7 @@ def test_a_sheet_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path)
         ),
     ],
 )
-def test_a_forbidden_write_is_a_sentence_with_status_1(run: Run, words: list[str], sentence: str) -> None:
+def test_a_forbidden_write_is_one_sentence_with_status_1(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -291,7 +291,7 @@ def test_a_forbidden_write_shows_the_command_to_type(run: Run, words: list[str],
     assert advice in err
 
 
-def test_advice_for_a_plant_s_drive_uses_its_command(run: Run, tmp_path: Path) -> None:
+def test_advice_for_a_drive_in_a_plant_refers_to_the_plant_file(run: Run, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(
         '[[line]]\nname = "hall"\nport = "/dev/ttyX"\n'
@@ -302,7 +302,7 @@ def test_advice_for_a_plant_s_drive_uses_its_command(run: Run, tmp_path: Path) -
     assert "P0.04: write maximum_frequency = HZ below its [[line.drive]]" in err
 
 
-def test_advice_for_a_program_becomes_a_command_s() -> None:
+def test_advice_for_programs_is_converted_for_the_command_line() -> None:
     reset = WriteForbidden(
         "x has a fault: remove its cause, then call reset_fault()", advice=Advice.call("reset_fault")
     )
@@ -315,8 +315,8 @@ def test_advice_for_a_program_becomes_a_command_s() -> None:
     assert WriteForbidden("use emergency_stop()").for_command_line() == "use emergency_stop()"
 
 
-def test_advice_is_part_of_its_sentence() -> None:
-    """Otherwise the command line could not replace its parts."""
+def test_each_advice_is_found_in_the_error_that_contains_it() -> None:
+    """Otherwise the command line could not replace it."""
     erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
     for script, command in (
@@ -336,7 +336,7 @@ def test_advice_is_part_of_its_sentence() -> None:
         ("/dev/null", "/dev/null: it is not a serial port"),
     ],
 )
-def test_a_port_that_fails_is_a_sentence_and_status_1(run: Run, port: str, sentence: str) -> None:
+def test_a_port_that_cannot_be_opened_is_one_sentence_with_status_1(run: Run, port: str, sentence: str) -> None:
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -346,13 +346,13 @@ def test_a_port_that_fails_is_a_sentence_and_status_1(run: Run, port: str, sente
 def test_models_lists_the_families(run: Run) -> None:
     status, out, _ = run("models")
     assert status == 0
-    lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]  # others go on with a title
+    lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]  # indented lines continue a title
     assert [line.split()[0] for line in lines] == [*MODELS, *SHIPPED]
     _, out, _ = run("models", "--json")
     assert [family["model"] for family in json.loads(out)] == [*MODELS, *SHIPPED]
 
 
-def test_a_family_s_sheet_has_every_fact(run: Run) -> None:
+def test_a_familys_sheet_has_every_fact(run: Run) -> None:
     _, out, _ = run("models", TOY)
     for line in (
         "addresses       1-31",
@@ -375,7 +375,7 @@ def test_a_family_s_sheet_has_every_fact(run: Run) -> None:
         assert any(shown.startswith(line) for shown in out.splitlines()), f"{line!r} is not in\n{out}"
 
 
-def test_a_family_s_json_has_every_register(run: Run) -> None:
+def test_a_familys_json_has_every_register(run: Run) -> None:
     _, out, _ = run("models", TOY, "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}
@@ -442,20 +442,20 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
     ],
 )
 def test_a_sheet_has_drive_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
-    """In a family's own words (section 3 of ERMAN's manual, 4.3 and 6.1 of the YD1000's notes)."""
+    """In the words of the family's manual (ERMAN, section 3; notes on the YD1000, 4.3 and 6.1)."""
     _, out, _ = run("models", name)
     shown = " ".join(out.split())
     assert [fact for fact in facts if fact not in shown] == []
     assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
 
 
-def test_a_family_s_json_has_the_limits_of_values(run: Run) -> None:
+def test_a_familys_json_has_the_limits_of_values(run: Run) -> None:
     _, out, _ = run("models", "yd1000", "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}
-    upper = by_name["upper_limit_frequency"]  # 0.5 to FH
+    upper = by_name["upper_limit_frequency"]  # from 0.5 Hz to the highest frequency FH
     assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
-    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # LL to UL
+    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # from the lower limit LL to the upper limit UL
     limits = {("minimum_frequency", "upper_limit_frequency")}
     assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
     assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]
@@ -497,7 +497,7 @@ Where the document errs or is silent, the safest reading is taken:
 - The example of function 06"""
 
 
-def test_a_sheet_leaves_indented_lines_of_notes_as_they_are(run: Run, tmp_path: Path) -> None:
+def test_a_sheet_keeps_indented_lines_of_notes(run: Run, tmp_path: Path) -> None:
     notes = "Two words:\n    0 off\n    1 on\n* one\n* two"
     docstring = f'"""Mine.\n\n{notes}"""'.replace("\n", "\n    ")
     (tmp_path / "mine.py").write_text(
@@ -516,8 +516,8 @@ def test_a_sheet_wraps_its_notes_as_paragraphs(run: Run) -> None:
 # ---- signals ----
 
 
-def test_a_thread_that_is_not_the_main_one_can_run_a_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """Signals are the main thread's business."""
+def test_a_command_can_run_in_a_thread_and_keeps_signal_handlers(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only the main thread can change signal handlers."""
     found: list[int] = []
     before = signal.getsignal(signal.SIGTERM)
     thread = threading.Thread(target=lambda: found.append(main(["models", TOY])))
@@ -540,7 +540,7 @@ def in_a_process(words: list[str]) -> list[str]:
 
 @pytest.mark.long
 @table("words", PRINTING)
-def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
+def test_output_on_a_full_disk_fails_with_one_sentence(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(in_a_process(words), stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (1, "multidrop: No space left on device\n")
@@ -548,7 +548,7 @@ def test_a_full_disk_under_the_output_is_a_sentence(words: list[str]) -> None:
 
 @pytest.mark.long
 @table("words", PRINTING)
-def test_a_closed_pipe_is_not_a_failure(words: list[str]) -> None:
+def test_output_into_a_closed_pipe_returns_0(words: list[str]) -> None:
     with BoundProcess(in_a_process(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
         assert command.stdout is not None
         command.stdout.close()
@@ -566,7 +566,7 @@ def test_a_closed_pipe_is_not_a_failure(words: list[str]) -> None:
         (2, ["models", "zzz"], 2),
     ],
 )
-def test_a_closed_standard_stream_is_not_a_failure(closed: int, words: list[str], status: int) -> None:
+def test_a_closed_standard_stream_causes_no_traceback(closed: int, words: list[str], status: int) -> None:
     done = subprocess.run(
         in_a_process(words), capture_output=True, text=True, preexec_fn=lambda: os.close(closed)
     )

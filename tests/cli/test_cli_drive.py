@@ -1,4 +1,4 @@
-"""Commands for one drive, against a simulated drive."""
+"""Commands for one drive, run against a simulated drive."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ DOG = "watchdog: The document names no watchdog: the motor runs on when the clie
 
 
 class Stubborn(SimulatedDrive):
-    """Limits acceleration times to 20 s, and does not report its fault."""
+    """A drive that limits acceleration times to 20 s, and refuses to report its fault."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         return min(raw, 200) if cell.name == "acceleration_time" else super().accept(cell, raw)
@@ -65,7 +65,7 @@ def toy() -> SimulatedDrive:
 
 @pytest.fixture
 def port(toy: SimulatedDrive) -> Iterator[str]:
-    """The port of a line with two drives, at the addresses 1 and 2."""
+    """Yield the port of a line with two drives, which have the addresses 1 and 2."""
     toy["output_frequency"] = 49.9
     toy["output_current"] = 3.25
     toy["mystery"] = 777
@@ -94,7 +94,7 @@ def test_read_prints_registers_in_the_given_order(run: Run, port: str) -> None:
     assert (status, out) == (0, "output_current    3.25  A\noutput_frequency  49.9  Hz\n")
 
 
-def test_read_as_json(run: Run, port: str) -> None:
+def test_read_prints_values_as_json(run: Run, port: str) -> None:
     _, out, _ = run("read", port, TOY, 1, "output_current", "mystery", "fault", "status", "--json")
     assert json.loads(out) == {
         "drive": "toy@1",
@@ -109,7 +109,7 @@ def test_read_as_json(run: Run, port: str) -> None:
     }
 
 
-def test_an_unnamed_number_is_shown_as_a_number(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_a_value_without_a_name_is_shown_as_a_number(run: Run, port: str, toy: SimulatedDrive) -> None:
     for cell in toy.memory.of(Toy.fault):
         cell.raw = 99
     assert run("read", port, TOY, 1, "fault")[1] == "fault  99  (no name in the manual)\n"
@@ -118,7 +118,7 @@ def test_an_unnamed_number_is_shown_as_a_number(run: Run, port: str, toy: Simula
     }
 
 
-def test_an_unnamed_bit_is_shown_by_its_number(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_a_bit_without_a_name_is_shown_by_its_number(run: Run, port: str, toy: SimulatedDrive) -> None:
     for cell in toy.memory.of(Toy.status):
         cell.raw = 0x1101
     assert run("read", port, TOY, 1, "status")[1] == "status  RUNNING, bit 8, bit 12\n"
@@ -152,7 +152,7 @@ class Mute(Drive):
 """
 
 
-def test_a_family_without_a_state_is_stopped(
+def test_a_family_that_cannot_read_its_state_is_stopped(
     run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
 ) -> None:
     (tmp_path / "mute.py").write_text(MUTE)
@@ -163,11 +163,11 @@ def test_a_family_without_a_state_is_stopped(
     assert out.startswith("mute@1: stop done; state: the family cannot say")
     assert json.loads(run(*words, "--json")[1])["state"] is None
     writes = [(write.address, write.raw) for write in toy.counters.writes]
-    assert len(writes) >= 2  # a busy machine may have a stop repeated
+    assert len(writes) >= 2  # the stop is repeated on a busy machine
     assert set(writes) == {(0x14, 0)}
 
 
-def test_write_prints_its_outcome_in_one_line(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_write_prints_its_outcome_on_one_line(run: Run, port: str, toy: SimulatedDrive) -> None:
     toy["status"] = Status(0)
     assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes") == (
         0,
@@ -192,7 +192,7 @@ def test_a_write_for_a_stopped_motor_is_refused_while_it_runs(
     assert toy["acceleration_time"] == 10.0
 
 
-def test_write_as_json(run: Run, port: str) -> None:
+def test_write_prints_its_outcome_as_json(run: Run, port: str) -> None:
     _, out, _ = run("write", port, TOY, 1, "frequency", "25", "--json", "--yes")
     assert json.loads(out) == {
         "drive": "toy@1",
@@ -214,7 +214,7 @@ def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
 def test_a_value_between_two_steps_is_rounded_with_a_warning(
     run: Run, port: str, toy: SimulatedDrive
 ) -> None:
-    """The rounded value is sent and reported."""
+    """The rounded value is sent, and is the one reported."""
     note = "multidrop: frequency has steps of 0.01 Hz: 12.345 becomes 12.34 Hz\n"
     assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
         0,
@@ -235,7 +235,7 @@ def test_a_value_between_two_steps_is_rounded_with_a_warning(
     assert f"{note}multidrop: Write frequency = 12.34 Hz to toy@1" in err
 
 
-def test_a_percentage_of_a_frequency_is_shown(run: Run) -> None:
+def test_a_setpoint_in_percent_is_shown_in_percent(run: Run) -> None:
     che = InvtCHE(1, maximum_frequency=50)
     with Simulator([Wire([simulated(che)], unpaced=True)]) as simulator:
         words = ("invt-che", 1, "12.3456", "--option", "maximum_frequency=50", "--yes")
@@ -244,7 +244,7 @@ def test_a_percentage_of_a_frequency_is_shown(run: Run) -> None:
     assert "set-frequency done at setpoint = 24.69 %;" in out
 
 
-def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_start_stop_and_set_frequency_write_to_the_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
     assert run("start", port, TOY, 1, "--direction", "reverse", "--yes") == (
         0,
         f"toy@1: start done; state: running; {DOG}\n",
@@ -253,13 +253,13 @@ def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None
     assert toy["control"] == 3
     assert run("set-frequency", port, TOY, 1, "33.5", "--yes")[0] == 0
     assert toy["frequency"] == 33.5
-    assert run("stop", port, TOY, 1)[0] == 0  # is never asked for
+    assert run("stop", port, TOY, 1)[0] == 0  # a stop needs no confirmation
     assert toy["control"] == 0
 
 
 @pytest.mark.slow
-def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> None:
-    """A command does not know what another one wrote."""
+def test_starting_a_drive_with_unreadable_setpoint_needs_a_frequency(run: Run) -> None:
+    """No command knows which setpoint another command has written."""
     with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
         words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
         sentence = "multidrop: innovert-ibd@1 cannot report its setpoint: add --frequency HZ\n"
@@ -275,7 +275,7 @@ def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDriv
 
 @patient
 @pytest.mark.parametrize(("answer", "writes"), [("y", 1), ("yes", 1), ("n", 0), ("", 0), ("start", 0)])
-def test_a_person_at_a_terminal_is_asked(
+def test_on_a_terminal_a_start_is_confirmed_or_not_sent(
     run: Run,
     port: str,
     toy: SimulatedDrive,
@@ -293,7 +293,7 @@ def test_a_person_at_a_terminal_is_asked(
 
 
 def test_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second "y" of an impatient person belongs to the question before."""
+    """The second "y" of an impatient user belongs to the previous question."""
     terminal, program = os.openpty()
 
     class Screen(io.StringIO):
@@ -304,14 +304,14 @@ def test_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.
 
     os.write(terminal, b"y\n")
     with os.fdopen(program) as keyboard, os.fdopen(terminal, "rb"):
-        assert select.select([keyboard], [], [], 10)[0]  # it is there
+        assert select.select([keyboard], [], [], 10)[0]  # the typed input has arrived
         monkeypatch.setattr("sys.stdin", keyboard)
         monkeypatch.setattr("sys.stderr", Screen())
         with pytest.raises(WriteForbidden, match="nothing was sent"):
             confirm("Start the motor of pump?", argparse.Namespace(yes=False))
 
 
-def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Path) -> None:
+def test_every_write_is_recorded_in_the_audit_log(run: Run, port: str, tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
     run("set-frequency", port, TOY, 1, 20, "--yes", "--audit", log)
     run("start", port, TOY, 1, "--yes", "--audit", log)
@@ -366,7 +366,7 @@ def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None
     status, out, err = run("write", port, TOY, 1, "acceleration_time", "13", "--yes")
     assert (status, out) == (1, "")
     assert "is written once in 60 s at most" in err
-    assert "no writes to EEPROM yet" in run("wear")[1]  # a simulated drive's EEPROM is none
+    assert "no writes to EEPROM yet" in run("wear")[1]  # writes to a simulated drive are not counted
     assert not ledger.Ledger().enter(
         ledger.LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0
     )
@@ -377,13 +377,13 @@ def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None
     assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
 
 
-def test_only_start_writes_to_a_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_state_and_read_write_nothing_to_the_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
     run("state", port, TOY, 1)
     run("read", port, TOY, 1)
     assert not toy.counters.writes
 
 
-def test_state_in_words_and_as_json(run: Run, port: str) -> None:
+def test_state_is_printed_in_words_and_as_json(run: Run, port: str) -> None:
     assert run("state", port, TOY, 1) == (0, f"running\n{DOG}\n", "")
     _, out, _ = run("state", port, TOY, 1, "--json")
     assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}
@@ -391,12 +391,12 @@ def test_state_in_words_and_as_json(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [(9,), (1, "--baudrate", 19200)], ids=["no drive", "wrong baud rate"])
-def test_silence_is_a_sentence_with_advice(run: Run, port: str, words: tuple[object, ...]) -> None:
+def test_a_silent_drive_is_reported_with_advice(run: Run, port: str, words: tuple[object, ...]) -> None:
     sentence = "does not answer: check its address, baud rate, format, wiring, and that it has power"
     assert run("read", port, TOY, *words, "status") == (1, "", f"multidrop: toy@{words[0]} {sentence}\n")
 
 
-def test_a_damaged_reply_is_a_sentence(run: Run, toy: SimulatedDrive) -> None:
+def test_a_damaged_reply_is_one_sentence(run: Run, toy: SimulatedDrive) -> None:
     wire = Faulty([toy], lambda reply: reply[:-1] + b"\0", unpaced=True)
     with Simulator([wire]):
         assert run("state", wire.path, TOY, 1) == (
@@ -406,7 +406,7 @@ def test_a_damaged_reply_is_a_sentence(run: Run, toy: SimulatedDrive) -> None:
         )
 
 
-def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
+def test_a_port_in_use_is_reported_and_a_stop_as_not_sent(run: Run, port: str) -> None:
     holder = (
         "import serial, sys; port = serial.Serial(sys.argv[1], exclusive=True);"
         "print('held', flush=True); sys.stdin.read()"
@@ -431,7 +431,7 @@ Che = tuple[ReceivedRequests, list[object]]
 
 @pytest.fixture
 def che() -> Iterator[Che]:
-    """Return the requests that a simulated CHE receives, and the arguments that select it."""
+    """Yield the requests that a simulated CHE receives, and the command-line words that name it."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
@@ -440,7 +440,7 @@ def che() -> Iterator[Che]:
 
 
 def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
-    """Ctrl-C, at the first request of this kind, whose reply is not lost."""
+    """Return a function that presses Ctrl-C at the first request of this kind, and loses no reply."""
     pressed: list[Message] = []
 
     def loses(request: Message) -> bool:
@@ -464,11 +464,11 @@ def test_an_interrupted_start_reports_requests_and_the_stop_command(run: Run, ch
 
 
 def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Press Ctrl-C when a bus is opened or closed."""
+    """Let Ctrl-C come when a bus is opened or closed."""
     carry_out = getattr(Bus, place)
 
     def pressed(*args: Any, **details: Any) -> None:
-        if place == "close":  # no file is left
+        if place == "close":  # close it first, so that no file stays open
             carry_out(*args, **details)
         raise KeyboardInterrupt
 
@@ -479,7 +479,7 @@ def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("place", "told"), [("__init__", "the start was not sent"), ("close", "start is done")]
 )
-def test_an_interruption_while_opening_or_closing_reports_requests(
+def test_ctrl_c_while_a_port_opens_or_closes_reports_the_start(
     run: Run, che: Che, monkeypatch: pytest.MonkeyPatch, place: str, told: str
 ) -> None:
     received, words = che
@@ -502,7 +502,7 @@ def test_an_interruption_while_opening_or_closing_reports_requests(
         ),
     ],
 )
-def test_a_write_interrupted_while_opening_or_closing_reports_requests(
+def test_ctrl_c_while_a_port_opens_or_closes_reports_the_write(
     run: Run,
     port: str,
     toy: SimulatedDrive,
@@ -519,15 +519,15 @@ def test_a_write_interrupted_while_opening_or_closing_reports_requests(
 
 
 @patient
-def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> None:
+def test_an_interrupted_stop_is_sent_once_more(run: Run, che: Che) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)
     received.loses = pressing(lambda request: request.start == 0x1000)
     status, _, err = run("stop", *words)
     assert status == 130
-    until(lambda: len(received.writes) >= begun + 3)  # the drive may hear it when the client has left
-    assert [write.data for write in received.writes[begun:]] == [b"\0\5", b"\0\5", b"\0\x08"]  # a jog's too
+    until(lambda: len(received.writes) >= begun + 3)  # the drive may receive it after the client has left
+    assert [write.data for write in received.writes[begun:]] == [b"\0\5", b"\0\5", b"\0\x08"]  # the last write stops a jog
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
 
@@ -536,7 +536,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> Non
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", usually("stop", "coast"))
-def test_a_stop_continues_after_its_terminal_is_closed(run: Run, che: Che, verb: str) -> None:
+def test_a_stop_continues_after_its_terminal_was_closed(run: Run, che: Che, verb: str) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)
@@ -550,7 +550,7 @@ def test_a_stop_continues_after_its_terminal_is_closed(run: Run, che: Che, verb:
 
     received.loses = loses
     with closing_terminal(verb, *words) as terminal:
-        assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it; its output is closed
+        assert terminal.process.wait(PATIENCE) >= 0  # it was not ended by a signal; its output is closed
     assert is_closed.is_set()
     assert len(received.writes) >= begun + 3
     assert received.starts == received.starts[:1]
@@ -566,7 +566,7 @@ def test_a_stop_continues_after_its_terminal_is_closed(run: Run, che: Che, verb:
         (["pump-2"], ["stop takes one drive, which is invt-che@1: ignored pump-2"]),
     ],
 )
-def test_a_mistake_beside_the_drive_does_not_prevent_a_stop(
+def test_a_mistake_after_the_drives_name_does_not_prevent_a_stop(
     run: Run, che: Che, mistake: list[str], told: list[str]
 ) -> None:
     received, words = che
@@ -577,12 +577,12 @@ def test_a_mistake_beside_the_drive_does_not_prevent_a_stop(
     assert "stop done" in out
     assert all(text in err for text in told)
     assert received.sim["status"] == 3
-    assert run("start", *words, "--yes", *mistake)[0] == 2  # and only the stop is sent
+    assert run("start", *words, "--yes", *mistake)[0] == 2  # other commands are not sent
     assert received.starts == received.starts[:1]
 
 
 @patient
-def test_the_value_of_an_unknown_option_is_not_a_drive(run: Run, che: Che) -> None:
+def test_the_value_of_an_unknown_option_is_not_taken_for_a_drive(run: Run, che: Che) -> None:
     received, (port, model, address, option) = che
     status, out, err = run("stop", port, model, "--secnds", 5, address, option)
     assert status == 2
@@ -597,10 +597,10 @@ def test_the_value_of_an_unknown_option_is_not_a_drive(run: Run, che: Che) -> No
 
 
 @patient
-def test_a_stop_whose_terminal_is_closed_before_it_begins_is_sent(
+def test_a_stop_is_sent_even_if_its_terminal_closes_while_it_starts(
     run: Run, che: Che, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its words are not read yet, which takes a small computer a while."""
+    """The arguments are not parsed yet, which takes a while on a small computer."""
 
     def parse(*words: Any) -> Any:
         signal.raise_signal(signal.SIGHUP)
@@ -623,14 +623,14 @@ def test_a_stop_whose_terminal_is_closed_before_it_begins_is_sent(
     "words",
     [["nowhere", "invt-che"], ["nowhere", "invt-che", "one"], ["nowhere", "invt-che", 1, "--baudrate"]],
 )
-def test_a_stop_without_a_known_drive_reports_that_it_was_not_sent(run: Run, words: list[object]) -> None:
+def test_a_stop_that_names_no_drive_is_reported_as_not_sent(run: Run, words: list[object]) -> None:
     status, _, err = run("emergency-stop", *words)
     assert status == 2
     assert err.startswith("multidrop: the emergency-stop was NOT sent: ")
 
 
 def plant_of(port: object, folder: Path) -> Path:
-    """Return a plant file with the CHE at this port."""
+    """Return a plant file with a CHE at this port."""
     plant = folder / "hall.toml"
     drive = '[[line.drive]]\nname = "pump"\nmodel = "invt-che"\naddress = 1\nmaximum_frequency = 50\n'
     plant.write_text(f'[[line]]\nname = "hall"\nport = "{port}"\n{drive}')
@@ -640,7 +640,7 @@ def plant_of(port: object, folder: Path) -> Path:
 @pytest.mark.long
 @patient
 @pytest.mark.parametrize("keys", usually(b"sy", b"Sy"))
-def test_a_stop_by_a_key_continues_after_its_terminal_is_closed(
+def test_a_stop_from_the_monitor_continues_after_its_terminal_was_closed(
     run: Run, che: Che, tmp_path: Path, keys: bytes
 ) -> None:
     received, words = che
@@ -658,12 +658,12 @@ def test_a_stop_by_a_key_continues_after_its_terminal_is_closed(
     assert received.starts == received.starts[:1]
     until(lambda: received.sim["status"] == 3)
     rows = [row for batch in open_recording(out) for row in batch]
-    assert rows[-1].register in {row.register for row in rows[:-1]}  # it was closed in good order
+    assert rows[-1].register in {row.register for row in rows[:-1]}  # the recording was completed and closed
 
 
 @pytest.mark.long
 @patient
-def test_a_monitor_ends_when_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
+def test_the_monitor_ends_without_writing_when_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
     received, words = che
     plant = plant_of(words[0], tmp_path)
     with closing_terminal("monitor", plant) as terminal:
@@ -674,7 +674,7 @@ def test_a_monitor_ends_when_its_terminal_is_closed(che: Che, tmp_path: Path) ->
 
 
 @patient
-def test_a_stop_is_sent_though_no_warning_can_be_printed(
+def test_a_stop_is_sent_even_if_no_warning_can_be_printed(
     run: Run, che: Che, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Gone(io.StringIO):
@@ -698,20 +698,20 @@ def test_an_invalid_time_does_not_prevent_a_stop(run: Run, che: Che, verb: str, 
 
 
 @pytest.mark.slow
-def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:
+def test_a_stop_is_repeated_for_the_given_seconds(run: Run, che: Che) -> None:
     received, words = che
     received.loses = lambda request: True
     status, _, err = run("stop", *words, "--seconds", 1)
     assert status == 1
     assert "it was never confirmed" in err
     assert received.writes[0].data == b"\0\5"
-    assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}  # a run's stop and a jog's
+    assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}  # the stops of a run and of a jog
 
 
 @pytest.mark.parametrize(
     "words", [["read", "{}", "invt-che", "1", "status"], ["scan", "{}"], ["sniff", "{}"]]
 )
-def test_ports_of_a_command_are_documented_urls(
+def test_undocumented_port_urls_are_refused_before_they_are_opened(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "precious").write_text("precious")

@@ -1,4 +1,4 @@
-"""`plan`: its output for a plant file, without a port; prediction beside measurement after `poll`."""
+"""`multidrop plan`: its output for a plant file, without a port; and the comparison that `poll` prints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
 
 @pytest.fixture
 def fitting(tmp_path: Path) -> Path:
-    """A plant file with two drives at low rates."""
+    """Return a plant file with two drives at low rates."""
     path = tmp_path / "fitting.toml"
     path.write_text(
         LINE.format("hall-1", 1)
@@ -31,7 +31,7 @@ def fitting(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def crowded(tmp_path: Path) -> Path:
-    """A plant file whose second line has four drives at 9600 bit/s, each polled 50 times a second."""
+    """Return a plant file whose second line has four drives at 9600 bit/s, each polled 50 times a second."""
     path = tmp_path / "crowded.toml"
     path.write_text(
         LINE.format("hall-1", 1)
@@ -42,7 +42,7 @@ def crowded(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_fitting_plan_is_status_0_with_its_rates(run: Run, fitting: Path) -> None:
+def test_a_plan_that_fits_returns_0_and_prints_its_rates(run: Run, fitting: Path) -> None:
     status, out, err = run("plan", fitting)
     assert (status, err) == (0, "")
     lines = out.splitlines()
@@ -54,8 +54,8 @@ def test_a_fitting_plan_is_status_0_with_its_rates(run: Run, fitting: Path) -> N
     assert len(lines) == 5
 
 
-def test_long_names_fit_in_line_and_keep_both_ends(run: Run, tmp_path: Path) -> None:
-    """Two names may differ at their ends alone, and Chinese characters are two columns wide."""
+def test_long_names_are_shortened_to_aligned_columns(run: Run, tmp_path: Path) -> None:
+    """Names may differ only at their ends, and Chinese characters are two columns wide."""
     path = tmp_path / "named.toml"
     names = [
         "conveyor-of-the-bottling-hall-1",
@@ -75,7 +75,7 @@ def test_long_names_fit_in_line_and_keep_both_ends(run: Run, tmp_path: Path) -> 
     assert {columns_of(row) for row in (first, second, chinese)} == {columns_of(head)}
 
 
-def test_json_has_the_figures(run: Run, fitting: Path) -> None:
+def test_a_plan_in_json_has_the_same_figures(run: Run, fitting: Path) -> None:
     status, out, _ = run("plan", fitting, "--json")
     line = json.loads(out)["lines"]["hall-1"]
     assert (status, line["fits"], line["misfits"], line["remedies"], line["warnings"]) == (
@@ -85,8 +85,8 @@ def test_json_has_the_figures(run: Run, fitting: Path) -> None:
         None,
         [],
     )
-    # Five registers and twice one, 8N1: characters, 5 ms of delay, 3.5 characters and a bit of silence,
-    # and the host's 0.1 ms.
+    # Five registers and twice one register, at 8N1: the characters, 5 ms of response delay, 3.5 characters
+    # and one bit of silence, and 0.1 ms in this computer.
     characters = (8 + 15) + 2 * (8 + 7)
     assert line["cycle_ms"] == pytest.approx(characters * 10 / 9.6 + 3 * (5 + 36 / 9.6 + 0.1), abs=0.001)
     (pump,) = line["drives"]["pump-1"]
@@ -101,7 +101,7 @@ def test_json_has_the_figures(run: Run, fitting: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_plan_that_does_not_fit_is_status_1_with_suggestions(run: Run, crowded: Path) -> None:
+def test_a_plan_that_does_not_fit_returns_1_with_suggestions(run: Run, crowded: Path) -> None:
     status, out, err = run("plan", crowded)
     assert (status, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -121,7 +121,7 @@ def test_a_plan_that_does_not_fit_is_status_1_with_suggestions(run: Run, crowded
     assert run("plan", crowded)[0] == 0
 
 
-def test_a_drive_that_is_polled_in_turn_keeps_its_share(run: Run, crowded: Path) -> None:
+def test_a_drive_without_a_rate_keeps_its_share_of_a_full_line(run: Run, crowded: Path) -> None:
     crowded.write_text(crowded.read_text() + DRIVE.format("eager", TOY, 9) + 'poll = ["fault"]\n')
     status, out, _ = run("plan", crowded)
     assert status == 1
@@ -131,7 +131,7 @@ def test_a_drive_that_is_polled_in_turn_keeps_its_share(run: Run, crowded: Path)
 
 
 @pytest.mark.parametrize("model", ["yd1000", "delixi-modbus"])
-def test_polling_all_readings_in_single_requests_is_warned_of(run: Run, tmp_path: Path, model: str) -> None:
+def test_polling_all_readings_in_single_requests_causes_a_warning(run: Run, tmp_path: Path, model: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(LINE.format("hall-1", 1) + DRIVE.format("p", model, 1) + DRIVE.format("q", model, 2))
     status, out, _ = run("plan", path)
@@ -144,7 +144,7 @@ def test_polling_all_readings_in_single_requests_is_warned_of(run: Run, tmp_path
     assert "?" not in run("plan", path)[1]
 
 
-def test_a_plan_reckons_with_the_time_of_switching(run: Run, tmp_path: Path) -> None:
+def test_a_plan_includes_the_time_of_switching_settings(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         LINE.format("hall-1", 1) + DRIVE.format("p", "yd1000", 1) + 'poll = ["output_current"]\n'
@@ -162,7 +162,7 @@ def test_a_plan_reckons_with_the_time_of_switching(run: Run, tmp_path: Path) -> 
     )
 
 
-def test_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
+def test_plans_with_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     name = "the pump behind the second door on the left of the hall with the blue floor"
     path.write_text(LINE.format(name, 1) + DRIVE.format(name, TOY, 1) + 'every = "1 ms"\n')
@@ -171,7 +171,7 @@ def test_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_all_mistakes_in_the_file_are_printed_with_status_2(run: Run, fitting: Path) -> None:
+def test_plan_prints_all_mistakes_in_the_file_and_returns_2(run: Run, fitting: Path) -> None:
     text = fitting.read_text().replace("port =", "prot =").replace('"1 s"', '"soon"')
     fitting.write_text(text)
     status, out, err = run("plan", fitting)
@@ -183,13 +183,13 @@ def test_all_mistakes_in_the_file_are_printed_with_status_2(run: Run, fitting: P
     ]
 
 
-def test_a_file_that_is_not_there_is_status_2(run: Run, tmp_path: Path) -> None:
+def test_plan_returns_2_for_a_missing_file(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
     sentence = f"multidrop: {path}: the plant file cannot be read: No such file or directory\n"
     assert run("plan", path) == (2, "", sentence)
 
 
-# ---- after a poll ----
+# ---- the comparison after a poll ----
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
     assert list(found) == ["predicted", "predicted_with_measured_delays", "measured"]
     assert found["predicted"]["cycle_ms"] == planned["cycle_ms"]
     assert found["predicted"]["utilisation"] == planned["utilisation"]
-    delay = summary["drives"]["pump-1"]["response_delay_ms"]  # pump-9 never answers: it keeps its 5 ms
+    delay = summary["drives"]["pump-1"]["response_delay_ms"]  # pump-9 never answers, so 5 ms are assumed for it
     known = found["predicted_with_measured_delays"]["cycle_ms"]
     assert known == pytest.approx(planned["cycle_ms"] + delay - 5, abs=0.01)
     assert found["measured"]["utilisation"] == summary["utilisation"]
@@ -210,7 +210,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
 
 
 @pytest.mark.slow
-def test_poll_prints_both_as_text(run: Run, plant: Path) -> None:
+def test_poll_prints_prediction_and_measurement_as_text(run: Run, plant: Path) -> None:
     lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     heading = next(
         at for at, line in enumerate(lines) if line.split() == ["PREDICTED", "WITH", "DELAYS", "MEASURED"]
@@ -222,7 +222,7 @@ def test_poll_prints_both_as_text(run: Run, plant: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_time_of_switching_is_printed_if_settings_differ(run: Run, plant: Path) -> None:
+def test_the_measured_switching_time_is_printed_if_settings_differ(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
     told = run("poll", plant, "--seconds", 1)[1]
     assert re.search(r"\n  and the measured \d+\.\d\d ms to change the port's settings\n", told)

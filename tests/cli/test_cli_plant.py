@@ -1,4 +1,4 @@
-"""Commands that take a plant file and a name instead of PORT MODEL ADDRESS."""
+"""Commands that are given a plant file and a name instead of PORT, MODEL and ADDRESS."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from multidrop.sim.wire import Wire
 pytestmark = pytest.mark.usefixtures("_turns_awaited")
 
 FAN = f"{Path(__file__).parents[1]}/support/drives/own_drives.py:Fan"
-find_model(FAN)  # says that the file is run, once in a process: not in the midst of a test
+find_model(FAN)  # prints once per process that the file is run: not during a test
 LINE = '[[line]]\nname = "{}"\nport = "{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
 READINGS = ("output_current", "output_frequency")
@@ -47,7 +47,7 @@ def port(toy: SimulatedDrive) -> Iterator[str]:
 
 @pytest.fixture
 def plant(tmp_path: Path) -> Path:
-    """A plant of two lines, with ports that are not there."""
+    """Return a plant of two lines whose ports do not exist."""
     path = tmp_path / "plant.toml"
     drives = (("pump-1", TOY, 1), ("fan-1", FAN, 3), ("che-1", "invt-che", 4))
     line = LINE.format("hall-1", "/dev/none-1") + "".join(DRIVE.format(*drive) for drive in drives)
@@ -78,7 +78,7 @@ def test_read_takes_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path:
     assert (record["drive"], record["values"]["output_current"]["value"]) == ("pump-1", 3.25)
 
 
-def test_a_line_s_port_is_replaced(run: Run, plant: Path, at: str) -> None:
+def test_the_port_option_replaces_a_lines_port(run: Run, plant: Path, at: str) -> None:
     assert run("read", plant, "pump-1", "output_current")[0] == 1
     assert run("read", plant, "pump-1", "output_current", at) == (0, "output_current  3.25  A\n", "")
     both = (at, "--port", "roof=/dev/none-3")
@@ -87,7 +87,7 @@ def test_a_line_s_port_is_replaced(run: Run, plant: Path, at: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_command_uses_the_plant_file_s_settings(run: Run, plant: Path, at: str) -> None:
+def test_a_command_uses_the_settings_in_the_plant_file(run: Run, plant: Path, at: str) -> None:
     text = plant.read_text().replace("address = 1\n", 'address = 1\nframing = "ascii"\nbaudrate = 19200\n')
     plant.write_text(text)
     status, _, err = run("read", plant, "pump-1", "output_current", at)
@@ -118,7 +118,7 @@ def test_a_command_uses_the_plant_file_s_settings(run: Run, plant: Path, at: str
         ),
     ],
 )
-def test_a_mistake_is_a_sentence(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_a_mistaken_name_or_option_is_one_sentence(run: Run, plant: Path, words: list[str], sentence: str) -> None:
     status, out, err = run("read", plant, *words)
     assert (status, out) == (2, "")
     assert err.startswith(f"multidrop: {sentence.replace('PLANT', str(plant))}")
@@ -131,7 +131,7 @@ def test_options_of_plant_files_are_refused_without_one(run: Run) -> None:
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
 
-def test_a_plant_file_s_mistakes_are_the_same_as_in_plan(run: Run, plant: Path) -> None:
+def test_a_plant_files_mistakes_are_reported_as_by_plan(run: Run, plant: Path) -> None:
     plant.write_text(
         plant.read_text().replace('"pump-1"', '"fan-1"').replace("address = 4", "address = 4000")
     )
@@ -141,7 +141,7 @@ def test_a_plant_file_s_mistakes_are_the_same_as_in_plan(run: Run, plant: Path) 
     assert run("read", plant.with_name("none.toml"), "fan-1")[0] == 2
 
 
-def test_write_takes_a_plant_file(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_write_takes_a_plant_file_and_a_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     words = ("write", plant, "pump-1", at, "frequency")
     assert run(*words, "25", "--yes") == (0, "pump-1: frequency = 25.00 Hz: done (cannot be read back)\n", "")
     assert toy["frequency"] == 25
@@ -156,7 +156,7 @@ def test_write_takes_a_plant_file(run: Run, plant: Path, at: str, toy: Simulated
 # ---- commands to motors ----
 
 
-def test_verbs_take_a_plant_file(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_verbs_take_a_plant_file_and_a_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     drive = (plant, "pump-1", at)
     assert run("state", *drive)[1].startswith("stopped\n")
     assert run("set-frequency", *drive, "33.5", "--yes")[0] == 0
@@ -167,14 +167,14 @@ def test_verbs_take_a_plant_file(run: Run, plant: Path, at: str, toy: SimulatedD
     assert "argument HZ: 'fast' is not a number" in run("set-frequency", *drive, "fast", "--yes")[2]
     assert run("start", *drive, "--direction", "reverse", "--yes")[0] == 0
     assert toy["control"] == Status.RUNNING | Status.REVERSE
-    assert run("stop", *drive)[0] == 0  # is never asked for
+    assert run("stop", *drive)[0] == 0  # a stop needs no confirmation
     assert toy["control"] == 0
 
 
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
 ) -> None:
-    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    """By keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     plant = tmp_path / "spelt.toml"
     text = LINE.format("hall-1", port) + DRIVE.format("L\u00fcfter", TOY, 1)
     plant.write_text(text, encoding="utf-8")
@@ -191,7 +191,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     assert run("read", *fan, "output_current")[0] == 0
 
 
-def test_a_start_by_plant_asks_first(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_a_start_by_plant_file_needs_confirmation(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     status, _, err = run("start", plant, "pump-1", at)
     assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)
     assert not toy.counters.writes
@@ -203,12 +203,12 @@ def test_an_unidentifiable_drive_is_commanded_only_if_confirmed(run: Run, plant:
     assert (status, "declare confirmed = 1" in err or "confirmed" in err) == (1, True)
     assert run("read", plant, "fan-1", "run", at)[1].split()[:2] == ["run", "OFF"]
     plant.write_text(plant.read_text().replace("address = 3\n", "address = 3\nconfirmed = 1\n"))
-    run(*start)  # it runs on the simulator only as far as its speed is played
+    run(*start)  # the simulator may not show that the motor runs
     assert run("read", plant, "fan-1", "run", at)[1].split()[:2] == ["run", "ON"]
 
 
 @pytest.mark.parametrize(("there", "is_started"), [(Toy(4), False), (InvtCHE(4, maximum_frequency=50), True)])
-def test_a_drive_of_another_family_is_sent_no_write(
+def test_a_start_writes_nothing_to_a_drive_of_another_family(
     run: Run, plant: Path, there: Drive, is_started: bool
 ) -> None:
     plant.write_text(plant.read_text().replace("address = 4\n", "address = 4\nmaximum_frequency = 50\n"))
@@ -219,7 +219,7 @@ def test_a_drive_of_another_family_is_sent_no_write(
     assert (status == 0, bool(sim.counters.writes)) == (is_started, is_started), err
 
 
-def test_an_interruption_says_how_to_stop_it_by_plant(
+def test_an_interrupted_start_prints_the_stop_command_with_the_plant_file(
     run: Run, plant: Path, at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*words: object) -> str:
@@ -232,10 +232,10 @@ def test_an_interruption_says_how_to_stop_it_by_plant(
     assert run(*err.splitlines()[-1].split()[6:])[0] == 0
 
 
-# ---- commands to lines ----
+# ---- commands for whole lines ----
 
 
-def test_models_shows_a_drive_s_family(run: Run, plant: Path) -> None:
+def test_models_shows_the_family_of_a_drive_in_a_plant(run: Run, plant: Path) -> None:
     assert run("models", plant, "che-1") == run("models", "invt-che")
     status, _, err = run("models", plant, "che-2")
     assert (status, err.startswith(f"multidrop: {plant} has no drive 'che-2'; did you mean che-1")) == (
@@ -244,14 +244,14 @@ def test_models_shows_a_drive_s_family(run: Run, plant: Path) -> None:
     )
 
 
-def test_poll_takes_other_ports(run: Run, port: str, tmp_path: Path) -> None:
+def test_poll_replaces_ports_by_the_port_option(run: Run, port: str, tmp_path: Path) -> None:
     plant = one_line(tmp_path, "/dev/none-1")
     assert run("poll", plant, "--seconds", "0.2")[0] == 1
     status, out, _ = run("poll", plant, "--seconds", "0.2", "--json", f"--port=hall-1={port}")
     assert (status, json.loads(out)["samples"] > 0) == (0, True)
 
 
-def test_monitor_takes_other_ports(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_monitor_replaces_ports_by_the_port_option(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
 
     def watch(watched: Plant, out: object) -> dict[str, int]:
@@ -265,7 +265,7 @@ def test_monitor_takes_other_ports(run: Run, plant: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
+def test_scan_takes_a_plant_file_and_a_line(run: Run, plant: Path, port: str, at: str) -> None:
     few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--json")
     status, out, _ = run("scan", plant, "hall-1", at, *few)
     assert status == 0
@@ -279,7 +279,7 @@ def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str)
 
 
 @pytest.mark.slow
-def test_doctor_measures_with_a_drive_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
+def test_doctor_measures_with_the_drives_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
     def findings(*words: object) -> dict[str, str]:
         record = json.loads(run("doctor", plant, *words, at, "--json")[1])
         assert record["port"] == port
@@ -294,7 +294,7 @@ def test_doctor_measures_with_a_drive_of_a_plant(run: Run, plant: Path, port: st
     assert "--model is not for plant files" in run("doctor", plant, "pump-1", "--model", TOY)[2]
 
 
-def test_sniff_listens_to_a_line_of_a_plant(run: Run, plant: Path, at: str) -> None:
+def test_sniff_takes_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -> None:
     status, out, err = run("sniff", plant, "hall-1", at, "--seconds", "0.2")
     assert (status, out) == (0, "0 exchanges, 0 unknown bytes\n")
     assert err.startswith("listening on /dev/pts/")
@@ -302,10 +302,10 @@ def test_sniff_listens_to_a_line_of_a_plant(run: Run, plant: Path, at: str) -> N
     assert "is a plant file already" in run("sniff", plant, "roof", "--plant", plant, "--seconds", "0.2")[2]
 
 
-def test_a_simulated_plant_of_another_family_resolves_models_from_the_plant_file(
+def test_models_are_found_relative_to_the_plant_file(
     run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever the working directory is, and with a module beside the model."""
+    """This does not depend on the working directory, and a model may import a module beside it."""
     room = tmp_path / "room"
     room.mkdir()
     (room / "steps.py").write_text("CURRENT = 0.01\n")
@@ -319,8 +319,8 @@ def test_a_simulated_plant_of_another_family_resolves_models_from_the_plant_file
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_guards_are_the_same_by_plant_file_and_by_port(run: Run, plant: Path, at: str, port: str) -> None:
-    """Both ways to name a drive have the same guards."""
+def test_a_drive_named_by_plant_file_has_the_same_guards_as_by_port(run: Run, plant: Path, at: str, port: str) -> None:
+    """Each refused command prints the same error in both cases."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),
         ("write", ("sealed", "1", "--yes")),
@@ -346,7 +346,7 @@ current = { at = 2, unit = "A", step = 0.01 }
 """
 
 
-def test_a_family_s_file_beside_the_plant_file_is_a_model(run: Run, port: str, tmp_path: Path) -> None:
+def test_a_family_file_beside_the_plant_file_is_used_as_model(run: Run, port: str, tmp_path: Path) -> None:
     (tmp_path / "room").mkdir()
     (tmp_path / "room" / "meter.toml").write_text(METER)
     plant = tmp_path / "room" / "plant.toml"
@@ -355,7 +355,7 @@ def test_a_family_s_file_beside_the_plant_file_is_a_model(run: Run, port: str, t
     assert run("models", plant, "meter-1")[1] == run("models", tmp_path / "room" / "meter.toml")[1]
 
 
-def test_a_family_file_instead_of_a_plant_file_is_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_a_family_file_in_place_of_a_plant_file_is_refused(run: Run, tmp_path: Path) -> None:
     (tmp_path / "meter.toml").write_text(METER)
     status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
     assert (status, out) == (2, "")
@@ -380,7 +380,7 @@ def test_stop_of_a_plant_or_line_stops_all_its_drives(
     assert status == has_portless_line
 
 
-def test_stop_of_a_plant_prints_json_and_exits_with_0_when_all_stand(
+def test_a_stop_of_a_plant_prints_json_and_returns_0_if_all_have_stopped(
     run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
 ) -> None:
     plant = tmp_path / "all.toml"
@@ -404,7 +404,7 @@ def test_stop_of_a_plant_prints_json_and_exits_with_0_when_all_stand(
         (["--all", "--line", "roof"], "--all and --line contradict each other: give one of them"),
     ],
 )
-def test_mistaken_stop_of_a_plant_says_that_it_was_not_sent(
+def test_a_mistaken_stop_of_a_plant_is_reported_as_not_sent(
     run: Run, plant: Path, at: str, toy: SimulatedDrive, words: list[str], mistake: str
 ) -> None:
     status, _, err = run("stop", plant, at, *words)

@@ -1,4 +1,4 @@
-"""Commands that run for a while: demo, poll, simulate; and convert. Each runs in its own process."""
+"""Commands that run for a while: `demo`, `poll`, `simulate`; and `convert`. Each runs in its own process."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, n
     assert not link.is_symlink()
 
 
-def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -> None:
+def test_simulate_does_not_replace_a_file_by_a_port_link(run: Run, tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     link.parent.mkdir()
     link.write_text("mine")
@@ -89,10 +89,10 @@ def test_simulate_applies_the_faults_of_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
+def test_poll_records_in_segments_and_continues_after_a_restart(plant: Path, tmp_path: Path) -> None:
     counted = 0
     words = ["--seconds", 1.6, "--out", tmp_path / "run.arrows", "--rotate", "1 s", "--json"]
-    for _ in range(2):  # a restart goes on
+    for _ in range(2):  # the second run continues the recording
         done = multidrop("poll", plant, *words)
         assert (done.returncode, done.stderr) == (0, "")
         summary = json.loads(done.stdout)
@@ -106,7 +106,7 @@ def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_a_recording_in_segments_needs_a_segment_s_name(run: Run, tmp_path: Path) -> None:
+def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: Path) -> None:
     for number in (1, 2):
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
             writer.write(counting(100, 0))
@@ -126,7 +126,7 @@ def test_a_recording_in_segments_needs_a_segment_s_name(run: Run, tmp_path: Path
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
     ],
 )
-def test_options_of_segments_that_do_not_fit(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_invalid_options_for_segments_are_one_sentence(run: Run, plant: Path, words: list[str], sentence: str) -> None:
     status, out, told = run("poll", plant, *words)
     assert (status, out) == (2, "")
     assert sentence in told
@@ -148,14 +148,14 @@ def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, 
     misses = [row for row in rows if row.value is None]
     assert Counter(row.status for row in misses) == summary["lines"]["hall-1"]["misses"]
     assert {"no reply"} <= {row.status for row in misses if row.drive == "pump-9"} <= LATE_OR_SILENT
-    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # by a busy machine
+    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # misses caused by a busy machine
     assert len(misses) == summary["misses"]
     assert summary["lines"]["hall-1"]["exchanges"] > 0
     assert summary["lines"]["hall-1"]["drives"]["pump-1"]["samples_per_second"] > 0
     assert summary["lines"]["hall-1"]["utilisation"] > 0
 
 
-def test_a_recording_describes_its_registers(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_a_polls_recording_describes_its_registers(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     run("poll", plant, "--seconds", 0.1, "--out", out)
     drive = open_recording(out).metadata["drives"]["pump-1"]
@@ -210,7 +210,7 @@ def test_poll_prints_its_summary_as_text(run: Run, plant: Path) -> None:
 
 
 @pytest.mark.slow
-def test_no_sample_at_all_is_status_1(run: Run, plant: Path) -> None:
+def test_poll_without_any_sample_returns_1(run: Run, plant: Path) -> None:
     text = plant.read_text().replace("address = 1\n", "address = 8\n")
     plant.write_text(text)
     status, out, _ = run("poll", plant, "--seconds", 0.5, "--json")
@@ -236,7 +236,7 @@ def test_all_mistakes_of_a_plant_file_are_printed(run: Run, tmp_path: Path) -> N
     ]
 
 
-def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
+def test_poll_and_convert_never_overwrite_a_recording(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     out.write_text("mine")
     sentence = f"multidrop: {out} exists already: name another file, or remove it first\n"
@@ -252,7 +252,7 @@ def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
         ("none/out.arrows", 1, "cannot be written: No such file or directory"),
     ],
 )
-def test_an_unwritable_recording_is_a_sentence(
+def test_a_recording_that_cannot_be_written_is_one_sentence(
     run: Run, plant: Path, tmp_path: Path, out: str, status: int, sentence: str
 ) -> None:
     done, _, err = run("poll", plant, "--seconds", 1, "--out", tmp_path / out)
@@ -261,7 +261,7 @@ def test_an_unwritable_recording_is_a_sentence(
 
 @pytest.mark.long
 @pytest.mark.uncounted
-def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
+def test_a_full_disk_ends_polling_and_keeps_the_rows_before(
     plant: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.arrows"
@@ -275,7 +275,7 @@ def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
     assert done.stderr.count("\n") == 1
 
 
-def test_a_port_that_is_not_there_is_a_sentence(run: Run, tmp_path: Path) -> None:
+def test_poll_reports_a_missing_port_in_one_sentence(run: Run, tmp_path: Path) -> None:
     sentence = f"multidrop: {tmp_path}/ports/hall-1: there is no such port\n"
     out = tmp_path / "out.csv"
     assert run("poll", plant_file(tmp_path), "--seconds", 1, "--out", out) == (1, "", sentence)
@@ -294,7 +294,7 @@ def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
-def test_a_recording_with_a_missing_end_is_warned_of(run: Run, tmp_path: Path, suffix: str) -> None:
+def test_convert_warns_of_a_recording_with_a_missing_end(run: Run, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         for at in range(3):
@@ -313,7 +313,7 @@ def test_a_recording_with_a_missing_end_is_warned_of(run: Run, tmp_path: Path, s
     assert run("report", path) == (0, f"{tmp_path}/a.html\n", sentence)
 
 
-def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:
+def test_convert_refuses_a_file_that_is_no_recording(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.arrows").write_text("hello")
     status, out, err = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (2, "")
@@ -324,7 +324,7 @@ def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
-    """It takes the place of an earlier demo's recording, and is captured."""
+    """It replaces the recording of an earlier demo, and captures the traffic."""
     out, capture = tmp_path / "demo.arrows", tmp_path / "demo.pcapng"
     with open_writer(out, {"drives": dict.fromkeys(DRIVES)}):
         pass
@@ -343,7 +343,7 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     rows = recorded(out)
     assert {row.drive for row in rows if row.value is not None} == set(drives)
     assert summary["misses"] == sum(row.value is None for row in rows)
-    assert any(row.value for row in rows if row.register == "output_frequency")  # a motor runs
+    assert any(row.value for row in rows if row.register == "output_frequency")  # at least one motor runs
     with Capture(capture) as found:
         assert sum(map(len, Decoding(found))) > 0
 
@@ -354,7 +354,7 @@ def framings_of(model: str) -> list[str]:
 
 @pytest.mark.slow
 def test_the_operator_of_a_demo_never_undoes_a_stop() -> None:
-    """It skips a silent drive, and restarts a motor that has tripped."""
+    """It skips a silent drive, and restarts a motor after a trip."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     sims[0].deaf_until = math.inf
     stopped, tripped = sims[1].motor, sims[2].motor
@@ -379,7 +379,7 @@ def test_a_demo_replaces_only_the_recording_of_a_demo(run: Run, tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
+def test_a_killed_demo_leaves_no_simulator(tmp_path: Path) -> None:
     ports = tmp_path / "ports"
     words = [sys.executable, "-c", SIMULATING, str(plant_file(tmp_path)), str(ports)]
     with BoundProcess(words, stdout=subprocess.PIPE) as process:
@@ -395,7 +395,7 @@ def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) -> None:
+def test_on_a_terminal_a_demo_shows_the_monitor_until_its_time_is_over(tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
         terminal.wait_for(">pump-1")
@@ -408,18 +408,18 @@ def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
+def test_on_a_terminal_poll_shows_the_newest_values_in_a_table(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(120, 24)) as terminal:
         terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
         terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
-        terminal.wait_for("output_frequency: no")  # of the other: no reply, or not asked
+        terminal.wait_for("output_frequency: no")  # for the other drive: "no reply" or "not asked"
         terminal.wait_for("utilisation")
         assert terminal.process.wait(timeout=60) == 0
-        assert b"\x1b[3F\x1b[J" in terminal.written  # the table and its head, over themselves
+        assert b"\x1b[3F\x1b[J" in terminal.written  # table and head are drawn over the previous ones
 
 
 @pytest.mark.long
-def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
+def test_the_live_table_is_cut_to_the_size_of_its_terminal(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
         terminal.wait_for("... and 3 more drives")
         terminal.wait_for("utilisation")

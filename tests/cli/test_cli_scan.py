@@ -29,12 +29,12 @@ from multidrop.scan.sweep import Sweep
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 USUAL = Settings(9600, "8N1")
-PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  # however busy the machine is
+PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  # short, and the same on a busy machine
 
 
 @pytest.fixture(autouse=True)
 def _slow_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Use a longer least time-out: a busy computer may delay the next reply of a fast drive."""
+    """Use a longer least timeout, because a busy computer may delay the replies of a fast drive."""
     monkeypatch.setattr(multidrop.scan.identify, "LEAST_TIMEOUT", 0.1)
 
 
@@ -46,11 +46,11 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_findings_are_printed(run: Run, port: str) -> None:
+def test_scan_prints_each_finding(run: Run, port: str) -> None:
     status, out, err = run("scan", port, *PATIENTLY)
     assert status == 0
     *told, summary = out.splitlines()
-    told.sort()  # on a busy machine the second pass finds the drives
+    told.sort()  # on a busy machine, only the second pass may find a drive
     assert told[0].startswith("address 1: invt-che at 9600 8N1 rtu, ")
     assert told[1].startswith("address 2: innovert-ibd at 9600 8N1 ascii, ")
     assert told[2].startswith("address 3: an unknown Modbus device at 9600 8N1 rtu, ")
@@ -60,7 +60,7 @@ def test_findings_are_printed(run: Run, port: str) -> None:
 
 
 @pytest.mark.slow
-def test_json_is_one_object(run: Run, port: str) -> None:
+def test_scan_prints_one_json_object(run: Run, port: str) -> None:
     status, out, _ = run("scan", port, *PATIENTLY, "--model", "invt-che", "--json")
     told = json.loads(out)
     assert status == 0
@@ -72,7 +72,7 @@ def test_json_is_one_object(run: Run, port: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path) -> None:
+def test_the_plant_file_of_a_scan_can_be_polled_unchanged(run: Run, port: str, tmp_path: Path) -> None:
     out = tmp_path / "found.toml"
     words = (
         *PATIENTLY,
@@ -103,7 +103,7 @@ def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path
     assert "exists already" in err
 
 
-def test_no_drives_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
+def test_a_scan_without_findings_returns_1_and_writes_no_file(run: Run, port: str, tmp_path: Path) -> None:
     out = tmp_path / "none.toml"
     words = ("--baudrates", "19200", "--formats", "8O2", "--addresses", "9", "--quick", "--out", out)
     status, text, _ = run("scan", port, *words)
@@ -115,7 +115,7 @@ def test_no_drives_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_a_serial_server_is_asked_at_its_own_baud_rate(run: Run, port: str) -> None:
+def test_scanning_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> None:
     status, _, err = run("scan", port, "--quick")
     assert status == 2
     assert "name it, such as --baudrates 9600" in err
@@ -158,7 +158,7 @@ def test_unit_ids_beyond_a_serial_line_s_addresses_are_scanned_on_tcp(run: Run, 
         (("--model", "inovert-ibd"), "did you mean innovert-ibd"),
     ],
 )
-def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], sentence: str) -> None:
+def test_mistaken_scan_arguments_are_one_sentence(run: Run, words: tuple[str, ...], sentence: str) -> None:
     status, out, err = run("scan", "/dev/nowhere", *words)
     assert (status, out) == (2, "")
     assert sentence in err
@@ -176,17 +176,17 @@ def test_an_unwritable_plant_file_fails_before_the_port_is_opened(run: Run, tmp_
     assert (status, err) == (1, f"multidrop: {directory}/found.toml: Permission denied\n")
 
 
-def test_a_scan_that_fails_leaves_no_plant_file(run: Run, tmp_path: Path) -> None:
+def test_a_failed_scan_leaves_no_plant_file(run: Run, tmp_path: Path) -> None:
     sentence = "multidrop: /dev/nowhere: there is no such port\n"
     assert run("scan", "/dev/nowhere", "--out", tmp_path / "found.toml") == (1, "", sentence)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_port_that_is_not_there_is_one_sentence(run: Run) -> None:
+def test_scan_reports_a_missing_port_in_one_sentence(run: Run) -> None:
     assert run("scan", "/dev/nowhere") == (1, "", "multidrop: /dev/nowhere: there is no such port\n")
 
 
-def test_every_finding_is_a_sentence() -> None:
+def test_every_kind_of_finding_is_printed_as_a_sentence() -> None:
     found = Found(5, USUAL, Framing.RTU, ("yd1000", "delixi-modbus"), 0.0051, "1 of 9 replies were damaged")
     assert sentence(found) == (
         "address 5: yd1000 or delixi-modbus at 9600 8N1 rtu, response delay 5.1 ms "
@@ -199,7 +199,7 @@ def test_every_finding_is_a_sentence() -> None:
     assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
 
 
-def test_doubts_are_comments_of_the_plant_file(tmp_path: Path) -> None:
+def test_doubts_of_findings_are_comments_in_the_plant_file(tmp_path: Path) -> None:
     families = {each.model: each for each in (InvtCHE, InnovertIBD, DelixiModbus)}
     found = [
         Found(4, USUAL, Framing.RTU, (), 0.005),
@@ -224,12 +224,12 @@ def test_doubts_are_comments_of_the_plant_file(tmp_path: Path) -> None:
     assert comments[-1] == "# address 4: an unknown Modbus device at 9600 8N1 rtu"
 
 
-def test_a_plant_file_needs_a_drive() -> None:
+def test_a_plant_file_is_not_written_without_a_drive() -> None:
     with pytest.raises(ValueError, match="nothing to write a plant file of"):
         plant_text("port", [Found(4, USUAL, Framing.RTU, (), 0.005)], {})
 
 
-# ---- that takes its time ----
+# ---- long scans ----
 
 
 @pytest.mark.parametrize("words", [(), ("--json",)])
@@ -266,7 +266,7 @@ def test_quick_skips_the_second_pass(run: Run, port: str, monkeypatch: pytest.Mo
 
 
 @pytest.mark.long
-def test_on_a_terminal_progress_is_one_line(port: str) -> None:
+def test_on_a_terminal_scan_progress_is_one_line(port: str) -> None:
     with on_terminal("scan", port, *PATIENTLY) as terminal:
         terminal.wait_for("address 2; ")
         terminal.wait_for("3 drives found in ")
@@ -277,13 +277,13 @@ def test_on_a_terminal_progress_is_one_line(port: str) -> None:
 
 
 class TerminalText(StringIO):
-    """Text that is written to a terminal."""
+    """Text output that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True
 
 
-def test_an_interruption_clears_the_progress_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_scan_clears_its_progress_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> Iterator[Finding]:
         yield Progress(USUAL, Framing.RTU, 3, 12.0)
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""`sniff` and `decode`: on a live line, behind a network, from captures, and their errors."""
+"""`sniff` and `decode`: on a live line, behind a network, from captures; and their errors."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ poll = ["output_frequency", "status"]
 
 @pytest.fixture
 def line() -> Iterator[tuple[str, str]]:
-    """The ports of a master and of a listener, on a line with drives of three framings."""
+    """Yield the ports of a master and of a listener, on a line with drives of three framings."""
     drives = [EncodedDrive(drive) for drive in DRIVES]
     simulator = Simulator([Wire(drives, unpaced=True)])
     with simulator, tapped(simulator.wires[0].path, 9600) as ports:
@@ -76,7 +76,7 @@ def plant(directory: Path, port: str) -> Path:
 
 
 @pytest.mark.long
-def test_a_poll_s_values_are_heard_captured_and_decoded(
+def test_polled_values_are_sniffed_captured_and_decoded(
     line: tuple[str, str], tmp_path: Path, run: Run
 ) -> None:
     port, tap = line
@@ -97,12 +97,12 @@ def test_a_poll_s_values_are_heard_captured_and_decoded(
     assert {drive for drive, _ in polled} == {"fan-1", "fan-2", "pump-3", "pump-4"}
     assert set(polled) <= set(decoded)
     for name, column in polled.items():
-        assert decoded[name][: len(column)] == column  # the last one may have come too late for the poll
-        assert len(decoded[name]) <= len(column) + 3  # nor were the first one and a proof for the poll
+        assert decoded[name][: len(column)] == column  # the poll may have missed the last reply
+        assert len(decoded[name]) <= len(column) + 3  # at most three replies are no rows of the poll
     assert {exchange["line"] for exchange in sniffer.exchanges} == {"hall-1"}
 
 
-def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
+def test_the_listener_has_no_way_to_send(line: tuple[str, str]) -> None:
     with (
         closing(Listener(line[1], Settings(9600, "8N1"))) as listener,
         pytest.raises(OSError, match="Bad file"),
@@ -112,7 +112,7 @@ def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_an_unanswered_request_is_printed_during_silence() -> None:
+def test_an_unanswered_request_is_printed_while_the_line_is_silent() -> None:
     master, slave = pty.openpty()
     with sniffing(os.ttyname(slave)) as sniffer:
         os.write(master, READ.request_frame)
@@ -124,10 +124,10 @@ def test_an_unanswered_request_is_printed_during_silence() -> None:
     os.close(slave)
 
 
-def test_late_received_bytes_are_not_silence(
+def test_bytes_received_late_do_not_count_as_silence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The listener had to wait for a processor before it had the request; the reply comes next."""
+    """The listener waited for a processor before it read the request. The reply comes next."""
     now = 0.0
 
     class Listening:
@@ -153,7 +153,7 @@ def test_late_received_bytes_are_not_silence(
 
 
 class ResponderLine:
-    """A far end that sends the same bytes again and again, and stores the bytes that it receives."""
+    """A far end that sends the same bytes repeatedly, and stores the bytes that it receives."""
 
     def __init__(self, said: bytes) -> None:
         self._said = said
@@ -176,7 +176,7 @@ class ResponderLine:
                     self.told += more
 
     def close(self) -> bytes:
-        """Close the connection, and return all that came on it."""
+        """Close the connection, and return all bytes received on it."""
         self._thread.join(timeout=PATIENCE)
         self._server.close()
         return self.told
@@ -194,7 +194,7 @@ def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
     told = [json.loads(line) for line in out.splitlines()]
     assert {record["line"] for record in told[:-1]} == {url}
     assert told[-1]["summary"]["exchanges"] > 10
-    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # both ends may be incomplete
+    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # the first and the last records may be incomplete
     pair = [[each.frame.hex(" ").upper()] for each in (READ, WRITE)]
     assert sniffed in ((len(sniffed) * pair)[: len(sniffed)], (len(sniffed) * pair)[1 : len(sniffed) + 1])
     if server:
@@ -203,7 +203,7 @@ def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
     assert far.close() == b""
 
 
-def test_a_url_s_port_has_no_write() -> None:
+def test_a_sniffed_url_cannot_be_written_to() -> None:
     far = ResponderLine(b"")
     with closing(Listener(far.url, Settings(9600, "8N1"))) as listener:
         port = listener._source
@@ -212,7 +212,7 @@ def test_a_url_s_port_has_no_write() -> None:
     assert far.close() == b""
 
 
-def test_a_lost_network_ends_sniffing_with_a_sentence(run: Run) -> None:
+def test_a_lost_network_connection_ends_sniffing_with_a_sentence(run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = f"socket://127.0.0.1:{server.getsockname()[1]}"
         threading.Thread(target=lambda: server.accept()[0].close(), daemon=True).start()
@@ -220,7 +220,7 @@ def test_a_lost_network_ends_sniffing_with_a_sentence(run: Run) -> None:
     assert (status, err.splitlines()[-1]) == (1, f"multidrop: {url}: the port was lost (hung up)")
 
 
-# ---- replay ----
+# ---- captures ----
 
 PAIRS = {each.frame: each for each in PRINTED if each.request is not None}
 READ = PAIRS[bytes.fromhex("01 03 02 13 88 B5 12")]
@@ -248,7 +248,7 @@ def delixi_plant(directory: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
-def test_a_capture_is_printed_in_engineering_units(run: Run, capture: Path, command: list[str]) -> None:
+def test_a_capture_is_printed_with_units(run: Run, capture: Path, command: list[str]) -> None:
     status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
     assert (status, err) == (0, "")
     assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
@@ -260,7 +260,7 @@ def test_a_capture_is_printed_in_engineering_units(run: Run, capture: Path, comm
     assert out.splitlines()[4:] == ["2 exchanges, 1 request without a reply, 2 unknown bytes"]
 
 
-def test_without_a_plant_raw_registers_are_printed(run: Run, capture: Path) -> None:
+def test_a_capture_without_a_plant_is_printed_as_raw_registers(run: Run, capture: Path) -> None:
     out = run("decode", capture)[1]
     assert "  address 1  reads holding_register_500 = 5000  " in out
     objects = [json.loads(line) for line in run("decode", capture, "--json")[1].splitlines()]
@@ -286,7 +286,10 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
-    """Return the output of `decode` for a capture with these frames, one every ms, without times of day."""
+    """Return the lines that `decode` prints for a capture of these frames, without times of day.
+
+    The frames are 1 ms apart.
+    """
     with CaptureWriter(path) as writer:
         for number, (raw, side) in enumerate(frames):
             writer.write(raw, side, number * 1_000_000, "hall-1")
@@ -296,7 +299,7 @@ def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: obj
     return [line.partition("  ")[2] or line for line in out.splitlines()]
 
 
-def test_other_requests_than_reads_are_printed_too(run: Run, tmp_path: Path) -> None:
+def test_requests_other_than_reads_are_printed_too(run: Run, tmp_path: Path) -> None:
     delixi = (4, 0x02, 1, 0, bytes(4))
     frames = [
         frame(False, 1, 0x03, 0, 0, b"\x13\x88"),
@@ -317,7 +320,7 @@ def test_other_requests_than_reads_are_printed_too(run: Run, tmp_path: Path) -> 
     ]
 
 
-def test_endless_noise_is_printed() -> None:
+def test_noise_without_end_is_printed_while_it_comes() -> None:
     stream, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
     for time in range(4):
         stream.put(b"\xff" * 1500, time)
@@ -339,8 +342,8 @@ class Meter(Drive):
 """
 
 
-def test_a_drive_s_not_a_number_is_printed(run: Run, tmp_path: Path) -> None:
-    """The floating-point format's own, as a meter without a sensor says it."""
+def test_a_not_a_number_reply_is_printed_as_no_valid_value(run: Run, tmp_path: Path) -> None:
+    """A meter without a sensor replies with the NaN of the floating-point format."""
     (tmp_path / "meter.py").write_text(METER)
     drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'
     plant = tmp_path / "plant.toml"
@@ -359,14 +362,14 @@ def test_a_drive_s_not_a_number_is_printed(run: Run, tmp_path: Path) -> None:
     ]
 
 
-def test_a_replay_can_be_captured_again(run: Run, capture: Path) -> None:
+def test_a_capture_can_be_replayed_into_an_equal_capture(run: Run, capture: Path) -> None:
     again = capture.parent / "again.pcapng"
     first = run("sniff", "--replay", capture, "--out", again)
     assert first[0] == 0
     assert run("decode", again) == first
 
 
-def test_columns_of_a_capture_are_counted(run: Run, capture: Path) -> None:
+def test_decode_prints_the_number_of_columns_and_rows(run: Run, capture: Path) -> None:
     out = capture.parent / "a.csv"
     assert run("decode", capture, "--out", out) == (
         0,
@@ -379,7 +382,7 @@ def test_columns_of_a_capture_are_counted(run: Run, capture: Path) -> None:
 # ---- errors ----
 
 
-def test_a_port_that_cannot_be_sniffed_is_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_sniff_reports_a_port_that_cannot_be_opened(run: Run, tmp_path: Path) -> None:
     ordinary = tmp_path / "file"
     ordinary.write_text("hello")
     for port, sentence in (
@@ -393,7 +396,7 @@ def test_a_port_that_cannot_be_sniffed_is_one_sentence(run: Run, tmp_path: Path)
     assert run("sniff", port) == (2, "", f"multidrop: {port}: {sentence}\n")
 
 
-def test_a_port_in_use_is_one_sentence(run: Run) -> None:
+def test_sniff_reports_a_port_in_use(run: Run) -> None:
     master, slave = pty.openpty()
     fcntl.flock(slave, fcntl.LOCK_EX)
     port = os.ttyname(slave)
@@ -402,7 +405,7 @@ def test_a_port_in_use_is_one_sentence(run: Run) -> None:
     os.close(slave)
 
 
-def test_missing_permission_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sniff_reports_a_missing_permission(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Root has every permission, so the system's refusal is simulated."""
 
     def refuse(path: str, flags: int) -> int:
@@ -416,7 +419,7 @@ def test_missing_permission_is_one_sentence(run: Run, monkeypatch: pytest.Monkey
     )
 
 
-def test_invalid_arguments_are_one_sentence(
+def test_invalid_sniff_arguments_are_one_sentence(
     run: Run, tmp_path: Path, capture: Path, request: pytest.FixtureRequest
 ) -> None:
     none, text = tmp_path / "none.pcapng", tmp_path / "text"

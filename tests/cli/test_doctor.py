@@ -1,4 +1,4 @@
-"""`multidrop doctor`: the facts that it reads from the system, and its report."""
+"""`multidrop doctor`: the facts that it reads from the system, and the findings that it prints."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 
 
 def ended(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
-    """Return the result of the request that no drive should answer."""
+    """Return the outcome of the request to an unused address."""
     reply = Message(0xF7, 3, exception=exception)
     return completed(result, reply, raw, at_ns=1, skipped=skipped)
 
 
 @pytest.fixture
 def sysfs(tmp_path: Path) -> Path:
-    """A folder like Linux's /sys with an FTDI adapter: links from classes to the tree of devices."""
+    """Return a folder like Linux's /sys with an FTDI adapter: class links into the tree of devices."""
     usb = tmp_path / "devices/pci0000:00/usb1/1-2"
     port = usb / "1-2:1.0/ttyUSB0"
     (port / "tty/ttyUSB0").mkdir(parents=True)
@@ -101,25 +101,25 @@ def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
     assert (adapter.usb_id, adapter.latency_timer) == ("0403:6001", 16)
 
 
-def test_a_link_is_followed_to_its_device(sysfs: Path) -> None:
+def test_a_link_to_a_device_finds_the_devices_adapter(sysfs: Path) -> None:
     link = sysfs / "by-id"
     link.symlink_to("/dev/ttyUSB0")
     assert find_adapter(str(link), sysfs).driver == "ftdi_sio"
 
 
-def test_a_port_without_known_facts(sysfs: Path) -> None:
+def test_an_adapter_without_known_facts_has_only_a_name(sysfs: Path) -> None:
     assert find_adapter("/dev/ttyS7", sysfs) == Adapter("ttyS7")
 
 
-def test_the_rs485_struct_is_linux_s() -> None:
-    # linux/serial.h: flags, two delays in ms, five words of padding
+def test_rs485_modes_are_decoded_from_linuxs_struct() -> None:
+    # struct serial_rs485 in linux/serial.h: flags, two delays in ms, five words of padding
     assert decoded_rs485(struct.pack("=8I", 0x01, 0, 0, 0, 0, 0, 0, 0)) == RS485Mode(True, False)
     assert decoded_rs485(struct.pack("=8I", 0x13, 5, 5, 0, 0, 0, 0, 0)) == RS485Mode(True, True)
     assert decoded_rs485(bytes(32)) == RS485Mode(False, False)
     assert (RS485_ENABLED, RS485_RX_DURING_TX) == (1, 16)
 
 
-def test_a_pty_has_neither_flag_nor_mode() -> None:
+def test_a_pty_has_no_low_latency_flag_and_no_rs485_mode() -> None:
     master, slave = os.openpty()
     try:
         assert low_latency(slave) is None
@@ -132,7 +132,7 @@ def test_a_pty_has_neither_flag_nor_mode() -> None:
 # ---- sentences ----
 
 
-def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
+def test_a_long_latency_timer_gets_advice(sysfs: Path) -> None:
     finding = latency_finding(find_adapter("/dev/ttyUSB0", sysfs))
     assert finding.what == "16 ms: every reply may wait that long in the adapter"
     assert f"echo 1 | sudo tee {sysfs}/bus/usb-serial/devices/ttyUSB0/latency_timer" in finding.advice
@@ -220,7 +220,7 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
         ),
     ],
 )
-def test_each_finding_is_a_sentence_with_advice_if_needed(finding: object, what: str, advised: bool) -> None:
+def test_each_finding_is_a_sentence_with_advice_only_if_needed(finding: object, what: str, advised: bool) -> None:
     assert finding.what == what
     assert bool(finding.advice) == advised
 
@@ -244,14 +244,14 @@ def test_lost_requests_are_a_failure_with_advice() -> None:
     assert lost.is_failure
 
 
-def test_invalid_replies_are_reported() -> None:
+def test_invalid_replies_are_part_of_the_round_trip_finding() -> None:
     came = "reply from another address (received 63 03 02 00 00)"
     nothing_good = round_trip_finding(InvtCHE(1), [], 4, came=came).what
     assert nothing_good == f"invt-che@1 gave no valid reply to 4 requests; received: {came}"
     assert round_trip_finding(InvtCHE(1), [0.005], 2, came=came).what.endswith(f"received instead: {came}")
 
 
-def test_a_network_s_round_trip_has_the_wire_in_it() -> None:
+def test_a_round_trip_over_a_network_includes_the_wires_time() -> None:
     told = round_trip_finding(InvtCHE(1), [0.0004, 0.0005, 0.0006], 3, 0.0094)
     assert told.what.endswith(
         "answers in 0.5 ms (median; 0.4 to 0.6 ms) after its request was handed over "
@@ -265,7 +265,7 @@ def test_a_network_s_round_trip_has_the_wire_in_it() -> None:
 # ---- the command ----
 
 
-def test_a_pty_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
+def test_on_a_pty_doctor_reports_no_adapter(run: Run, port: str) -> None:
     status, out, err = run("doctor", port)
     assert (status, err) == (0, "")
     told = " ".join(out.split())
@@ -279,7 +279,7 @@ def test_a_pty_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_a_socket_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
+def test_on_a_socket_the_adapter_is_at_the_far_end(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port)
     told = " ".join(out.split())
     assert status == 0
@@ -287,9 +287,9 @@ def test_a_socket_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
     assert "at the far end" in told
 
 
-def test_rs485_modes_apply_to_devices_only(run: Run, port: str) -> None:
+def test_rs485_modes_are_accepted_only_for_devices(run: Run, port: str) -> None:
     status, out, err = run("doctor", port, "--rs485", "rts-up")
-    assert (status, err) == (0, "")  # a pseudo-terminal has none, and goes without
+    assert (status, err) == (0, "")  # a pseudo-terminal has no RS-485 mode, and works without
     for words, sentence in (
         ((port, "--rs485", "on"), 'rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'),
         (("tcp://10.0.0.7", "--rs485", "kernel"), "rs485 applies to serial devices only"),
@@ -302,7 +302,7 @@ def test_rs485_modes_apply_to_devices_only(run: Run, port: str) -> None:
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_a_pyserial_port_lacks_the_adapter_s_findings(run: Run, port: str) -> None:
+def test_on_a_pyserial_port_the_adapter_is_at_the_far_end(run: Run, port: str) -> None:
     server = SerialServer(port)
     status, out, _ = run("doctor", server.url)
     server.close()
@@ -312,7 +312,7 @@ def test_a_pyserial_port_lacks_the_adapter_s_findings(run: Run, port: str) -> No
     assert "at the far end" in told
 
 
-def test_a_port_lost_during_the_echo_test_is_reported(run: Run) -> None:
+def test_a_port_lost_during_the_echo_test_is_part_of_the_finding(run: Run) -> None:
     port, hang_up = vanishing_pty()
     thread = threading.Thread(target=hang_up)
     thread.start()
@@ -321,7 +321,7 @@ def test_a_port_lost_during_the_echo_test_is_reported(run: Run) -> None:
     assert "not tested: the port was lost (" in " ".join(out.split())
 
 
-def test_a_lost_port_differs_from_a_driver_without_the_feature() -> None:
+def test_driver_features_of_a_lost_port_raise_instead_of_none() -> None:
     master, slave = os.openpty()
     os.close(master)
     os.close(slave)
@@ -341,7 +341,7 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_patient")
-def test_all_drives_of_a_plant_are_tried(run: Run, port: str, tmp_path: Path) -> None:
+def test_doctor_measures_all_drives_of_a_plant(run: Run, port: str, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
     plant.write_text(
@@ -363,7 +363,7 @@ def test_all_drives_of_a_plant_are_tried(run: Run, port: str, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_silent_drive_gets_few_requests(run: Run, port: str) -> None:
+def test_doctor_sends_only_five_requests_to_a_silent_drive(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
     assert status == 1
     assert "did not answer 5 requests" in " ".join(out.split())
@@ -371,7 +371,7 @@ def test_a_silent_drive_gets_few_requests(run: Run, port: str) -> None:
 
 @pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"], indirect=True)
 def test_no_delay_is_negative_on_ports_without_bits(run: Run, port: str) -> None:
-    """The far end answers at once: sooner than a wire could have brought the request."""
+    """The simulated far end answers immediately, sooner than a wire could have delivered the request."""
     status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "1")
     told = " ".join(out.split())
     assert status == 0
@@ -382,14 +382,14 @@ def test_no_delay_is_negative_on_ports_without_bits(run: Run, port: str) -> None
     assert "after its request was handed over (a wire at 9600 8N1 takes 9.4 ms of it)" in told
 
 
-def test_the_echo_test_uses_the_line_s_settings(run: Run, port: str) -> None:
+def test_the_echo_test_uses_the_given_settings(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port, "--baudrate", "19200", "--format", "8E1")
     assert status == 0
     assert "none at 19200 8E1" in out
 
 
 class Responder:
-    """A line that records every request and answers with `answer`, which may return no bytes."""
+    """A line that records every request, and replies with the bytes that `answer` returns."""
 
     def __init__(self, answer: Callable[[bytes], bytes]) -> None:
         self.requests: list[bytes] = []
@@ -419,7 +419,7 @@ class Responder:
 
 @contextmanager
 def frame_server(answer: Callable[[bytes], bytes]) -> Iterator[str]:
-    """Serve one client after another on a port of this machine, as a far end that answers each piece."""
+    """Yield HOST:PORT of a server that replies to each received piece, for one client after another."""
 
     class Handler(socketserver.BaseRequestHandler):
         def handle(self) -> None:
@@ -447,11 +447,11 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
 
 
 @pytest.mark.slow
-def test_an_exception_in_the_echo_test_is_not_foreign_traffic(
+def test_an_exception_in_the_echo_test_is_not_called_foreign_traffic(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A server may answer for every address."""
-    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)  # it may come late on a busy machine
+    """A server may answer for every address, even an unused one."""
+    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)  # the reply may come late on a busy machine
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
     told = " ".join(run("doctor", end.path)[1].split())
     assert "answers with exception 04" in told
@@ -460,8 +460,8 @@ def test_an_exception_in_the_echo_test_is_not_foreign_traffic(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateway_s_exception_is_not_the_drive_s_answer(run: Run, responder: Any, code: int) -> None:
-    """It means that the device is not reached (application protocol V1.1b3, section 7)."""
+def test_a_gateways_exception_does_not_count_as_the_drives_answer(run: Run, responder: Any, code: int) -> None:
+    """These codes mean that the device was not reached (application protocol V1.1b3, section 7)."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
@@ -470,8 +470,8 @@ def test_a_gateway_s_exception_is_not_the_drive_s_answer(run: Run, responder: An
 
 
 @pytest.mark.slow
-def test_a_gateway_s_exception_proves_its_framing(run: Run) -> None:
-    """Nor do bytes without a frame in them prove that it speaks the other one."""
+def test_a_gateways_exception_proves_its_framing_and_noise_does_not(run: Run) -> None:
+    """Bytes without a frame do not prove that the far end speaks the other framing."""
 
     def answered(request: bytes) -> bytes:
         if request[2:4] != b"\0\0":
@@ -491,7 +491,7 @@ def test_a_gateway_s_exception_proves_its_framing(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_a_refusing_drive_is_present_and_its_code_is_printed(run: Run, responder: Any) -> None:
+def test_a_drive_that_refuses_counts_as_present_and_its_code_is_printed(run: Run, responder: Any) -> None:
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=6)))
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
@@ -500,8 +500,8 @@ def test_a_refusing_drive_is_present_and_its_code_is_printed(run: Run, responder
 
 
 @pytest.mark.slow
-def test_only_sent_requests_are_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A silent drive gets no request while a late reply may come; a skipped request does not count."""
+def test_the_round_trip_counts_only_sent_requests(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a late reply may come, a silent drive gets no request. Held-back requests do not count."""
     end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
@@ -524,7 +524,7 @@ def test_only_sent_requests_are_counted(run: Run, responder: Any, monkeypatch: p
         (("/dev/nowhere", "--framing", "rtu"), 2, "--framing needs a drive: add --model and --address"),
     ],
 )
-def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
+def test_mistaken_doctor_arguments_are_one_sentence(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
     found, out, err = run("doctor", *words)
     assert (found, out) == (status, "")
     assert sentence in err
@@ -554,7 +554,7 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     ),
     indirect=["port"],
 )
-def test_a_mixed_up_framing_is_reported(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
+def test_doctor_reports_a_far_end_with_the_other_framing(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
     place = port.partition("://")[2]
     status, said, _ = run("doctor", f"{asked}://{place}", "--model", "invt-che", "--address", "1")
     assert status == 1

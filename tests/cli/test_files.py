@@ -1,4 +1,4 @@
-"""New files of commands: whole or absent."""
+"""New files of commands are complete or absent."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_page_that_does_not_fit_on_the_disk_leaves_no_file(tmp_path: Path) -> 
 
 
 class PollerOf:
-    """A poller with these batches."""
+    """A poller that delivers these batches."""
 
     batches: tuple[Batch, ...] = ()
 
@@ -55,10 +55,10 @@ class PollerOf:
         pass
 
 
-def test_the_sentence_of_a_full_disk_counts_the_rows_that_can_be_read(
+def test_the_error_of_a_full_disk_counts_the_readable_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second batch does not fit; the third, which comes when the poller closes, would."""
+    """The second batch does not fit. The third one would, but must not follow a gap."""
     monkeypatch.setattr(PollerOf, "batches", (counting(20), counting(2000), counting(5)))
     monkeypatch.setattr(polling, "Poller", PollerOf)
     out = tmp_path / "run.arrows"

@@ -14,19 +14,19 @@ from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording.rows import from_rows
 
-WIDE_NAME = "\u4e3b\u6cf5-1"  # two columns for each of its first two characters
+WIDE_NAME = "\u4e3b\u6cf5-1"  # its first two characters take two columns each
 
 
 @pytest.fixture
 def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The terminal's columns and lines, which a test may change."""
+    """Return the terminal's columns and lines, in a list that a test may change."""
     found = [80, 24]
     monkeypatch.setattr(multidrop.cli.poll.shutil, "get_terminal_size", lambda: os.terminal_size(found))
     return found
 
 
 def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> list[str]:
-    """Return the output for each width in turn."""
+    """Return what is drawn on a terminal of each of these widths in turn."""
     path = tmp_path / "plant.toml"
     drive = f'[[line.drive]]\nname = "{WIDE_NAME}"\nmodel = "invt-che"\naddress = 1\n'
     path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{drive}poll = ["output_frequency"]\n', "utf-8")
@@ -42,7 +42,7 @@ def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> li
     return found
 
 
-def test_a_cut_line_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
+def test_a_table_line_that_is_cut_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
     whole, narrow = drawings(tmp_path, "utf-8", size, 80, 40)
     head = "DRIVE   SAMPLES  MISSES  NEWEST VALUES\n"
     assert whole == f"{head}{WIDE_NAME}        1       0  output_frequency 42.50 Hz\n"
@@ -50,12 +50,12 @@ def test_a_cut_line_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
 
 
 def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, size: list[int]) -> None:
-    """On 40 columns, 51 columns of values take two rows, and 38 columns of the head take one."""
+    """On 40 columns, the 51 columns of values take two rows, and the 38 columns of the head one."""
     again = [text[: text.index("J") + 1] for text in drawings(tmp_path, "utf-8", size, 80, 80, 40)[1:]]
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
 
 
-def test_a_name_that_the_terminal_lacks_moves_no_column(tmp_path: Path, size: list[int]) -> None:
+def test_a_name_that_cannot_be_encoded_moves_no_column(tmp_path: Path, size: list[int]) -> None:
     (text,) = drawings(tmp_path, "ascii", size, 80)
     assert "\\u" not in text
     assert text.endswith("\n??-1        1       0  output_frequency 42.50 Hz\n")

@@ -46,7 +46,7 @@ def test_lines_lost_by_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch
         fill(log)
         handler = LogThread(stream, FORMAT)
         handler.handle(record("first"))
-        until(lambda: handler._waiting.empty())  # its write hangs
+        until(lambda: handler._waiting.empty())  # the thread hangs in a write
         for number in range(8):
             handler.handle(record(f"line {number}"))
         told = [reader.readline().strip()]
@@ -56,7 +56,7 @@ def test_lines_lost_by_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch
     assert told == ["first", lost, "line 0", "line 1", "line 2"]
 
 
-def test_closing_writes_all_lines_and_ignores_a_closed_reader() -> None:
+def test_closing_a_log_writes_all_lines_and_ignores_a_closed_reader() -> None:
     unread, log = os.pipe()
     with os.fdopen(log, "w") as stream:
         handler = LogThread(stream, FORMAT)
@@ -73,7 +73,7 @@ def test_closing_writes_all_lines_and_ignores_a_closed_reader() -> None:
         assert not handler._thread.is_alive()
 
 
-def test_a_fleet_s_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fleets_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(*_: object) -> int:
         logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
         return 7
@@ -88,7 +88,7 @@ def test_a_fleet_s_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("command", [serve, hub])
-def test_logs_of_a_fleet_have_time_and_level_also_as_json(
+def test_logs_of_a_fleet_have_time_and_level_in_text_and_json(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, command: Any
 ) -> None:
     require_module("nats")
@@ -112,6 +112,6 @@ def test_logs_of_a_fleet_have_time_and_level_also_as_json(
 
 
 def test_closing_a_log_whose_thread_never_started_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C came before the start of the thread; `logging` closes the handler at exit."""
+    """Ctrl-C came before the thread was started. `logging` closes the handler at exit."""
     monkeypatch.setattr(threading.Thread, "start", lambda thread: None)
     LogThread(io.StringIO(), FORMAT).close()

@@ -1,4 +1,4 @@
-"""Families by name and from the user's files; every failure is a ValueError with one sentence."""
+"""Families by name, or from the user's files. Every failure is a ValueError with one sentence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def fan(tmp_path: Path) -> Path:
 
 
 def refused(text: str, relative_to: Path | None = None) -> str:
-    """The sentence with which it is refused."""
+    """Return the sentence of the error that this model raises."""
     try:
         find_model(text, relative_to)
     except ValueError as refusal:
@@ -48,11 +48,11 @@ def test_a_built_in_model_is_found_by_its_name() -> None:
         assert model.model == name
 
 
-def test_a_misspelt_model_gets_the_nearest_names() -> None:
+def test_a_misspelt_model_is_refused_with_the_nearest_names() -> None:
     assert "there is no model 'Inovert-IBD'; did you mean innovert-ibd or " in refused("Inovert-IBD")
 
 
-def test_an_unknown_model_gets_all_names() -> None:
+def test_an_unknown_model_is_refused_with_all_names() -> None:
     sentence = refused("zzz")
     assert all(name in sentence for name in MODELS)
 
@@ -64,11 +64,11 @@ def test_a_class_is_loaded_from_a_file_beside_the_plant_file(fan: Path) -> None:
     assert model(7).name == "fan@7"
 
 
-def test_a_file_is_loaded_once_so_that_its_drives_share_a_class(fan: Path) -> None:
+def test_a_model_file_is_loaded_once_so_its_drives_share_a_class(fan: Path) -> None:
     assert find_model("fan.py:Fan", fan.parent) is find_model(f"{fan}:Fan")
 
 
-def test_a_missing_class_in_a_file_is_reported(fan: Path) -> None:
+def test_a_class_missing_in_a_model_file_is_reported(fan: Path) -> None:
     here = fan.parent
     assert refused("fun.py:Fan", here) == f"there is no file {here}/fun.py to take a model from"
     assert refused("fan.py", here) == "fan.py names no class; write fan.py:Fan"
@@ -78,7 +78,7 @@ def test_a_missing_class_in_a_file_is_reported(fan: Path) -> None:
         assert refused(f"fan.py:{name}", here) == expected
 
 
-def test_a_link_to_another_file_type_is_reported(tmp_path: Path) -> None:
+def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path) -> None:
     (tmp_path / "fan.txt").write_text(FAN)
     (tmp_path / "fan.py").symlink_to("fan.txt")
     assert refused("fan.py:Fan", tmp_path) == f"{tmp_path}/fan.txt cannot be loaded as Python"
@@ -97,14 +97,14 @@ def test_a_link_to_another_file_type_is_reported(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_file_that_fails_is_a_sentence_with_its_line(tmp_path: Path, source: str, ending: str) -> None:
+def test_a_failing_model_file_is_one_sentence_with_its_line(tmp_path: Path, source: str, ending: str) -> None:
     (tmp_path / "broken.py").write_text(source)
     sentence = refused("broken.py:Fan", tmp_path)
     assert sentence.startswith(str(tmp_path / "broken.py"))
     assert sentence.endswith(ending)
 
 
-def test_a_failed_file_is_read_again(tmp_path: Path) -> None:
+def test_a_model_file_that_failed_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "later.py"
     path.write_text("1 / 0\n")
     assert "ZeroDivisionError" in refused("later.py:Fan", tmp_path)
@@ -112,7 +112,7 @@ def test_a_failed_file_is_read_again(tmp_path: Path) -> None:
     assert find_model("later.py:Fan", tmp_path).model == "fan"
 
 
-# ---- modules beside a file ----
+# ---- modules beside a model file ----
 
 USES_SCALES = """\
 from multidrop import Drive, reading
@@ -135,7 +135,7 @@ def with_scales(directory: Path, step: float, source: str = USES_SCALES) -> Path
     return directory
 
 
-def test_a_file_imports_the_modules_beside_it_and_no_other_directory_s(tmp_path: Path) -> None:
+def test_a_model_file_imports_only_modules_in_its_own_directory(tmp_path: Path) -> None:
     before, names = list(sys.path), {*sys.modules}
     one, two = (
         find_model("fan.py:Fan", with_scales(tmp_path / f"plant-{step}", step)) for step in (0.1, 0.5)
@@ -147,14 +147,14 @@ def test_a_file_imports_the_modules_beside_it_and_no_other_directory_s(tmp_path:
     assert {name for name in {*sys.modules} - names if not name.startswith("multidrop")} == set()
 
 
-def test_a_module_beside_a_file_is_run_once(tmp_path: Path) -> None:
+def test_a_module_beside_a_model_file_is_run_once(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "other.py").write_text(USES_SCALES)
     families = [find_model(f"{name}.py:Fan", directory) for name in ("fan", "other")]
     assert len({id(family.step_later(None)) for family in families}) == 1  # type: ignore[attr-defined]
 
 
-def test_modules_beside_a_file_may_import_each_other(tmp_path: Path) -> None:
+def test_modules_beside_a_model_file_may_import_each_other(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "scales.py").write_text("import units\nSTEP = units.STEP\n")
     (directory / "units.py").write_text("import scales\nSTEP = 0.25\n")
@@ -162,7 +162,7 @@ def test_modules_beside_a_file_may_import_each_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["json", "multidrop"])
-def test_no_file_replaces_a_module_of_python_or_multidrop(tmp_path: Path, name: str) -> None:
+def test_a_user_file_never_replaces_a_module_of_python_or_multidrop(tmp_path: Path, name: str) -> None:
     source = f"import {name}\nOURS = {name}\n{FAN}"
     (tmp_path / "fan.py").write_text(source)
     (tmp_path / f"{name}.py").write_text("1 / 0\n")
@@ -197,7 +197,7 @@ def test_a_failing_neighbour_module_is_reported_with_its_line(tmp_path: Path) ->
     assert find_model("fan.py:Fan", directory).registers["speed"].step == 2.0
 
 
-def test_a_missing_module_is_reported(tmp_path: Path) -> None:
+def test_a_module_missing_beside_a_model_file_is_reported(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "scales.py").unlink()
     ending = "fan.py, line 2: ModuleNotFoundError: No module named 'scales'"

@@ -1,4 +1,4 @@
-"""The monitor: its values, its picture at any terminal size, and its keys, which can only stop drives."""
+"""The monitor: its values, its pictures at any terminal size, and its keys, which can only stop drives."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def row(drive: str, register: str, value: float | None, status: str = "ok", ago:
 
 
 def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) -> dict[str, LineStatistics]:
-    """Return statistics of a line on which only the first drive has counts."""
+    """Return statistics of a line of which only the first drive has exchanges."""
     busy = Counters(
         sent=exchanges,
         ideal_ns=round(utilisation * seconds * SECOND),
@@ -88,7 +88,7 @@ def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) ->
         late=2,
         stray_bytes=17,
         longest_ns=31_000_000,
-        delays=Counter({56: 99, 64: 1}),  # 8.4 to 9.4 ms, 16.8 to 18.9 ms
+        delays=Counter({56: 99, 64: 1}),  # bins of 8.4 to 9.4 ms and of 16.8 to 18.9 ms
     )
     counters_by_drive = {f"drive-{at}": busy if at == 1 else Counters() for at in range(1, drives + 1)}
     return {"hall-1": line_statistics(seconds, counters_by_drive, None)}
@@ -96,7 +96,7 @@ def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) ->
 
 @pytest.fixture
 def watched(tmp_path: Path) -> LivePlant:
-    """One drive that runs, one with a fault, one that never answered."""
+    """Return a plant with one drive that runs, one with a fault, and one that never answered."""
     live = LivePlant(a_plant(tmp_path))
     rows = [
         row("drive-1", "output_frequency", 42.5),
@@ -119,7 +119,7 @@ def texts(lines: list[Any]) -> list[str]:
     return [line.plain for line in lines]
 
 
-# ---- what it knows ----
+# ---- states and histories ----
 
 
 def test_states_come_from_polled_registers(watched: LivePlant) -> None:
@@ -132,12 +132,12 @@ def test_states_come_from_polled_registers(watched: LivePlant) -> None:
     assert [drive.so_far.misses.total() for drive in watched.drives] == [12, 0, 0]
 
 
-def test_a_silent_drive_keeps_its_reason(watched: LivePlant) -> None:
+def test_a_silent_drive_that_is_not_asked_keeps_its_first_reason(watched: LivePlant) -> None:
     watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
     assert watched.drives[2].why_silent == "no reply"
 
 
-def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
+def test_a_frequency_of_0_is_not_shown_as_stopped(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
     assert live.drives[0].state == ""
@@ -156,7 +156,7 @@ def test_flags_without_a_set_bit_name_no_state(tmp_path: Path) -> None:
     assert live.drives[0].state == ""
 
 
-def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
+def test_rates_are_measured_over_the_last_seconds(watched: LivePlant) -> None:
     recent = watched.recent["hall-1"]
     assert recent.exchanges_per_second == pytest.approx(50)
     assert recent.utilisation == pytest.approx(0.9)
@@ -177,14 +177,14 @@ def test_history_has_a_gap_for_a_miss(watched: LivePlant) -> None:
     assert sparkline([1, 2], 0) == ""
 
 
-def test_a_long_history_is_drawn_as_means_that_do_not_move() -> None:
+def test_a_long_history_is_drawn_as_means_that_keep_their_columns() -> None:
     assert sparkline([0, 7, 0, 7, 7, 7, None, None, 0, 0], 5) == "▅▅█ ▁"
     steps = [0.0] * 60 + [7.0] * 60 + [0.0] * 120
     pictures = [sparkline(steps[at : at + 120], 30, points=120 + at) for at in range(100)]
     assert {picture.strip("▁") for picture in pictures[:60]} == {"█" * 15}
 
 
-def test_history_is_one_register_s(tmp_path: Path) -> None:
+def test_a_history_has_values_of_one_register_only(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     for name, value in (("status", 3.0), ("output_frequency", 50.0)):
         live.add(from_rows([row("drive-1", name, value)]))
@@ -192,7 +192,7 @@ def test_history_is_one_register_s(tmp_path: Path) -> None:
     assert list(live.drives[0].history) == [None, 50.0]
 
 
-# ---- how it looks ----
+# ---- pictures ----
 
 
 def test_the_overview_shows_states_in_words(watched: LivePlant) -> None:
@@ -209,13 +209,13 @@ def test_the_overview_shows_states_in_words(watched: LivePlant) -> None:
     assert "start" not in " ".join(lines).lower()
 
 
-def test_one_old_value_among_new_ones_is_marked(watched: LivePlant) -> None:
+def test_an_old_value_among_new_ones_is_marked(watched: LivePlant) -> None:
     for drive in watched.drives:
-        drive.cycle = 1.0  # s: values count as current for three cycles
+        drive.cycle = 1.0  # in s; values count as current for three cycles
     watched.add(from_rows([row("drive-1", "output_frequency", None, "exception 02", ago=0)]))
     at = Position()
     shown = [texts(overview(watched, at, (80, 24), NOW + wait, BLOCKS))[3] for wait in (0, SECOND)]
-    assert [" 42.50 Hz " in line for line in shown] == [True, False]  # one miss is none yet
+    assert [" 42.50 Hz " in line for line in shown] == [True, False]  # one miss does not make a value old
     assert shown[1].split()[1:8] == ["running", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
 
 
@@ -228,7 +228,7 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
     drive.add(row("drive-1", "output_frequency", 42.5))
     ages = [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (100, 170, 190)]
     assert ages == [False, False, True]
-    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}  # of a line full of drives
+    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}  # the planned cycle of a line with many drives
     (drive,) = LivePlant(plant, planned).drives
     drive.add(row("drive-1", "output_frequency", 42.5))
     assert [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (290, 310)] == [
@@ -237,16 +237,16 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
     ]
 
 
-def test_side_reads_take_little_time_of_a_full_line(tmp_path: Path) -> None:
+def test_side_reads_take_only_little_time_of_a_full_line(tmp_path: Path) -> None:
     for utilisation, share in ((0.2, 0.05), (0.97, 0.03), (1.0, 0.01), (3.0, 0.01)):
         assert 0.03 / (0.03 + pause_s(0.03, utilisation)) == pytest.approx(share)
-    assert pause_s(0.001, 0.2) == 0.1  # a fast line
+    assert pause_s(0.001, 0.2) == 0.1  # least pause on a fast line
     plant = a_plant(tmp_path, 1)
     (drive,) = LivePlant(plant, plant.metadata()["planned"]).drives
     assert drive.line_utilisation == 1.0  # polled as fast as the line allows
 
 
-def test_unencodable_characters_take_the_same_columns() -> None:
+def test_replaced_characters_keep_the_text_in_its_columns() -> None:
     text = "Июль 主 26 °C"
     for encoding, shown in (("ascii", "???? ?? 26 ?C"), ("utf-8", text)):
         with TextIOWrapper(BytesIO(), encoding) as terminal:
@@ -254,7 +254,7 @@ def test_unencodable_characters_take_the_same_columns() -> None:
         assert columns_of(shown) == columns_of(text)
 
 
-def test_a_picture_is_drawn_over_the_last_one_and_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_picture_replaces_the_last_and_is_removed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "6")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
@@ -292,7 +292,7 @@ def test_a_picture_fills_every_size(tmp_path: Path, size: tuple[int, int], drive
 
 
 @pytest.mark.parametrize("name", ["pump", "a-drive-of-a-long-name", "主泵电机三号线北侧冷却水循环"])
-def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> None:
+def test_the_least_width_shows_the_age_and_all_keys(tmp_path: Path, name: str) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name
     size = LEAST_WIDTH, LEAST_HEIGHT
@@ -300,24 +300,24 @@ def test_the_least_width_has_the_age_and_all_keys(tmp_path: Path, name: str) -> 
     assert shown[2].split()[-1] == "AGE"
     assert shown[3].rstrip().endswith(" never")
     assert columns_of(shown[3]) <= LEAST_WIDTH
-    assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())  # in line with its heading
+    assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())  # the value is aligned with its heading
     for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
         assert lines[-1].endswith("s stop   S stop all   q quit")
 
 
-def test_no_heading_is_cut(watched: LivePlant) -> None:
+def test_no_heading_of_the_overview_is_cut(watched: LivePlant) -> None:
     widths = range(LEAST_WIDTH, 160)
     headings = [texts(overview(watched, Position(), (width, 24), NOW, BLOCKS))[2] for width in widths]
     assert [heading for heading in headings if "~" in heading] == []
 
 
-def test_a_wide_overview_has_long_names_whole(tmp_path: Path) -> None:
+def test_a_wide_overview_shows_long_names_in_full(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name = "conveyor-of-the-bottling-hall-south-12"
     assert texts(overview(live, Position(), (200, 50), NOW, BLOCKS))[3].split()[0] == f">{name}"
 
 
-def test_the_page_has_every_register(watched: LivePlant) -> None:
+def test_a_drives_page_shows_every_register(watched: LivePlant) -> None:
     live = watched.drives[1]
     others = {"motor_speed": SideRead("0 rpm", NOW - 14 * SECOND)}
     lines = texts(page(live, others, Position(1, page=True), (80, 40), NOW))
@@ -331,7 +331,7 @@ def test_the_page_has_every_register(watched: LivePlant) -> None:
     assert rows["device"].split()[1] == "..."
 
 
-def test_a_page_has_whole_reasons_beside_short_values(watched: LivePlant) -> None:
+def test_a_page_shows_full_reasons_beside_short_values(watched: LivePlant) -> None:
     why = "not asked: drive is silent"
     watched.add(from_rows([row("drive-1", name, None, why) for name in CHE]))
     lines = texts(page(watched.drives[0], {}, Position(page=True), (80, 24), NOW))
@@ -346,14 +346,14 @@ def test_ages_have_readable_units(watched: LivePlant, seconds: int, age: str) ->
     assert " ".join(lines[3].split()[6:8]) == age
 
 
-def test_a_wide_overview_has_the_delays(watched: LivePlant) -> None:
+def test_a_wide_overview_shows_response_delays(watched: LivePlant) -> None:
     lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
     assert lines[2].split()[-3:] == ["DELAY", "LAST", "MINUTE"]
     assert " 8.9 ms " in lines[3]
     assert " ms " not in lines[4]
 
 
-def test_the_page_shows_a_drive_s_response_delays(watched: LivePlant) -> None:
+def test_a_page_shows_the_drives_response_delays(watched: LivePlant) -> None:
     lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
     assert lines[1] == " running      12 missed: bad checksum 9, no reply 3"
     assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
@@ -361,7 +361,7 @@ def test_the_page_shows_a_drive_s_response_delays(watched: LivePlant) -> None:
     assert silent[2] == " 0.0 exchanges/s"
 
 
-def test_the_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
+def test_a_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
     at = Position(0, page=True, scrolled=1000)
     lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
     assert lines[9].strip()
@@ -369,7 +369,7 @@ def test_the_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
     assert f"of {len([register for register in registers if register.readable])}" in lines[-2]
 
 
-# ---- its keys ----
+# ---- keys ----
 
 
 @table(
@@ -379,13 +379,13 @@ def test_the_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
         (b"\x1b[A\x1b[B\r", [UP, DOWN, ENTER]),
         (b"\x1bOBsy", [DOWN, "s", "y"]),
         (b"\x1b[5~\x1b", ["page up", "escape"]),
-        ("ыЫнй".encode(), ["s", "S", "y", "q"]),  # the same keys with a Russian layout
-        ("\u0456\u043e\u0441".encode(), ["s", DOWN, "\u0441"]),  # and a Ukrainian one
+        ("ыЫнй".encode(), ["s", "S", "y", "q"]),  # the same keys in a Russian layout
+        ("\u0456\u043e\u0441".encode(), ["s", DOWN, "\u0441"]),  # and in a Ukrainian layout
         (b"\xd1s\xff", ["\ufffd", "s", "\ufffd"]),
         (b"\x1bOSy\x1b[1;2S\x1b[[As\x1b[a\x1bOq", [UNKNOWN, "y", UNKNOWN, UNKNOWN, "s", UNKNOWN, UNKNOWN]),
     ],
 )
-def test_keys_that_come_together_are_separated(pressed: bytes, told: list[str]) -> None:
+def test_keys_that_arrive_together_are_separated(pressed: bytes, told: list[str]) -> None:
     found = []
     while pressed:
         key, pressed = next_key(pressed)
@@ -396,16 +396,16 @@ def test_keys_that_come_together_are_separated(pressed: bytes, told: list[str]) 
 @table(
     ("pieces", "pressed"),
     [
-        ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # F4
+        ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # bytes of F4
         ([b"j\x1b[", b"5", b"~y"], [DOWN, PAGE_UP, "y"]),
-        (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["s"]),  # with a Russian layout
+        (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["s"]),  # the key of s in a Russian layout, in two pieces
         ([b"\x1b", b""], ["escape"]),
     ],
 )
-def test_a_key_whose_bytes_come_apart_is_one_key(
+def test_a_key_whose_bytes_arrive_separately_is_one_key(
     monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], pressed: list[str]
 ) -> None:
-    """A network may divide them: F4 ends in S, but must not stop all drives."""
+    """A network may split a key's bytes: those of F4 end in S, which must not stop all drives."""
     terminal, end = os.openpty()
     left = iter(pieces)
 
@@ -423,7 +423,7 @@ def test_a_key_whose_bytes_come_apart_is_one_key(
 
 
 class Poller:
-    """A poller that records the calls of its bus."""
+    """A poller that records which methods of its bus are called."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
@@ -453,18 +453,18 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
     anyone: Any = poller
     session = PollingSession(anyone, Interruption(), lambda: None)
     monitor: Any = Monitor(LivePlant(plant), session, Screen())
-    monitor._begin = lambda what, work: False  # at once
+    monitor._begin = lambda what, work: False  # stops are carried out in this thread
     monitor._side_reader.read = lambda chosen: {}
     return monitor, poller
 
 
-def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_only_after_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
     for keys, asked in (
         (["s", "n"], []),
         (["s", ENTER], []),
-        (["s", "Y"], ["drive-1 control STOP"]),  # with caps lock on
-        (["s", "S", "y"], ["stop all"]),  # the question is another one
+        (["s", "Y"], ["drive-1 control STOP"]),  # Y with caps lock on
+        (["s", "S", "y"], ["stop all"]),  # S replaces the question of s
         (["y"], []),
         ([DOWN, "s", "y"], ["drive-2 control STOP"]),
         (["S", "n"], []),
@@ -476,7 +476,7 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert poller.asked == asked
 
 
-def test_a_stop_is_sent_if_no_thread_can_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_even_if_no_thread_can_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(thread: object) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -489,7 +489,7 @@ def test_a_stop_is_sent_if_no_thread_can_start(tmp_path: Path, monkeypatch: pyte
     assert not monitor._is_stopping
 
 
-def test_all_lines_are_sent_their_stops_before_one_is_waited_for_without_threads(
+def test_without_threads_stops_go_to_all_lines_before_one_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[str, float | None]] = []
@@ -501,7 +501,7 @@ def test_all_lines_are_sent_their_stops_before_one_is_waited_for_without_threads
         def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
             asked.append((self.line, seconds))
             if (self.line, seconds) == ("hall-2", 0.0):
-                raise OSError("the ledger cannot be kept")  # which keeps no other line's stop back
+                raise OSError("the ledger cannot be kept")  # must not delay the stops of other lines
             return {self.line: Stopped(self.line, Seen.STOPPED, 0.1)}
 
     monitor, poller = a_monitor(tmp_path, monkeypatch)
@@ -522,7 +522,7 @@ def seen(monitor: Any) -> str:
     return "\n".join(line.rstrip() for line in texts(monitor._picture()))
 
 
-def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stops_failure_is_shown_until_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
     monitor._plant.tick(0.0, told(1, 1, 0.5))
     for key in "Sy":
@@ -533,7 +533,7 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     assert "a acknowledge FAILURES" in seen(monitor)
     stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
     poller.stop_all = lambda: stopped  # type: ignore[method-assign]
-    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
+    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a stop that succeeded
         monitor._obey(key)
         assert failure in seen(monitor)
     assert monitor.await_stops() == monitor._at.failures
@@ -543,7 +543,7 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     assert monitor.await_stops() == []
 
 
-def test_the_result_of_a_stop_of_all_names_all_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_of_stopping_all_counts_drives_and_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
     (line,) = monitor._plant.plant.lines
     both = (line, replace(line, name="hall-2"))
@@ -552,7 +552,7 @@ def test_the_result_of_a_stop_of_all_names_all_lines(tmp_path: Path, monkeypatch
     assert messages == ["1 of 2 drives stopped, on 1 of 2 lines so far", "2 of 4 drives stopped"]
 
 
-def test_hidden_failures_are_shown_after_the_first_are_acknowledged(watched: LivePlant) -> None:
+def test_hidden_failures_are_shown_after_visible_ones_are_acknowledged(watched: LivePlant) -> None:
     at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
     shown: list[str] = []
     for more in (24, 17, 10, 3, 0):
@@ -565,7 +565,7 @@ def test_hidden_failures_are_shown_after_the_first_are_acknowledged(watched: Liv
 
 
 @pytest.mark.parametrize("failure", [OSError("the ledger cannot be kept"), KeyError("odd"), RuntimeError()])
-def test_a_stop_that_fails_in_any_way_is_seen(
+def test_any_exception_of_a_stop_is_shown_as_a_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
@@ -583,7 +583,7 @@ def test_a_stop_that_fails_in_any_way_is_seen(
     assert f"stopping drive-1 failed: {words}" in seen(monitor)
 
 
-def test_a_failed_stop_is_not_reported_as_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_stop_is_not_shown_as_being_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
 
     def fail(*details: object) -> None:
@@ -596,12 +596,12 @@ def test_a_failed_stop_is_not_reported_as_repeated(tmp_path: Path, monkeypatch: 
     assert monitor._at.message == "stopping drive-1 failed"
 
 
-def test_leaving_during_a_stop_asks_and_waits(
+def test_quitting_during_a_stop_asks_and_then_waits_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
     stands = threading.Event()
-    del monitor._begin  # in a thread, as it is
+    del monitor._begin  # restores the real method, which starts a thread
     monitor._stop = lambda chosen: (str(stands.wait(PATIENCE)), [])
     for key in ("s", "y", "q", "n"):
         monitor._obey(key)
@@ -609,7 +609,7 @@ def test_leaving_during_a_stop_asks_and_waits(
     for key in ("q", "y"):
         monitor._obey(key)
     assert monitor._has_left
-    monitor._session = monitor._session._replace(hand_out=stands.set)  # what is polled meanwhile is recorded
+    monitor._session = monitor._session._replace(hand_out=stands.set)  # rows are still recorded while it waits
     assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)
     assert "waiting for a stop in progress" in capsys.readouterr().err
@@ -630,7 +630,7 @@ def test_page_keys_scroll_a_page_and_choose_in_the_overview(
     assert monitor._at.chosen == 1
 
 
-def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_key_can_do_more_than_stop_motors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
     for key in [*string.printable, *KEYS.values()]:
         for answer in "yY\r ":
@@ -643,7 +643,8 @@ def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its reads return at once, without bytes or with an error; there may be no signal."""
+    """Reads of a closed terminal return immediately, without bytes or with an error. There may be no signal.
+    """
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)
         monkeypatch.setattr(sys, "stdin", stdin)
@@ -654,13 +655,13 @@ def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch
 
 
 def await_both(terminal: Terminal) -> None:
-    """Wait until one drive is silent, and a value of the other was read: its age is shown."""
+    """Wait until one drive is shown as silent, and the age of the other's value is shown."""
     terminal.wait_for_match(r"pump-9 .*silent")
     terminal.wait_for_match(r"\d\.\d s ")
 
 
 @pytest.mark.long
-def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
+def test_the_monitor_restores_its_terminal(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         terminal.press(b"\r")
@@ -676,13 +677,13 @@ def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
-    """Not below it: a screen that scrolls is never still, and shows parts of two pictures."""
+def test_each_picture_of_the_monitor_is_drawn_over_the_last(plant: Path) -> None:
+    """A screen that scrolls would never be still, and would show parts of two pictures."""
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         pictures = homes = 0
         while pictures < 4:
-            terminal.press(b"\x1b[B")  # forgets what was written: within a picture, maybe
+            terminal.press(b"\x1b[B")  # drops what was written so far, maybe within a picture
             terminal.wait_for("q quit")
             terminal.wait_for("multidrop monitor")
             pictures += len(re.findall(rb".{5} multidrop monitor", terminal.written, re.DOTALL))
@@ -693,7 +694,7 @@ def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_stop_is_carried_out_and_reported(plant: Path) -> None:
+def test_a_stop_by_key_is_carried_out_and_reported(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         terminal.press(b"sy")
@@ -703,7 +704,7 @@ def test_a_stop_is_carried_out_and_reported(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_page_shows_why_an_unpolled_value_is_missing(plant: Path) -> None:
+def test_a_page_shows_why_an_unpolled_value_is_missing(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         terminal.press(b"\x1b[B\r")
@@ -723,12 +724,12 @@ def test_the_monitor_records_what_it_shows(plant: Path, tmp_path: Path) -> None:
     rows = [row for batch in open_recording(out) for row in batch]
     assert {row.drive for row in rows} == {"pump-1", "pump-9"}
     with on_terminal("monitor", plant, "--out", out) as terminal:
-        terminal.wait_for("seen.arrows")  # it is there already
+        terminal.wait_for("seen.arrows")  # the recording exists already
         assert terminal.process.wait(timeout=60) == 2
 
 
 @pytest.mark.long
-def test_without_an_open_port_no_recording_is_made(tmp_path: Path) -> None:
+def test_the_monitor_creates_no_recording_if_no_port_opens(tmp_path: Path) -> None:
     plant, out = tmp_path / "hall.toml", tmp_path / "seen.arrows"
     plant.write_text(
         '[[line]]\nname = "hall"\nport = "/dev/not-there"\n'
@@ -741,7 +742,7 @@ def test_without_an_open_port_no_recording_is_made(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
+def test_the_monitor_is_complete_without_colours_and_utf_8(plant: Path) -> None:
     environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
     with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:
         terminal.wait_for(">pump-1")
@@ -753,7 +754,7 @@ def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_dumb_terminal_scrolls(plant: Path) -> None:
+def test_on_a_dumb_terminal_the_monitor_scrolls(plant: Path) -> None:
     with on_terminal("monitor", plant, TERM="dumb") as terminal:
         terminal.wait_for(">pump-1")
         terminal.wait_for("q quit")
@@ -766,13 +767,13 @@ def test_a_dumb_terminal_scrolls(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:
+def test_the_monitor_refuses_a_terminal_that_is_too_small(plant: Path) -> None:
     with on_terminal("monitor", plant, size=(40, 10)) as terminal:
         terminal.wait_for("the terminal has 40 x 10")
         assert terminal.process.wait(timeout=60) == 2
 
 
-def test_without_a_terminal_it_says_what_works(run: Run, tmp_path: Path) -> None:
+def test_without_a_terminal_the_monitor_suggests_other_commands(run: Run, tmp_path: Path) -> None:
     status, _, err = run("monitor", plant_file(tmp_path))
     assert status == 2
     assert err.startswith("multidrop: `multidrop monitor` needs a terminal on Linux or macOS; ")

@@ -1,4 +1,4 @@
-"""Output in an encoding that lacks letters, such as a pipe's on Windows."""
+"""Output in an encoding that lacks some letters, such as that of a pipe on Windows."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ address = 1
 
 
 @pytest.mark.parametrize("words", [["plan"], ["plan", "--json"]])
-def test_letters_that_the_encoding_lacks_are_spelt_out(
+def test_letters_that_the_encoding_lacks_are_printed_as_escapes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     plant, out = tmp_path / "plant.toml", BytesIO()

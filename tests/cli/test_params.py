@@ -1,4 +1,4 @@
-"""The command params, against a simulated drive."""
+"""`multidrop params`, run against a simulated drive."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def sim() -> MotorDrive:
 
 @pytest.fixture
 def drive(sim: MotorDrive, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[object, ...]]:
-    """The words that name the drive; the working directory is empty."""
+    """Yield the command-line words that name the drive. The working directory is empty."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
@@ -42,7 +42,7 @@ def edited(path: str, before: str, after: str) -> None:
     Path(path).write_text(text.replace(before, after))
 
 
-def test_save_diff_and_apply(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_saved_parameters_are_compared_and_applied(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     assert run("params", "save", *drive, "pump.toml")[0] == 0
     assert run("params", "diff", "pump.toml", *drive)[0] == 0
     sim["acceleration_time"] = 25.0
@@ -58,7 +58,7 @@ def test_save_diff_and_apply(run: Run, drive: tuple[object, ...], sim: MotorDriv
     assert "has these parameters already" in run("params", "apply", "pump.toml", *drive, "--yes")[1]
 
 
-def test_apply_asks_first(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     status, _, err = run("params", "apply", "pump.toml", *drive)
@@ -66,7 +66,7 @@ def test_apply_asks_first(run: Run, drive: tuple[object, ...], sim: MotorDrive) 
     assert "Write 1 parameter to" in err
 
 
-def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_commissioning_needs_a_terminal_for_confirmation(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     words = ("params", "apply", "pump.toml", *drive, "--yes", "--commissioning", "--audit", "audit.jsonl")
@@ -85,7 +85,7 @@ def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim
     assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
 
 
-def test_running_motor_refuses(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_apply_writes_nothing_while_the_motor_runs(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     sim.motor.target = 40.0
@@ -96,7 +96,7 @@ def test_running_motor_refuses(run: Run, drive: tuple[object, ...], sim: MotorDr
     assert sim["acceleration_time"] == 25.0
 
 
-def test_json(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_params_actions_print_json(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     saved = json.loads(run("params", "save", *drive, "pump.csv", "--json")[1])
     assert saved["parameters"]["b.003"] == 100
     sim["acceleration_time"] = 25.0
@@ -140,7 +140,7 @@ def test_two_files_and_two_drives_are_compared(run: Run, drive: tuple[object, ..
         (("list", "invt-che"), "follow no known rule"),
     ],
 )
-def test_bad_input_gets_one_sentence(
+def test_mistaken_params_arguments_are_one_sentence(
     run: Run, drive: tuple[object, ...], words: tuple[str, ...], sentence: str
 ) -> None:
     Path("plant.toml").write_text("[[line]]\nname = 'hall'\n")

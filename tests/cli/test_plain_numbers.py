@@ -15,18 +15,18 @@ from multidrop.importers.numbers import count, number
 from multidrop.printable import plain_number, plain_whole
 from multidrop.recording.csv import _parse
 
-# Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and Python's own underscore.
+# Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and underscores as in Python.
 ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", "12\u00a0", "1\u066b5"]
 
 
 @pytest.mark.parametrize("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
-def test_other_digits_are_not_numbers(text: str) -> None:
+def test_texts_with_other_digits_are_not_parsed_as_numbers(text: str) -> None:
     for parse in (plain_number, plain_whole):
         with pytest.raises(ValueError, match="in decimal digits"):
             parse(text)
 
 
-def test_plain_numbers_are_taken_as_they_are() -> None:
+def test_numbers_in_ascii_digits_are_parsed() -> None:
     given = ("12", " 12 ", "+12", "-0", "12.", ".5", "1e1", "0012")
     assert [plain_number(text) for text in given] == [12, 12, 12, 0, 12, 0.5, 10, 12]
     assert [plain_whole(text) for text in ("12", " 12", "+12", "-3", "0012")] == [12, 12, 12, -3, 12]
@@ -65,7 +65,7 @@ def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
         ["doctor", "/dev/none", "--address", "{}"],
     ],
 )
-def test_other_digits_are_a_mistake_of_the_command(
+def test_other_digits_in_arguments_make_a_command_return_2(
     words: list[str], text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([word.format(text) for word in words]) == 2

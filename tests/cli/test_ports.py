@@ -1,4 +1,4 @@
-"""`multidrop ports`: the list of serial ports and the advice on permissions, on an invented /sys."""
+"""`multidrop ports`: the list of serial ports and the advice on permissions, with a simulated /sys."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multidrop.cli import main, ports
 
 @pytest.fixture
 def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A computer with an FTDI adapter, and a driver's entry for a UART that is absent."""
+    """Return the /dev of a simulated computer with an FTDI adapter and an entry for an absent UART."""
     usb = tmp_path / "sys/devices/usb1/1-4"
     for name, text in (
         ("idVendor", "0403"),
@@ -39,7 +39,7 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "dev"
 
 
-def test_ports_lists_real_ports_with_adapter_and_driver(
+def test_ports_lists_existing_ports_with_adapter_and_driver(
     devices: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["ports"]) == 0
@@ -48,7 +48,7 @@ def test_ports_lists_real_ports_with_adapter_and_driver(
     )
 
 
-def test_ports_without_a_port_advises_to_plug_one_in(
+def test_without_any_port_the_advice_is_to_plug_one_in(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(ports, "_linux_ports", lambda: iter(()))

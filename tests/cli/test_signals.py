@@ -1,4 +1,4 @@
-"""Signals during a command: repeated Ctrl-C, and a closed terminal."""
+"""Signals during a command: repeated Ctrl-C, and the closing of its terminal."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def hangup_is_deadly() -> Iterator[None]:
 
 
 def hang_up() -> None:
-    """Send SIGHUP, to which each command has an answer: else this process would end here."""
+    """Send SIGHUP to this process. If no command handled it, the process would end."""
     assert callable(signal.getsignal(signal.SIGHUP))
     signal.raise_signal(signal.SIGHUP)
 
 
 def test_a_closed_terminal_is_noted_but_does_not_interrupt(hangup_is_deadly: None) -> None:
     with noting_signals() as interruption:
-        for _ in range(2):  # a shell and the system send one each
+        for _ in range(2):  # a shell and the system send one signal each
             hang_up()
         assert interruption.came
-        signal.raise_signal(signal.SIGTERM)  # of a system that ends the session
+        signal.raise_signal(signal.SIGTERM)  # sent by a system that ends the session
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
 
@@ -55,7 +55,7 @@ def test_a_closed_terminal_interrupts_a_command_once(hangup_is_deadly: None) -> 
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
 
-def test_nohup_is_respected() -> None:
+def test_under_nohup_sighup_is_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with end_signals_interrupt(), noting_signals() as interruption:
@@ -65,7 +65,7 @@ def test_nohup_is_respected() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_service_ends_once_when_its_terminal_is_closed(hangup_is_deadly: None) -> None:
+def test_a_service_is_ended_only_once_when_its_terminal_is_closed(hangup_is_deadly: None) -> None:
     ends: list[int] = []
 
     async def service() -> None:
@@ -90,7 +90,7 @@ def test_a_service_ends_once_when_its_terminal_is_closed(hangup_is_deadly: None)
     assert ends == [1]
 
 
-def test_a_second_signal_interrupts_at_once() -> None:
+def test_a_second_signal_interrupts_immediately() -> None:
     with noting_signals() as interruption:
         assert not interruption.came
         signal.raise_signal(signal.SIGINT)
@@ -103,7 +103,7 @@ def test_a_second_signal_interrupts_at_once() -> None:
 @pytest.mark.slow
 def test_poll_keeps_its_recording_when_its_terminal_is_closed(plant: Path, tmp_path: Path) -> None:
     require_module("pyarrow")
-    out = tmp_path / "out.parquet"  # which cannot be read unless it was closed
+    out = tmp_path / "out.parquet"  # a Parquet file cannot be read unless it was closed
     with closing_terminal("poll", plant, "--out", out) as terminal:
         terminal.wait_for_match(r"pump-1 +[1-9]")
         terminal.close()
@@ -119,23 +119,23 @@ def test_simulate_removes_its_links_when_its_terminal_is_closed(tmp_path: Path) 
         terminal.wait_for("ready hall-1")
         assert link.is_symlink()
         terminal.close()
-        assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it
+        assert terminal.process.wait(PATIENCE) >= 0  # it was not ended by a signal
     assert not link.is_symlink()
 
 
 @pytest.mark.long
 @pytest.mark.slow
 def test_the_demo_of_serve_ends_when_its_terminal_is_closed() -> None:
-    """It has no plant file that could be read again."""
+    """The demo has no plant file that could be read again."""
     require_module("uvicorn")
     with closing_terminal("serve", "--demo", "--no-browser") as terminal:
         terminal.wait_for("Ctrl-C ends it")
         terminal.close()
-        assert terminal.process.wait(PATIENCE) >= 0  # no signal ended it
+        assert terminal.process.wait(PATIENCE) >= 0  # it was not ended by a signal
 
 
 @pytest.mark.slow
-def test_a_gateway_ends_with_its_terminal(tmp_path: Path) -> None:
+def test_a_fleets_gateway_ends_when_its_terminal_is_closed(tmp_path: Path) -> None:
     require_module("uvicorn")
     path = plant_file(tmp_path)
     with path.open("a") as file:
@@ -179,7 +179,7 @@ def test_a_closed_terminal_ends_its_foreground_command(
 
 
 def interrupted_class(words: list[str]) -> int:
-    """Make a class whose attribute is interrupted, as an import may be; Python 3.11 raises RuntimeError."""
+    """Create a class during which Ctrl-C comes, as in an import. Python 3.11 raises RuntimeError then."""
 
     class Interrupted:
         def __set_name__(self, owner: type, name: str) -> None:
@@ -190,7 +190,7 @@ def interrupted_class(words: list[str]) -> int:
 
 
 def interrupted_parser(words: list[str]) -> int:
-    """Raise as argparse does, whose `finally` fails if its parser is interrupted."""
+    """Raise as argparse does if Ctrl-C comes while it parses: its `finally` fails."""
     try:
         raise KeyboardInterrupt
     finally:
@@ -210,7 +210,7 @@ def test_ctrl_c_during_the_first_imports_is_one_sentence() -> None:
 
 
 @pytest.mark.parametrize("run", [interrupted_class, interrupted_parser])
-def test_an_interruption_that_python_wraps_is_one_sentence(
+def test_an_interruption_wrapped_by_python_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run: Callable[[list[str]], int]
 ) -> None:
     monkeypatch.setattr(cli, "_run_interruptible", run)

@@ -1,6 +1,7 @@
-"""A mixed line that pymodbus masters, while `sniff` only listens: first undamaged, then damaged on the way.
+"""A line with several framings, on which pymodbus is the master and `sniff` listens.
 
-SNIFFED_EXCHANGES says how many exchanges: 3,000 in .ci/run, 10,000 for the whole proof.
+The listener first receives all bytes undamaged, then with damage. SNIFFED_EXCHANGES is the number of
+exchanges: 3,000 in .ci/run, 10,000 for the complete proof.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from multidrop.families import DelixiNative, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 EXCHANGES = int(os.environ.get("SNIFFED_EXCHANGES", "300"))
-TURN = 10  # exchanges of one master before the next one's
-BAUDRATE = 1_000_000  # characters and silences take next to no time
+TURN = 10  # exchanges of one master before the next master's turn
+BAUDRATE = 1_000_000  # so high that characters and silences take nearly no time
 TO_HEAR = ["--baudrate", BAUDRATE]
 
 
@@ -45,14 +46,14 @@ def drives() -> list[Drive]:
     ]
 
 
-# ---- other programs as masters ----
+# ---- other programs' masters ----
 
-Said = tuple[int, int, list[int] | int]  # address, function, values or minus the exception code
-NUMBERS = itertools.count(1)  # each is written once, so each exchange is unique
+Said = tuple[int, int, list[int] | int]  # address, function, and either the values or minus the exception code
+NUMBERS = itertools.count(1)  # each number is written once, so that each exchange is unique
 
 
 def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Callable[..., Iterator[Said]]:
-    """A master that reads and writes with pymodbus."""
+    """Return a master that reads and writes with pymodbus."""
 
     def master(port: str, chance: random.Random) -> Iterator[Said]:
         client = require_module("pymodbus.client")
@@ -74,7 +75,7 @@ def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Call
 
 
 def delixi(port: str, chance: random.Random) -> Iterator[Said]:
-    """pymodbus does not speak it."""
+    """Send requests in Delixi's framing, which pymodbus lacks; yield them with their replies."""
     with opened(port) as fd:
         for _ in range(TURN):
             register = chance.choice([DelixiNative.output_frequency, DelixiNative.output_current])
@@ -94,7 +95,7 @@ MASTERS = (
 
 
 def mastered(hear: Callable[[bytes], bytes] = bytes) -> tuple[list[Said], list[dict[str, Any]]]:
-    """The masters' requests with their replies, and the report of `sniff` on them."""
+    """Return the masters' requests with their replies, and the exchanges that `sniff` reports."""
     chance = random.Random(1)
     said: list[Said] = []
     simulator = Simulator([Wire([EncodedDrive(drive) for drive in drives()])])
@@ -130,15 +131,15 @@ def test_every_exchange_of_a_mixed_line_is_sniffed() -> None:
     assert {record["framing"] for record in told[:-1]} == {"rtu", "ascii", "delixi"}
 
 
-# ---- with damage ----
+# ---- with damaged bytes ----
 
 
 @dataclass
 class Damage:
-    """One byte in a hundred is changed, lost or doubled on its way to the listener."""
+    """Changes, drops or duplicates one byte in a hundred on its way to the listener."""
 
     said: bytearray = field(default_factory=bytearray)
-    damaged: list[int] = field(default_factory=list)  # offsets in the traffic
+    damaged: list[int] = field(default_factory=list)  # offsets of damaged bytes in the traffic
     chance: random.Random = field(default_factory=lambda: random.Random(2))
 
     def __call__(self, said: bytes) -> bytes:
@@ -155,7 +156,7 @@ class Damage:
         return bytes(damaged)
 
     def exchanges(self) -> list[tuple[bool, tuple[str, ...]]]:
-        """Return each exchange's frames, and True if it is undamaged."""
+        """Return the frames of each exchange, each with True if it is undamaged."""
         stream = Stream()
         stream.put(bytes(self.said), 0)
         stream.end(True)
@@ -175,7 +176,7 @@ def frames(pair: tuple[FrameSpan, ...]) -> tuple[str, ...]:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_exchanges_between_damage_are_sniffed() -> None:
+def test_undamaged_exchanges_between_damaged_ones_are_sniffed() -> None:
     damage = Damage()
     said, told = mastered(damage)
     exchanges = damage.exchanges()
@@ -186,7 +187,7 @@ def test_exchanges_between_damage_are_sniffed() -> None:
     assert len(expected) > 0.3 * len(said)
     sniffed = [tuple(record["frames"]) for record in told[:-1] if record.get("result") in ("ok", "refused")]
     rest = iter(sniffed)
-    assert [each for each in expected if each not in rest] == []  # every exchange, in order
-    assert set(sniffed) <= {each for _, each in exchanges}  # and no invented exchange
+    assert [each for each in expected if each not in rest] == []  # every undamaged exchange was sniffed, in order
+    assert set(sniffed) <= {each for _, each in exchanges}  # no exchange was invented
     unknown = sum(len(bytes.fromhex(record["unknown"])) for record in told[:-1] if "unknown" in record)
     assert told[-1]["summary"]["unknown_bytes"] == unknown > 0

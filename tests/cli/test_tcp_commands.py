@@ -39,7 +39,7 @@ def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: 
 
 
 @pytest.mark.long
-def test_a_port_of_this_machine_is_served_as_the_plant_names_it(tmp_path: Path, run: Run) -> None:
+def test_a_local_port_is_served_as_the_plant_names_it(tmp_path: Path, run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     plant = tmp_path / "plant.toml"
@@ -49,7 +49,7 @@ def test_a_port_of_this_machine_is_served_as_the_plant_names_it(tmp_path: Path, 
         assert "output_current" in run("read", plant, "pump", "output_current")[1]
 
 
-def test_a_pseudo_terminal_needs_a_place(tmp_path: Path, run: Run) -> None:
+def test_simulating_a_serial_line_needs_a_directory_for_its_port(tmp_path: Path, run: Run) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(PLANT.format(port="/dev/ttyUSB0"))
     assert run("simulate", plant)[::2] == (
@@ -59,7 +59,7 @@ def test_a_pseudo_terminal_needs_a_place(tmp_path: Path, run: Run) -> None:
 
 
 @pytest.mark.long
-def test_scan_finds_drives_behind_a_gateway_and_writes_their_plant(tmp_path: Path, run: Run) -> None:
+def test_scan_finds_drives_behind_a_gateway_and_writes_their_plant_file(tmp_path: Path, run: Run) -> None:
     sims = [simulated(drive) for drive in (InnovertIBD(1), InvtCHE(2), ErmanERG220(3))]
     out = tmp_path / "found.toml"
     with Simulator([Wire(sims, port="tcp://127.0.0.1:0", unpaced=True)]) as line:

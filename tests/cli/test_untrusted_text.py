@@ -1,4 +1,4 @@
-"""Names from files and arguments: their characters control no terminal and break no page."""
+"""Names from files and arguments: their characters cannot control a terminal or break a page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from multidrop.gateway.settings import read_plant
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.printable import masked, printable
 
-# Clear the screen; set the title; write the clipboard; run from right to left; one-byte escape; two lines.
+# They clear the screen, set the title, write the clipboard, reverse the text direction, start an escape with
+# one byte, or break the line.
 TRAPS = ("\x1b[2J", "\x1b]0;title\x07", "\x1b]52;c;cm0gLXJm\x07", "\u202egpj.exe", "\x9b2J", "a\r\nb", "\0")
 TRAP = "".join(TRAPS)
 
@@ -41,8 +42,8 @@ def test_printable_text_stays_unchanged() -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_gateway_s_log_escapes_names_of_callers(capfd: pytest.CaptureFixture[str], form: str) -> None:
-    """A caller's address may come from a proxy, and a drive's name from an MQTT topic."""
+def test_a_gateways_log_escapes_the_names_of_callers(capfd: pytest.CaptureFixture[str], form: str) -> None:
+    """A caller's address may come from a proxy, and a drive's name may come from an MQTT topic."""
     with _logging(form, logging.INFO):
         logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")
     (line,) = capfd.readouterr().err.removesuffix("\n").split("\n")
@@ -51,10 +52,10 @@ def test_a_gateway_s_log_escapes_names_of_callers(capfd: pytest.CaptureFixture[s
     assert form == "json" or line.isprintable()
 
 
-SECRET = "S3C@R:ET"  # users write such passwords as they are, though an @ should be escaped
+SECRET = "S3C@R:ET"  # some users write such passwords, although an @ should be escaped
 
 
-def test_a_url_is_printed_without_its_login() -> None:
+def test_a_url_is_printed_without_user_and_password() -> None:
     given = f"no server at nats://bob:{SECRET}@a:4222, tls://{SECRET}@b, nats://c; by anna@hall"
     assert masked(given) == "no server at nats://a:4222, tls://b, nats://c; by anna@hall"
 
@@ -73,7 +74,7 @@ def test_a_url_is_printed_without_its_login() -> None:
         (["read", "{}", "invt-che", "1", "status"], {}),
     ],
 )
-def test_no_message_of_a_command_has_a_url_s_password(
+def test_no_message_of_a_command_contains_a_urls_password(
     words: list[str],
     variables: dict[str, str],
     tmp_path: Path,
@@ -93,7 +94,7 @@ def test_no_message_of_a_command_has_a_url_s_password(
     assert "R:ET" not in said
 
 
-def test_a_plant_file_s_mistakes_have_no_url_s_password(tmp_path: Path) -> None:
+def test_a_plant_files_mistakes_are_reported_without_a_urls_password(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text(
         '[[line]]\nname = "L"\nport = "/dev/a"\n'
         '[[line.drive]]\nname = "D"\nmodel = "invt-che"\naddress = 1\n'
@@ -112,7 +113,7 @@ def test_a_plant_file_s_mistakes_have_no_url_s_password(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_gateway_s_log_has_no_url_s_password(capfd: pytest.CaptureFixture[str], form: str) -> None:
+def test_a_gateways_log_contains_no_urls_password(capfd: pytest.CaptureFixture[str], form: str) -> None:
     with _logging(form, logging.INFO):
         failure = OSError(f"nats://bob:{SECRET}@host is lost")
         logging.getLogger("multidrop.gateway").error("at %s", f"nats://{SECRET}@host", exc_info=failure)
@@ -122,7 +123,7 @@ def test_a_gateway_s_log_has_no_url_s_password(capfd: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("trap", TRAPS)
-def test_a_plant_file_has_no_names_and_ports_that_do_not_print(tmp_path: Path, trap: str) -> None:
+def test_names_and_ports_that_cannot_be_printed_are_refused(tmp_path: Path, trap: str) -> None:
     text = "".join(f"\\u{ord(character):04x}" for character in trap)
     path = tmp_path / "plant.toml"
     path.write_text(
@@ -192,7 +193,7 @@ def test_names_in_a_recording_are_printed_without_control_characters(run: Run, t
     assert is_harmless(out + err)
 
 
-# a label that is hidden, mathematics, a format and a terminal's command
+# A hidden label, mathematics, a format string and a command for the terminal, all in one name.
 ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
 
 
@@ -201,7 +202,7 @@ ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.usefixtures("_laid_out")
 @pytest.mark.parametrize("name", usually(ALL_AT_ONCE, "_hidden", "$x^{$", "\\frac"))
-def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
+def test_names_with_markup_are_plain_text_in_pictures_and_legends(tmp_path: Path, name: str) -> None:
     require_module("matplotlib")
     from multidrop.report import load, plot, plot_page, report_page
 
@@ -217,7 +218,7 @@ def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path,
     assert plot_page(look, figure)
 
 
-def test_texts_of_a_capture_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
+def test_texts_in_a_capture_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
     exchanges = [each for each in PRINTED if each.framing is Framing.RTU and isinstance(each.says, Message)]
     path = write(
         tmp_path / "it.pcapng",
@@ -246,7 +247,7 @@ def section_length(path: Path) -> int:
 
 @pytest.mark.slow
 def test_commands_print_through_the_escaping_function() -> None:
-    """Commands `print` only help, drawings and questions directly; other text is escaped."""
+    """Commands call `print` only for help, drawings and questions. All other text is escaped."""
     ours = {"__init__.py", "support/output.py", "support/writing.py", "params.py", "poll.py", "scan.py"}
     root = Path(multidrop.cli.__file__).parent
     found = {
@@ -260,8 +261,8 @@ def test_commands_print_through_the_escaping_function() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", usually("poll", "plan"))
-def test_a_plant_file_that_runs_a_file_says_so_once(tmp_path: Path, command: str) -> None:
-    """In a process of its own, as a file is run once in each."""
+def test_running_a_users_model_file_is_reported_once(tmp_path: Path, command: str) -> None:
+    """A new process, because a model file is run only once in each process."""
     (tmp_path / "fan.py").write_text(
         "from pathlib import Path\nfrom multidrop import Drive, reading\n"
         f"Path({str(tmp_path / 'ran')!r}).touch()\n\n"
