@@ -336,7 +336,9 @@ def test_each_advice_is_found_in_the_error_that_contains_it() -> None:
         ("/dev/null", "/dev/null: it is not a serial port"),
     ],
 )
-def test_a_port_that_cannot_be_opened_is_one_sentence_with_status_1(run: Run, port: str, sentence: str) -> None:
+def test_a_port_that_cannot_be_opened_is_one_sentence_with_status_1(
+    run: Run, port: str, sentence: str
+) -> None:
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -455,7 +457,9 @@ def test_a_familys_json_has_the_limits_of_values(run: Run) -> None:
     by_name = {register["name"]: register for register in sheet["registers"]}
     upper = by_name["upper_limit_frequency"]  # from 0.5 Hz to the highest frequency FH
     assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
-    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # from the lower limit LL to the upper limit UL
+    speeds = [
+        by_name[f"preset_speed_{number}"] for number in range(1, 8)
+    ]  # from the lower limit to the upper one
     limits = {("minimum_frequency", "upper_limit_frequency")}
     assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
     assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]

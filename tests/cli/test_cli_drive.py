@@ -527,7 +527,11 @@ def test_an_interrupted_stop_is_sent_once_more(run: Run, che: Che) -> None:
     status, _, err = run("stop", *words)
     assert status == 130
     until(lambda: len(received.writes) >= begun + 3)  # the drive may receive it after the client has left
-    assert [write.data for write in received.writes[begun:]] == [b"\0\5", b"\0\5", b"\0\x08"]  # the last write stops a jog
+    assert [write.data for write in received.writes[begun:]] == [
+        b"\0\5",
+        b"\0\5",
+        b"\0\x08",
+    ]  # the last stops a jog
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
 
@@ -705,7 +709,7 @@ def test_a_stop_is_repeated_for_the_given_seconds(run: Run, che: Che) -> None:
     assert status == 1
     assert "it was never confirmed" in err
     assert received.writes[0].data == b"\0\5"
-    assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}  # the stops of a run and of a jog
+    assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}  # a run's stop and a jog's stop
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,9 @@ def test_a_drive_without_a_rate_keeps_its_share_of_a_full_line(run: Run, crowded
 
 
 @pytest.mark.parametrize("model", ["yd1000", "delixi-modbus"])
-def test_polling_all_readings_in_single_requests_causes_a_warning(run: Run, tmp_path: Path, model: str) -> None:
+def test_polling_all_readings_in_single_requests_causes_a_warning(
+    run: Run, tmp_path: Path, model: str
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(LINE.format("hall-1", 1) + DRIVE.format("p", model, 1) + DRIVE.format("q", model, 2))
     status, out, _ = run("plan", path)
@@ -200,7 +202,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
     assert list(found) == ["predicted", "predicted_with_measured_delays", "measured"]
     assert found["predicted"]["cycle_ms"] == planned["cycle_ms"]
     assert found["predicted"]["utilisation"] == planned["utilisation"]
-    delay = summary["drives"]["pump-1"]["response_delay_ms"]  # pump-9 never answers, so 5 ms are assumed for it
+    delay = summary["drives"]["pump-1"]["response_delay_ms"]  # pump-9 never answers: 5 ms are assumed
     known = found["predicted_with_measured_delays"]["cycle_ms"]
     assert known == pytest.approx(planned["cycle_ms"] + delay - 5, abs=0.01)
     assert found["measured"]["utilisation"] == summary["utilisation"]

@@ -118,7 +118,9 @@ def test_a_command_uses_the_settings_in_the_plant_file(run: Run, plant: Path, at
         ),
     ],
 )
-def test_a_mistaken_name_or_option_is_one_sentence(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_a_mistaken_name_or_option_is_one_sentence(
+    run: Run, plant: Path, words: list[str], sentence: str
+) -> None:
     status, out, err = run("read", plant, *words)
     assert (status, out) == (2, "")
     assert err.startswith(f"multidrop: {sentence.replace('PLANT', str(plant))}")
@@ -141,7 +143,9 @@ def test_a_plant_files_mistakes_are_reported_as_by_plan(run: Run, plant: Path) -
     assert run("read", plant.with_name("none.toml"), "fan-1")[0] == 2
 
 
-def test_write_takes_a_plant_file_and_a_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_write_takes_a_plant_file_and_a_drive_name(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive
+) -> None:
     words = ("write", plant, "pump-1", at, "frequency")
     assert run(*words, "25", "--yes") == (0, "pump-1: frequency = 25.00 Hz: done (cannot be read back)\n", "")
     assert toy["frequency"] == 25
@@ -156,7 +160,9 @@ def test_write_takes_a_plant_file_and_a_drive_name(run: Run, plant: Path, at: st
 # ---- commands to motors ----
 
 
-def test_verbs_take_a_plant_file_and_a_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_verbs_take_a_plant_file_and_a_drive_name(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive
+) -> None:
     drive = (plant, "pump-1", at)
     assert run("state", *drive)[1].startswith("stopped\n")
     assert run("set-frequency", *drive, "33.5", "--yes")[0] == 0
@@ -191,7 +197,9 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     assert run("read", *fan, "output_current")[0] == 0
 
 
-def test_a_start_by_plant_file_needs_confirmation(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_a_start_by_plant_file_needs_confirmation(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive
+) -> None:
     status, _, err = run("start", plant, "pump-1", at)
     assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)
     assert not toy.counters.writes
@@ -251,7 +259,9 @@ def test_poll_replaces_ports_by_the_port_option(run: Run, port: str, tmp_path: P
     assert (status, json.loads(out)["samples"] > 0) == (0, True)
 
 
-def test_monitor_replaces_ports_by_the_port_option(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_monitor_replaces_ports_by_the_port_option(
+    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shown: list[str] = []
 
     def watch(watched: Plant, out: object) -> dict[str, int]:
@@ -319,7 +329,9 @@ def test_models_are_found_relative_to_the_plant_file(
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_a_drive_named_by_plant_file_has_the_same_guards_as_by_port(run: Run, plant: Path, at: str, port: str) -> None:
+def test_a_drive_named_by_plant_file_has_the_same_guards_as_by_port(
+    run: Run, plant: Path, at: str, port: str
+) -> None:
     """Each refused command prints the same error in both cases."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),

@@ -126,7 +126,9 @@ def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: 
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
     ],
 )
-def test_invalid_options_for_segments_are_one_sentence(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_invalid_options_for_segments_are_one_sentence(
+    run: Run, plant: Path, words: list[str], sentence: str
+) -> None:
     status, out, told = run("poll", plant, *words)
     assert (status, out) == (2, "")
     assert sentence in told
@@ -148,7 +150,7 @@ def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, 
     misses = [row for row in rows if row.value is None]
     assert Counter(row.status for row in misses) == summary["lines"]["hall-1"]["misses"]
     assert {"no reply"} <= {row.status for row in misses if row.drive == "pump-9"} <= LATE_OR_SILENT
-    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # misses caused by a busy machine
+    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # on a busy machine
     assert len(misses) == summary["misses"]
     assert summary["lines"]["hall-1"]["exchanges"] > 0
     assert summary["lines"]["hall-1"]["drives"]["pump-1"]["samples_per_second"] > 0
@@ -261,9 +263,7 @@ def test_a_recording_that_cannot_be_written_is_one_sentence(
 
 @pytest.mark.long
 @pytest.mark.uncounted
-def test_a_full_disk_ends_polling_and_keeps_the_rows_before(
-    plant: Path, tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_polling_and_keeps_the_rows_before(plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     done = multidrop("poll", plant, "--seconds", 30, "--out", out, most_bytes=12_000)
     rows = len(recorded(out))

@@ -29,7 +29,7 @@ from multidrop.scan.sweep import Sweep
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 USUAL = Settings(9600, "8N1")
-PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  # short, and the same on a busy machine
+PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  # for busy machines
 
 
 @pytest.fixture(autouse=True)

@@ -220,7 +220,9 @@ def test_a_long_latency_timer_gets_advice(sysfs: Path) -> None:
         ),
     ],
 )
-def test_each_finding_is_a_sentence_with_advice_only_if_needed(finding: object, what: str, advised: bool) -> None:
+def test_each_finding_is_a_sentence_with_advice_only_if_needed(
+    finding: object, what: str, advised: bool
+) -> None:
     assert finding.what == what
     assert bool(finding.advice) == advised
 
@@ -451,7 +453,7 @@ def test_an_exception_in_the_echo_test_is_not_called_foreign_traffic(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server may answer for every address, even an unused one."""
-    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)  # the reply may come late on a busy machine
+    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)  # a busy machine may be slow
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
     told = " ".join(run("doctor", end.path)[1].split())
     assert "answers with exception 04" in told
@@ -460,7 +462,9 @@ def test_an_exception_in_the_echo_test_is_not_called_foreign_traffic(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_does_not_count_as_the_drives_answer(run: Run, responder: Any, code: int) -> None:
+def test_a_gateways_exception_does_not_count_as_the_drives_answer(
+    run: Run, responder: Any, code: int
+) -> None:
     """These codes mean that the device was not reached (application protocol V1.1b3, section 7)."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
@@ -500,7 +504,9 @@ def test_a_drive_that_refuses_counts_as_present_and_its_code_is_printed(run: Run
 
 
 @pytest.mark.slow
-def test_the_round_trip_counts_only_sent_requests(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_round_trip_counts_only_sent_requests(
+    run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """While a late reply may come, a silent drive gets no request. Held-back requests do not count."""
     end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
@@ -524,7 +530,9 @@ def test_the_round_trip_counts_only_sent_requests(run: Run, responder: Any, monk
         (("/dev/nowhere", "--framing", "rtu"), 2, "--framing needs a drive: add --model and --address"),
     ],
 )
-def test_mistaken_doctor_arguments_are_one_sentence(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
+def test_mistaken_doctor_arguments_are_one_sentence(
+    run: Run, words: tuple[str, ...], status: int, sentence: str
+) -> None:
     found, out, err = run("doctor", *words)
     assert (found, out) == (status, "")
     assert sentence in err
@@ -554,7 +562,9 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     ),
     indirect=["port"],
 )
-def test_doctor_reports_a_far_end_with_the_other_framing(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
+def test_doctor_reports_a_far_end_with_the_other_framing(
+    port: str, asked: str, spoken: str, other: str, run: Run
+) -> None:
     place = port.partition("://")[2]
     status, said, _ = run("doctor", f"{asked}://{place}", "--model", "invt-che", "--address", "1")
     assert status == 1

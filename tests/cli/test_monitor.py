@@ -228,7 +228,7 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
     drive.add(row("drive-1", "output_frequency", 42.5))
     ages = [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (100, 170, 190)]
     assert ages == [False, False, True]
-    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}  # the planned cycle of a line with many drives
+    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}  # of a line with many drives
     (drive,) = LivePlant(plant, planned).drives
     drive.add(row("drive-1", "output_frequency", 42.5))
     assert [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (290, 310)] == [
@@ -398,7 +398,7 @@ def test_keys_that_arrive_together_are_separated(pressed: bytes, told: list[str]
     [
         ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # bytes of F4
         ([b"j\x1b[", b"5", b"~y"], [DOWN, PAGE_UP, "y"]),
-        (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["s"]),  # the key of s in a Russian layout, in two pieces
+        (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["s"]),  # s in a Russian layout
         ([b"\x1b", b""], ["escape"]),
     ],
 )
@@ -522,7 +522,9 @@ def seen(monitor: Any) -> str:
     return "\n".join(line.rstrip() for line in texts(monitor._picture()))
 
 
-def test_a_stops_failure_is_shown_until_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stops_failure_is_shown_until_it_is_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
     monitor._plant.tick(0.0, told(1, 1, 0.5))
     for key in "Sy":
@@ -533,7 +535,7 @@ def test_a_stops_failure_is_shown_until_it_is_acknowledged(tmp_path: Path, monke
     assert "a acknowledge FAILURES" in seen(monitor)
     stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
     poller.stop_all = lambda: stopped  # type: ignore[method-assign]
-    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a stop that succeeded
+    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a page, and after a success
         monitor._obey(key)
         assert failure in seen(monitor)
     assert monitor.await_stops() == monitor._at.failures
@@ -543,7 +545,9 @@ def test_a_stops_failure_is_shown_until_it_is_acknowledged(tmp_path: Path, monke
     assert monitor.await_stops() == []
 
 
-def test_the_result_of_stopping_all_counts_drives_and_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_of_stopping_all_counts_drives_and_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
     (line,) = monitor._plant.plant.lines
     both = (line, replace(line, name="hall-2"))
@@ -583,7 +587,9 @@ def test_any_exception_of_a_stop_is_shown_as_a_failure(
     assert f"stopping drive-1 failed: {words}" in seen(monitor)
 
 
-def test_a_failed_stop_is_not_shown_as_being_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_stop_is_not_shown_as_being_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
 
     def fail(*details: object) -> None:
@@ -609,7 +615,7 @@ def test_quitting_during_a_stop_asks_and_then_waits_for_it(
     for key in ("q", "y"):
         monitor._obey(key)
     assert monitor._has_left
-    monitor._session = monitor._session._replace(hand_out=stands.set)  # rows are still recorded while it waits
+    monitor._session = monitor._session._replace(hand_out=stands.set)  # rows are still recorded
     assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)
     assert "waiting for a stop in progress" in capsys.readouterr().err
@@ -643,8 +649,7 @@ def test_no_key_can_do_more_than_stop_motors(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reads of a closed terminal return immediately, without bytes or with an error. There may be no signal.
-    """
+    """Its reads return immediately, without bytes or with an error. There may be no signal."""
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)
         monkeypatch.setattr(sys, "stdin", stdin)

@@ -42,7 +42,9 @@ def edited(path: str, before: str, after: str) -> None:
     Path(path).write_text(text.replace(before, after))
 
 
-def test_saved_parameters_are_compared_and_applied(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_saved_parameters_are_compared_and_applied(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     assert run("params", "save", *drive, "pump.toml")[0] == 0
     assert run("params", "diff", "pump.toml", *drive)[0] == 0
     sim["acceleration_time"] = 25.0
@@ -66,7 +68,9 @@ def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...
     assert "Write 1 parameter to" in err
 
 
-def test_commissioning_needs_a_terminal_for_confirmation(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_commissioning_needs_a_terminal_for_confirmation(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     words = ("params", "apply", "pump.toml", *drive, "--yes", "--commissioning", "--audit", "audit.jsonl")
@@ -85,7 +89,9 @@ def test_commissioning_needs_a_terminal_for_confirmation(run: Run, drive: tuple[
     assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
 
 
-def test_apply_writes_nothing_while_the_motor_runs(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_apply_writes_nothing_while_the_motor_runs(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     sim.motor.target = 40.0
