@@ -457,9 +457,7 @@ def test_a_familys_json_has_the_limits_of_values(run: Run) -> None:
     by_name = {register["name"]: register for register in sheet["registers"]}
     upper = by_name["upper_limit_frequency"]  # from 0.5 Hz to the highest frequency FH
     assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
-    speeds = [
-        by_name[f"preset_speed_{number}"] for number in range(1, 8)
-    ]  # from the lower limit to the upper one
+    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # from lower to upper limit
     limits = {("minimum_frequency", "upper_limit_frequency")}
     assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
     assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]
