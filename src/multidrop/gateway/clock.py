@@ -1,4 +1,4 @@
-"""Clocks: monotonic times for ages, and the time of day."""
+"""Clocks: CLOCK_MONOTONIC, which dates polled rows; CLOCK_BOOTTIME, which includes sleep; and UTC."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import time
 if hasattr(time, "CLOCK_MONOTONIC"):
 
     def monotonic_ns() -> int:
-        """Return the time of CLOCK_MONOTONIC, the clock of rows."""
+        """Return the time of CLOCK_MONOTONIC, which dates polled rows, in ns."""
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 else:
 
     def monotonic_ns() -> int:
-        """Return the monotonic time, the clock of rows."""
+        """Return the monotonic time, which dates polled rows, in ns."""
         return time.monotonic_ns()
 
 
 if hasattr(time, "CLOCK_BOOTTIME"):
 
     def boottime_ns() -> int:
-        """Return the time of CLOCK_BOOTTIME, which includes sleep."""
+        """Return the time of CLOCK_BOOTTIME, which includes the computer's sleep, in ns."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 else:  # on macOS and Windows the monotonic clock includes sleep
@@ -30,7 +30,7 @@ else:  # on macOS and Windows the monotonic clock includes sleep
 def now_and_slept_ns() -> tuple[int, int]:
     """Return the monotonic time, and how long the computer has slept since its boot, both in ns.
 
-    The order of the two reads ensures that a pause between them never counts as sleep.
+    The boot-time clock is read first, so that a pause between the two reads never counts as sleep.
     """
     booted_ns = boottime_ns()
     now_ns = monotonic_ns()

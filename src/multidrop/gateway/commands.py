@@ -1,7 +1,7 @@
 """Commands: check and carry out everything that is written through the gateway, over every interface.
 
 The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs only
-the role, and waits for no other command.
+the role, and does not wait for other commands.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from multidrop.supervisor import supervisor
 MOST_AGE_S = 5.0  # an older write or verb, such as one that a network delayed, is refused; stops never are
 LOOK_S = 0.02  # during a reload: interval of checking for changed drives that must be stopped again
 MOST_WRITES = 8  # concurrent writes on one line; stops are not counted
-BUSY = "too many writes are under way"  # a `rule` of WriteForbidden
-UNAUDITED = "the audit log cannot be written"  # a `rule` of WriteForbidden
-OVERTAKEN = "a stop was called"  # a `rule` of WriteForbidden
+BUSY = "too many writes are under way"  # a value of WriteForbidden.rule
+UNAUDITED = "the audit log cannot be written"  # a value of WriteForbidden.rule
+OVERTAKEN = "a stop was called"  # a value of WriteForbidden.rule
 WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
-# Called with a command's text; returns until when it may be sent (CLOCK_BOOTTIME, ns) or raises
-# WriteForbidden.
+# A function that takes a command's text and returns the deadline for sending the command (CLOCK_BOOTTIME,
+# ns). It raises WriteForbidden if the command must not be sent.
 Admit = Callable[[str], float]
 
 _CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>\(\)|`)?")
@@ -56,7 +56,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class VerbRule(NamedTuple):
-    """The role that a verb needs, and whether `verbs` of [serve.may] must list it."""
+    """The role that a verb needs, and whether the plant file must list it in `verbs` of [serve.may]."""
 
     role: Right
     is_listed: bool
@@ -98,28 +98,30 @@ class Commands:
         self, lines: PolledLines, may: May, on_reset: Callable[[str], object] = lambda drive: None
     ) -> None:
         self.may = may
-        self.withheld = ""  # why only stops are sent
+        self.withheld = ""  # why all commands but stops are refused; "" if they are not
         self._on_reset = on_reset
-        self._halts: Counter[str] = Counter()  # by drive: commands other than stops that end a run
+        self._halts: Counter[str] = (
+            Counter()
+        )  # by drive: number of other commands than stops that can end a run
         self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
         self._lines = lines
-        self.called = 0  # commands that passed all rights, so far
+        self.called = 0  # number of commands so far whose callers had all rights
         self._under_way: Counter[str] = Counter()  # by line: writes in progress
         self.stops: Counter[str] = Counter()  # by drive: number of stops called
-        self._stopped_ns: dict[str, int] = {}  # by drive: when the latest stop was called
+        self._stopped_ns: dict[str, int] = {}  # by drive: when its latest stop was called (CLOCK_BOOTTIME)
         self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
-        self._ended_ns: dict[str, int] = {}  # by drive: when its latest command ended
-        self.plant_ns: int | None = None  # when the plant was reloaded (CLOCK_BOOTTIME)
+        self._ended_ns: dict[str, int] = {}  # by drive: when its latest command ended (CLOCK_MONOTONIC)
+        self.plant_ns: int | None = None  # when the plant file was last reloaded (CLOCK_BOOTTIME)
 
     def note_reload(self) -> None:
-        """Note that the plant was reloaded: a name may now be another drive's."""
+        """Note the time of a reload: from now on a name may mean another drive."""
         self.plant_ns = boottime_ns()
 
     def ended_ns(self, drive: str) -> int:
         """Return when the latest command of a drive ended (CLOCK_MONOTONIC); 0 if there was none.
 
-        Rows that were polled before that may be old.
+        Rows polled before that time may not show the command's effect.
         """
         return self._ended_ns.get(drive, 0)
 
@@ -128,7 +130,10 @@ class Commands:
         return self._stopped_ns.get(drive)
 
     def halts(self, drive: str) -> int | None:
-        """Return how many commands so far end a run of this motor, stops included; None while it jogs."""
+        """Return the number of commands so far that can end a run of this motor, stops included.
+
+        Return None while the motor jogs.
+        """
         return None if self._jogging[drive] else self.stops[drive] + self._halts[drive]
 
     def _note_stop(self, drives: Iterable[str]) -> None:
@@ -144,9 +149,9 @@ class Commands:
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
         """Stop these drives, or all with None; return the result of each.
 
-        The stops of all lines and drives run side by side, and one failure does not end the others. Only the
-        caller's role is checked. If a reload changes a drive during its stop, the
-        drive is stopped again under its new configuration.
+        All stops run concurrently, and a failed stop does not end the others. Only the caller's role is
+        checked. If a reload changes a drive during its stop, the drive is stopped again under its new
+        configuration.
         """
         if caller.role < Right.STOP:
             wanted = drives_of(self._lines.plant) if drives is None else drives
@@ -208,7 +213,10 @@ class Commands:
         caller: Caller,
         admit: Admit = lambda what: inf,
     ) -> CommandResult:
-        """Carry out a verb once if the plant file lists it; refused over Modbus, where no person confirms."""
+        """Carry out a verb once; all verbs but "stop" must be listed in the plant file.
+
+        Callers over Modbus are refused, because no person confirms their commands.
+        """
         drive = drive_meant(drive, names_of(self._lines)) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
@@ -248,7 +256,7 @@ class Commands:
         return found is not None and found.commands
 
     async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> CommandResult:
-        """Carry out a verb that stops the motor; neither writes under way nor other stops delay it."""
+        """Carry out a verb that stops the motor, without waiting for writes in progress or other stops."""
         self.called += 1
         _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
 
@@ -278,7 +286,7 @@ class Commands:
         stops = self.stops[drive]
 
         def limit_ns() -> float:
-            """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 once a stop was called."""
+            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 once a stop was called."""
             return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
@@ -301,7 +309,7 @@ class Commands:
 
 @contextmanager
 def _written_by(caller: Caller) -> Iterator[None]:
-    """Name the caller in the audit log. Only stops are sent before their line is in that log."""
+    """Name the caller in the audit log; log each command before it is sent, unless it is a stop."""
     name, way = _printable(caller.name), _printable(f"{caller.way} from {caller.address}")
     with written_by(name or "anyone", way), noted_first():
         yield
@@ -315,7 +323,7 @@ def _printable(text: str) -> str:
 
 
 class StopEnd(Protocol):
-    """The result of a stop."""
+    """The result of a stop, such as CommandResult."""
 
     @property
     def ok(self) -> bool: ...
@@ -398,7 +406,7 @@ def _for_users(result: CommandResult) -> CommandResult:
 
 
 def in_words(text: str, error: BusError | ValueError | None) -> str:
-    """Replace the program's calls that an error advises by the actions of a gateway's user."""
+    """Return an error's text for users of the gateway: "call stop()" becomes 'use "stop"'."""
     advice = error.advice if isinstance(error, WriteForbidden) else None
     if advice is not None and advice.plant:
         text = text.replace(advice.program, advice.plant)

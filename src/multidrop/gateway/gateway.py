@@ -47,7 +47,7 @@ RESTORE_S = 2.0  # how long to wait for the alarms of earlier runs
 MOST_ASKED = 16  # concurrent requests for registers outside the drives' tables
 ASKED_S = 30.0  # time limit of one such request
 END_S = 4.0  # time limit of shutdown, stops included
-GRACE_S = 1  # part of END_S for finishing requests in flight
+GRACE_S = 1  # part of END_S for finishing HTTP requests in flight
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -67,10 +67,10 @@ class Gateway:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
-        self.revision = secrets.randbits(32)  # number of the plant's version; starts at random
+        self.revision = secrets.randbits(32)  # version of the plant: random at first, plus 1 for each reload
         self.failures: dict[str, int] = {}
         self.audit = settings.audit
-        self.unaudited = ""  # why the audit log is not written
+        self.unaudited = ""  # why the audit log is not written; "" if it is
         self.parts = LiveParts(self)
         self.feeds = self.parts.feeds
         self.guard_clock: Callable[[], float] = self.clock
@@ -108,7 +108,8 @@ class Gateway:
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Poll and serve until `end` is called; then return within END_S, even if a disk hangs.
 
-        If interrupted, end polling before raising. Raises RuntimeError if the web server ends by itself.
+        If an exception interrupts it, polling is ended before the exception propagates. Raises RuntimeError
+        if the web server ends by itself.
         """
         try:
             await self._run(on_ready)
@@ -244,7 +245,7 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch to the hub and to all parts, even if one of them fails."""
+        """Give each batch of polled rows to the hub and to all parts, even if a part fails."""
         while batch := poller.take():
             self._has_news = True
             batch = self.reload.without_changed_drives(batch)
@@ -274,7 +275,7 @@ class Gateway:
                 self.hub.unopened.pop(line.name, None)  # a later loss has another reason
 
     def _restore_alarms(self) -> bool:
-        """Take over the alarms of earlier runs once they are read, or give up after RESTORE_S."""
+        """Take over the alarms of earlier runs; return False while they are being read, at most for RESTORE_S."""
         past = self.alarm_file.past if self.alarm_file is not None else []
         if past is None and self.clock() - self.begun < RESTORE_S:
             return False
@@ -347,7 +348,7 @@ class Gateway:
 
     @property
     def plant_now(self) -> Plant:
-        """The plant as polled now, also during a reload."""
+        """The plant that is polled now, also during a reload."""
         return self.plant if self.poller is None or self.plant_coming is None else self.poller.plant
 
     @property
@@ -367,7 +368,7 @@ class Gateway:
         return self.poller.bus(line)
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
-        """Read `count` words or bits of a drive from any address on; see `Drive.read_raw`."""
+        """Return `count` 16-bit words or bits, read from a drive at address `start`; see `Drive.read_raw`."""
         _, known = self.plant.find_drive(drive)
         work = partial(known.read_raw, function, start, count, expiry=expiry_s)
         data = await supervisor().within("passed requests", ASKED_S, work, most=MOST_ASKED)
@@ -390,7 +391,7 @@ class Gateway:
 
 
 class _Server(uvicorn.Server):
-    """A web server that does not install handlers of signals: the gateway handles these."""
+    """A web server that installs no signal handlers, because the gateway's process has its own."""
 
     @contextmanager
     def capture_signals(self) -> Any:

@@ -24,13 +24,13 @@ from multidrop.recording import parse_age, parse_size
 from multidrop.supervisor import supervisor
 
 MS_NS = 1_000_000
-LOOK_S = 1.0  # between checks of the writing thread
+LOOK_S = 1.0  # interval of checking that the writing thread is alive
 CLOSING_S = 3.0  # time limit for writing the last rows
 QUERY_S = 30.0  # time limit of a query, and of its wait for other queries
 MOST_QUERIES = 2  # concurrent queries
 PIECE = 1 << 16  # bytes of an export read at a time
 UNFINISHED = ".export-"  # prefix of temporary folders of exports
-MOST_BUCKETS = 200_000  # in one answer: enough for the page's 24 series on a screen of 8000 px; 5 MB
+MOST_BUCKETS = 200_000  # limit of one answer (5 MB): the page's 24 series on a screen of 8000 px
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ Settings = HistorySettings
 
 
 def build(settings: HistorySettings, context: PartContext) -> Historian:
-    """Return the historian of a gateway. Loads DuckDB now, so that the first viewer need not wait."""
+    """Return the historian of a gateway. Loads DuckDB now, so that the first query need not wait for that."""
     with suppress(ImportError):
         import_module("duckdb")
     folder = context.folder / settings.folder
@@ -134,9 +134,10 @@ class Historian:
     # ---- queries; times are UTC in ms ----
 
     async def series(self, names: Sequence[str], begin: int, end: int, points: int) -> bytes:
-        """Return the buckets of each series as JSON, made in a thread to keep the loop free for stops.
+        """Return each series between two times as JSON, reduced to `points` buckets.
 
-        Raises ValueError, OSError (including Hung) and ImportError.
+        A thread does the work, to keep the event loop free for stops. Raises ValueError for wrong arguments,
+        OSError (Hung included) if files cannot be read, and ImportError without DuckDB.
         """
         names = list(dict.fromkeys(names))
         if len(names) * points > MOST_BUCKETS:
@@ -153,8 +154,8 @@ class Historian:
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
         """Return a file of these series (of all if `names` is empty) in pieces; `kind` is "csv" or "parquet".
 
-        Call and iterate it in threads, because it reads files. Raises the errors of `series`; wrong arguments
-        raise theirs at the call.
+        Call and iterate it in threads, because it reads files. Raises the errors of `series`: those for wrong
+        arguments at the call, the others also during the iteration.
         """
         series, begin_ns, end_ns = names or None, begin * MS_NS, end * MS_NS
         if kind not in ("csv", "parquet"):
@@ -174,7 +175,7 @@ class Historian:
 
 
 def as_json(made: Buckets) -> dict[str, Any]:
-    """Return buckets for JSON, with None in place of infinity."""
+    """Return the buckets of a series as a JSON object, with None in place of infinity."""
     return {
         "time": [time // MS_NS for time in made.times],
         "least": _finite(made.least),

@@ -1,7 +1,7 @@
 """The four optional parts of the gateway: fleet view, history, Modbus server and MQTT.
 
-Each has a table in `[serve]` and is fed with every batch. If one fails, the failure is counted and logged,
-and the others continue.
+Each part has a table in `[serve]` and receives every batch of rows. If a part fails, the failure is counted
+and logged, and the other parts continue.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class LiveParts:
     async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> None:
         """Close the parts whose tables were changed or removed, and build the new parts.
 
-        Raises ValueError if one cannot be opened; the previous parts run again then.
+        If a new part cannot be opened, the previous parts are started again, and ValueError is raised.
         """
         self._replaced = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
         await self._drop([*self._replaced], END_S)
@@ -156,7 +156,7 @@ class LiveParts:
                 _log.error("%s did not start again: %s", name, failure)
 
     async def build(self, wanted: Mapping[str, Any], plant: Plant) -> None:
-        """Build parts concurrently, waiting up to BUILD_S. Raises ValueError if one cannot be opened."""
+        """Build parts concurrently, waiting up to BUILD_S. Raises ValueError if a part cannot be opened."""
         context, threads = self._host.part_context(plant), supervisor()
         self._built = {
             name: Building(settings, threads.thread(name, BUILD_S, partial(build, name, settings, context)))
@@ -173,14 +173,14 @@ class LiveParts:
                 raise failure
 
     async def _discard(self) -> None:
-        """Close parts that were not started, each when it is built; wait only for those built already."""
+        """Close the parts that were not started; a part still under construction is closed later."""
         built, self._built = self._built, {}
         await _close_when_built(built)
 
     # ---- one part ----
 
     async def _start_when_built(self, name: str, building: Building) -> None:
-        """Start a part when its files have answered, unless it was dropped before."""
+        """Start a part when it is built, unless a reload or the shutdown removed it before."""
         await asyncio.wait([building.part])
         if self.pending.get(name) is not building:
             return
@@ -218,7 +218,7 @@ class LiveParts:
 
 
 async def _close_when_built(built: Mapping[str, Building]) -> None:
-    """Close each of these parts when it is built; wait only for those built already."""
+    """Close each of these parts when it is built; wait only for the parts that are built already."""
 
     async def close(name: str, part: asyncio.Future[Part]) -> None:
         await asyncio.wait([part])

@@ -48,7 +48,7 @@ class Reload:
     """
 
     def __init__(self, gateway: Gateway, read: Read | None) -> None:
-        self.mistakes: tuple[str, ...] = ()  # in the file, at the latest reload
+        self.mistakes: tuple[str, ...] = ()  # mistakes in the file, found by the latest reload
         self.restart: tuple[str, ...] = ()  # sentences about changes in the file that need a restart
         self._gateway = gateway
         self._read = read
@@ -168,7 +168,10 @@ class Reload:
         gateway.guarded("frames", gateway.frames.note_news)
 
     def without_changed_drives(self, batch: Batch) -> Batch:
-        """Remove the rows of drives that the reload in progress changes: either plant may describe them."""
+        """Remove the rows of drives that the reload in progress changes.
+
+        It is unknown whether such a row was polled under the old plant or the new one.
+        """
         columns = batch.columns() if self._changed else None
         if columns is None or self._changed.isdisjoint(columns.drives):
             return batch
@@ -206,7 +209,7 @@ class Reload:
 
 
 def _changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
-    """Return the drives that only one plant has, or whose rows mean something else in the other."""
+    """Return the drives that only one plant has, or that differ in type, address or polled registers."""
     meanings = [
         {
             one.drive.name: (type(one.drive), one.drive.address, one.polls)

@@ -1,8 +1,8 @@
 """HTTP connections: their number, time limits, and the order of requests.
 
-Slow, silent or greedy clients do not delay others. At the limit one of their connections is closed, so that a
-new one, which may bring a stop, is always accepted. Requests are answered one at a time, possible stops
-first.
+Slow, silent or greedy clients do not delay others. At MOST_OPEN connections, one of such a client is closed,
+so that a new connection, which may bring a stop, is always accepted. Requests are answered one at a time,
+possible stops first.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MOST_OPEN = 256  # a process usually has 1024 descriptors, and lines and files n
 FIRST_S = 10.0  # time limit for a TLS handshake and the first request
 AGAIN_S = 40.0  # time limit for a later request; the server closes an idle connection after 30 s
 FRESH_S = 1.0  # a new connection should send its first request within this time
-MOST_FRESH = 64  # fresh connections protected from being closed
+MOST_FRESH = 64  # at most so many fresh connections are protected from being closed
 STALLED_S = 10.0  # a client that reads none of its answers for this long is closed
 
 ENDS = "the gateway is shutting down: the outcome of this request is unknown"
@@ -166,7 +166,7 @@ class CountingSocket(socket.socket):
 
 
 class Turns:
-    """Starts one request in each round of the event loop, those in `stops` first.
+    """Starts one request in each round of the event loop: first the queue `stops`, then the queue `others`.
 
     The loop reads all sockets in each round, so a stop waits for one request at most.
     """
@@ -198,7 +198,7 @@ class Turns:
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that notes whether its client waits for answers between requests, and reads them."""
+    """A connection that notes whether its client waits for each answer before the next request, and reads it."""
 
     @property
     def _connections(self) -> Connections:

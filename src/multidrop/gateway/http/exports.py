@@ -1,7 +1,7 @@
 """Exports of the history as CSV or Parquet files.
 
-The number of exports is limited: each uses a thread while a piece is made, and a Parquet file needs space on
-the disk of the history.
+The number of concurrent exports is limited: each uses a thread while a piece of its file is made, and a
+Parquet file needs space on the disk of the history.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from multidrop.gateway.live.parameter_reads import ParameterRead
 from multidrop.supervisor import supervisor
 
 MOST_EXPORTS = 8  # concurrent exports
-PIECE_S = 600.0  # time limit of a piece; before the first piece of Parquet the whole file is made
+PIECE_S = 600.0  # time limit for making one piece; for Parquet, the first piece includes the whole file
 R = TypeVar("R")
 MOST_NAME = 80  # characters of a series' name in a file name
 FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # signs that some systems forbid in file names
@@ -88,7 +88,7 @@ def _attachment(name: str) -> dict[str, str]:
 
 
 async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
-    """Yield the pieces, each made in a thread because a disk may hang."""
+    """Yield the pieces of a file, each made in a thread because the disk may hang."""
     try:
         while (piece := await _in_thread(partial(next, pieces, None))) is not None:
             yield piece

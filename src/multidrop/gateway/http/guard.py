@@ -15,7 +15,7 @@ from multidrop.gateway.http.rights import SCHEMES, Caller, May, OwnNames, Right,
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
-HEADERS = {  # of API answers; few, because each answer with a frame has them
+HEADERS = {  # headers of API answers; few, because every frame is sent with them
     "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
     "cross-origin-resource-policy": "same-origin",
     "x-content-type-options": "nosniff",
@@ -31,7 +31,7 @@ PAGE_HEADERS = HEADERS | {
 ANYONE = "anyone"
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
-HAS_WRONG_TOKEN = "has_wrong_token"  # key in a request's scope; a stop is sent despite a wrong token
+HAS_WRONG_TOKEN = "has_wrong_token"  # key in the scope of a request with a wrong token; stops are sent anyway
 MOST_HEAD = 64 * 1024  # limit of a request's head in bytes; browsers send the cookies of all ports of a host
 
 
@@ -45,7 +45,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class Needed(NamedTuple):
-    """The method and the right that a path needs; with None, no token is checked."""
+    """The HTTP method and the right that a path needs; if the right is None, no token is checked."""
 
     method: str
     right: Right | None
@@ -117,7 +117,7 @@ class Guard:
         return self._admit(scope, headers, needed.right)
 
     def _find(self, path: str) -> Needed:
-        """Return what a path needs: the entry of its longest prefix in `needed`."""
+        """Return the method and the right for a path: the entry of its longest prefix in `needed`."""
         while path not in self._needed:
             head, slash, _ = path.rstrip("/").rpartition("/")
             if not slash:
@@ -192,7 +192,7 @@ def _length(scope: Scope) -> int:
 
 
 def _secret(headers: Headers) -> tuple[str, str]:
-    """Return the token in a request, and the way of its sender: "http" for a program, or "page"."""
+    """Return the token in a request, and the kind of its sender: "http" for a program, "page" for a browser."""
     scheme, _, secret = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return secret.strip(), "http"

@@ -66,10 +66,10 @@ async def body_of(request: Request, seconds: float | None = None) -> dict[str, A
 
 
 async def drives_to_stop(request: Request) -> list[str] | None:
-    """Return the drives that a stop names; None: all.
+    """Return the names of the drives that a stop request names; None for all drives.
 
-    A stop whose body is missing, late, truncated, too long, empty or invalid means all drives: stopping too
-    many is harmless, stopping none is not.
+    A request whose body is missing, late, truncated, too long, empty or invalid stops all drives: stopping
+    too many is harmless, stopping none is not.
     """
     try:
         drives = (await body_of(request, STOP_BODY_S)).get("drives")

@@ -1,4 +1,4 @@
-"""Callers, tokens and rights. Pure: takes texts and times."""
+"""Callers, tokens and rights. Pure: works on given texts and times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ipaddress import ip_address
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-NOT_LISTED = "not on the list"  # rules of WriteForbidden raised by the gateway
+NOT_LISTED = "not on the list"  # this and the next two: values of WriteForbidden.rule
 NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
 
@@ -34,7 +34,7 @@ class Right(IntEnum):
 
 
 class Caller(NamedTuple):
-    """The sender of a request."""
+    """The sender of a request, and its role."""
 
     name: str  # a token's name, or "anyone"
     way: str  # "page", "http", "mqtt", "modbus"
@@ -127,9 +127,9 @@ class Tokens:
         return came is not None and len(came) >= MOST_WRONG
 
     def note_wrong(self, address: str, secret: str, now: float) -> bool:
-        """Count a wrong token; return True unless it is a repetition.
+        """Count a wrong token; return True unless this address has sent the same token recently.
 
-        Beyond MOST_ADDRESSES the oldest address is forgotten.
+        If MOST_ADDRESSES are remembered already, the oldest one is forgotten.
         """
         given = digest(secret)
         if address not in self._wrong and len(self._wrong) >= MOST_ADDRESSES:
@@ -173,7 +173,7 @@ def is_loopback(host: str) -> bool:
 
 
 class OwnNames:
-    """The host names of the gateway; requests to other names, or from pages of other names, are refused."""
+    """The host names of the gateway; requests to other hosts, or from pages of other hosts, are refused."""
 
     def __init__(self, names: Iterable[str], listen: str, port: int) -> None:
         self._always = {"localhost", "127.0.0.1", "[::1]"}

@@ -74,7 +74,7 @@ NEEDED: Mapping[str, Needed] = {
     "/api/forget": Needed("POST", None),
 }
 
-_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # or a prefix, as of a day
+_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # the time is optional
 R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 _PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
@@ -145,7 +145,7 @@ def _fields(result: CommandResult) -> dict[str, Any]:
 
 
 def _answer(result: CommandResult) -> Response:
-    """Return the outcome of a command: status 403 if a right was missing, else 200."""
+    """Return the HTTP answer with a command's outcome: status 403 if a right was missing, else 200."""
     is_denied = isinstance(result.error, WriteForbidden) and result.error.rule in RIGHTS_RULES
     return JsonResponse(
         _fields(result) | ({"error": result.text} if is_denied else {}), 403 if is_denied else 200
@@ -161,7 +161,7 @@ def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
 
 
 def _time_asked(query: Mapping[str, str]) -> str:
-    """Return the `before` of a query, "" without one. Raises Denied if it is not a UTC time."""
+    """Return the parameter `before` of a query, "" without one. Raises Denied if it is not a UTC time."""
     if "before" in query and not _UTC.fullmatch(query["before"]):
         wrong = query["before"][:40]
         raise Denied(400, f"before = {wrong!r} is not a time in UTC, such as 2026-11-22 or 2026-11-22T09:30")
@@ -169,9 +169,10 @@ def _time_asked(query: Mapping[str, str]) -> str:
 
 
 def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
-    """Return `count` entries before this time (ISO 8601, UTC; "" for all), the newest first.
+    """Return the newest `count` entries of an audit log before this time (ISO 8601, UTC; "": now).
 
-    `more` is True if there are older entries. Raises OSError.
+    The newest entry is first. `more` is True if there are older entries. Raises OSError if the log cannot be
+    read.
     """
     count = max(1, min(count, MOST_RECORDS))
     found: deque[dict[str, Any]] = deque(maxlen=count + 1)
@@ -357,7 +358,7 @@ class _Pages:
     async def token(self, request: Request) -> Response:
         """Store a token in a cookie that scripts cannot read.
 
-        After several wrong tokens, an address must wait before the next, except for a token for a stop.
+        After several wrong tokens, an address must wait before its next attempt, unless it wants to stop.
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)
@@ -384,7 +385,7 @@ class _Pages:
 
 
 class FrameRoute:
-    """Answers `/api/frame?after=N` as soon as the newest frame is not the N-th."""
+    """Answers `/api/frame?after=N` as soon as there is a frame with another number than N."""
 
     def __init__(self, frames: Frames) -> None:
         self._frames = frames

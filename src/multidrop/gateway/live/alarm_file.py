@@ -12,14 +12,14 @@ from typing import Any
 
 from multidrop.gateway.live.alarms import KINDS, MOST_ENDED, Alarm
 
-MOST_WAITING = 10_000  # alarms not yet written
+MOST_WAITING = 10_000  # limit of alarms queued for writing
 MOST_BYTES = 4 << 20  # size at which the file is rewritten with its newest alarms
-SLOW_S = 10.0  # a slower disk is reported
+SLOW_S = 10.0  # a disk access that takes longer is reported
 CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """A file of alarms as JSON lines; the newest line of an alarm is valid.
+    """A file of alarms as JSON lines; if an alarm has several lines, the newest is valid.
 
     Only `run` waits for the disk. No method raises.
     """
@@ -97,7 +97,7 @@ class AlarmFile:
                 return found
 
     def _write(self, changed: list[Alarm], known: dict[str, Alarm]) -> None:
-        """Append the changed alarms; after a failure, or if the file is too long, write all known alarms."""
+        """Append the changed alarms; after a failure, or if the file is too long, rewrite it with all alarms."""
         is_whole = not self._failure and (not self.path.exists() or self.path.stat().st_size <= MOST_BYTES)
         if is_whole:
             with self.path.open("a", encoding="utf-8") as file:

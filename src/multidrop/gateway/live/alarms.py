@@ -18,7 +18,7 @@ from multidrop.gateway.live.hub import (
     Shown,
 )
 
-STOPPED, PORT = "stopped", "port"  # kinds in addition to "fault" and "silent"
+STOPPED, PORT = "stopped", "port"  # kinds of alarms in addition to FAULT and SILENT
 KINDS = (FAULT, STOPPED, PORT, SILENT)  # the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
 STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
@@ -60,11 +60,13 @@ class Alarms:
     def __init__(self, since: int = 0, note: Callable[[Alarm], object] = lambda alarm: None) -> None:
         self.since = since
         self._note = note
-        self._lasting: dict[tuple[str, str, str], Alarm] = {}  # active, by line, drive and kind, oldest first
+        self._lasting: dict[
+            tuple[str, str, str], Alarm
+        ] = {}  # active alarms, oldest first; keys: line, drive, kind
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
-        self._runs: dict[str, int] = {}  # stop count of each drive when its motor was first seen running
-        self._stands: dict[str, int] = {}  # time at which a motor that ran was first seen at rest
+        self._runs: dict[str, int] = {}  # by drive: its `stops` (see `look`) when a run was first seen
+        self._stands: dict[str, int] = {}  # by drive: when a motor that ran was first seen at rest
         self.begun = 0  # number of alarms so far
 
     # ---- observations ----
@@ -72,7 +74,8 @@ class Alarms:
     def look(self, time: int, drive: str, shown: Shown, stops: int | None = None) -> None:
         """Note a drive's state. A fault stays active while its drive is silent.
 
-        `stops` counts the commands that end a run of its motor; None: a motor at rest raises no alarm now.
+        `stops` is the number of commands so far that can end a run of its motor. With None, a motor at rest
+        raises no alarm.
         """
         state, words = shown.state, shown.words
         if state == SILENT:
@@ -162,7 +165,7 @@ class Alarms:
                 self._take_up(alarm, time, names)
 
     def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
-        """Continue an alarm of an earlier run, or end it if it is over or its drive or line is gone."""
+        """Continue an alarm of an earlier run, or end it if it is over or its drive or line was removed."""
         key = _key(alarm)
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None

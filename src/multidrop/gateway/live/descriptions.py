@@ -28,7 +28,7 @@ def describe(gateway: Gateway, right: Right | None) -> dict[str, Any]:
         "file": gateway.reload.has_file,  # a reload is possible
         "fleet": fleet is not None,  # /api/fleet is available
         "fleet_stop": getattr(fleet, "can_stop", False),  # /api/fleet/stop is available
-        "mistakes": gateway.reload.mistakes,  # in the file, if the newest reload was refused
+        "mistakes": gateway.reload.mistakes,  # mistakes in the plant file, if the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),
             "write": sorted(may.write) if is_writer else [],
@@ -69,7 +69,10 @@ def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
 
 
 def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | None]:
-    """Return the registers of frequency, current and setpoint, preferably polled ones; None if missing."""
+    """Return the names of the registers for frequency, electric current and setpoint.
+
+    If several registers fit, a polled one is preferred. The name is None if the drive has no such register.
+    """
     wanted = {"frequency": FREQUENCIES, "current": CURRENTS, "setpoint": (drive.setpoint_name,)}
     found: dict[str, str | None] = {}
     for name, registers in wanted.items():

@@ -12,17 +12,17 @@ from typing import Any
 from multidrop import Bus, BusError, Drive, NoReply, Plant, WriteForbidden
 from multidrop.supervisor import supervisor
 
-PAUSE_S = 0.2  # between two reads on a line, to leave the line to polling
-SHARE = 20  # or, if longer, this many times the duration of the last read
-LOOKED_S = 3.0  # reading stops this long after the last request for a drive
+PAUSE_S = 0.2  # least pause between two reads on a line, for polling
+SHARE = 20  # the pause is at least this many times the duration of the last read
+LOOKED_S = 3.0  # reading stops this long after the last view of a drive
 MOST_DRIVES = 4  # drives read concurrently
 READ_S = 30.0  # time limit of one read
 
 UNANSWERED = "no reply"
 
 Found = dict[str, list[Any]]  # by register: value or None, UTC in ms, "ok" or the reason
-ROUND_S = 2.0  # between two rounds of all drives
-ASKED_S = 30.0  # time limit of one drive's check
+ROUND_S = 2.0  # pause between two rounds of identity checks
+ASKED_S = 30.0  # time limit of one identity check
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -41,7 +41,7 @@ class SideReads:
     ) -> None:
         self._bus = bus
         self._is_there = is_there
-        self._turns: dict[str, asyncio.Lock] = {}  # one read at a time, by line
+        self._turns: dict[str, asyncio.Lock] = {}  # by line: held during a read
         self._clock = clock
         self._utc_ms = utc_ms
         self._looked: dict[str, float] = {}
@@ -49,7 +49,7 @@ class SideReads:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def look(self, plant: Plant, name: str) -> Found:
-        """Return the values read so far, and read further. Raises ValueError for an unknown drive."""
+        """Return the values read so far, and continue reading. Raises ValueError for an unknown drive."""
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()
         found = self._found.setdefault(name, {})
@@ -113,7 +113,7 @@ class SideReads:
 
 
 class Identities:
-    """Checks each drive's identity once while its port is open, so that its first stop need not do so.
+    """Checks each drive's identity once while its port is open, so that the drive's first stop is not delayed.
 
     `fail` is called in the `except` block of an unexpected exception, so it can log the exception.
     """
@@ -132,7 +132,7 @@ class Identities:
         self._refused: dict[str, str] = {}  # the refusal that was logged last, by drive
 
     async def run(self) -> None:
-        """Check forever, because a drive may answer again, and a port may be reopened."""
+        """Check all drives in rounds, forever: a drive may answer again, and a port may be reopened."""
         while True:
             drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
             for line, drive in drives:

@@ -30,8 +30,8 @@ REMEMBERED = 6  # number of newest frames kept; a viewer may be a second behind
 
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
-TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # rules of a WriteForbidden
-ANOTHER_PLANT = "the plant was read anew"
+TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # WriteForbidden.rule
+ANOTHER_PLANT = "the plant was read anew"  # a value of WriteForbidden.rule
 
 
 class Encoded(NamedTuple):
@@ -95,12 +95,15 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
 
 
 def _age_ms(now: Times, asked: Times) -> int:
-    """Return the larger age in ms by both clocks: UTC may be set back, CLOCK_MONOTONIC stops in a sleep."""
+    """Return the age in ms, the larger one by two clocks.
+
+    UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps.
+    """
     return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
 
 
 class Places(dict[Times, int]):
-    """Numbers times from 0 on, without duplicates: all values of one request have the same time."""
+    """The numbers of request times, from 0: all values of one request share a time and its number."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = place = len(self)
@@ -110,7 +113,10 @@ class Places(dict[Times, int]):
 def _unknown(
     hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, now: Times
 ) -> tuple[Any, ...]:
-    """Return None, the index of the age, and the status; then the last good value and its index, if any."""
+    """Return the entry of a value that is not fresh: None, index of the age, status.
+
+    If there is an earlier good value, that value and the index of its age follow.
+    """
     if newest is None:
         return None, places[now], "not asked yet"
     last = () if good is None else (_finite(good[2]), places[good[:2]])
@@ -166,7 +172,7 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
-        self._encoded: dict[int, Encoded] = {}  # the newest frame; keys: the frame it is relative to
+        self._encoded: dict[int, Encoded] = {}  # the newest frame, by the frame it is relative to
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
@@ -198,10 +204,10 @@ class Frames:
         self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
-        """Return a frame other than the n-th as soon as there is one; None after WAIT_S without one.
+        """Return the newest frame as soon as it is not the n-th; None if WAIT_S pass without a new frame.
 
-        It has only the changes since the n-th if that one is still remembered. Raises OverflowError if too
-        many viewers wait.
+        The result has only the changes since the n-th frame if that is still remembered. Raises OverflowError
+        if too many viewers wait.
         """
         if self._has_news and self._clock() >= self._due:
             self._build()
@@ -264,11 +270,11 @@ def _let_go(turn: asyncio.Future[None]) -> None:
 class SeenFrames:
     """Protects commands over HTTP from networks that delay or repeat them.
 
-    A write, or a verb that may move a motor, names the newest frame that its sender has seen. It is sent
-    once, within MOST_AGE_S of that frame, and only if no stop and no reload came after it. Clocks of other
-    computers play no role.
+    A write, or a verb that may move a motor, names the newest frame that its sender has seen. The command is
+    sent once, within MOST_AGE_S of that frame, and only if no stop and no reload followed the frame. Clocks of
+    other computers are not used.
 
-    `clock` returns ns and includes sleep.
+    `clock` returns ns and includes the computer's sleep.
     """
 
     def __init__(self, clock: Callable[[], int], commands: Commands) -> None:

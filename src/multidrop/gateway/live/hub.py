@@ -16,12 +16,14 @@ from multidrop import Batch, Condition, Plant, PolledDrive, Register
 from multidrop.drive import FAULT_RECORDS, StateReader
 from multidrop.plant import current_for
 
-KeptRow = tuple[int, int, float, int]  # time, monotonic time, value (meaningless in a miss), status
-Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # newest row, newest good one, is it fresh
+KeptRow = tuple[int, int, float, int]  # UTC and monotonic ns, value (meaningless in a miss), status code
+Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # newest row, newest good row, is fresh
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
-UNNAMED = "it shows a fault"  # words of a fault without a text
-NOT_ASKED = "not asked recently"  # words of state UNKNOWN, without any fresh value
-INCOMPLETE = "not all of it is known"  # words of state UNKNOWN if some are missing: a fault is possible
+UNNAMED = "it shows a fault"  # the words for a fault without a text
+NOT_ASKED = "not asked recently"  # the words for state UNKNOWN if no value is fresh
+INCOMPLETE = (
+    "not all of it is known"  # the words for state UNKNOWN if some values are missing: a fault is possible
+)
 _STATES = {
     Condition.STOPPED: STANDS,
     Condition.RUNNING: RUNS,
@@ -30,10 +32,10 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-LEAST_SLEEP_NS = 100_000_000  # a smaller difference is the time between the reads of two clocks
+LEAST_SLEEP_NS = 100_000_000  # smaller differences arise because two clocks are read in turn
 FAULT_REGISTER = "fault"
 RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
-_ANSWERED = ("exception ", "no valid value")  # prefixes of the status of a miss if the drive did reply
+_ANSWERED = ("exception ", "no valid value")  # prefixes of a miss's status if the drive replied
 
 
 class RegisterRows:
@@ -83,7 +85,7 @@ class FreshValues(Mapping[str, float]):
 
 FREQUENCIES = ("output_frequency", "motor_speed")  # registers of a drive's frequency, the best one first
 MINUTE_POINTS = 60
-LEAST_POINT_MS = 900  # between two points of the last minute
+LEAST_POINT_MS = 900  # least time between two points of the last minute
 
 
 class Newest(NamedTuple):
@@ -97,7 +99,7 @@ class Newest(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A drive's state, one of five words, with the text of its fault or the reason of its silence."""
+    """A drive's state (RUNS, STANDS, FAULT, SILENT or UNKNOWN), and the words for a fault or silence."""
 
     state: str
     words: str | None
@@ -149,7 +151,7 @@ class Hub:
         self._woke_ns = 0  # monotonic time at which a sleep was noticed
         self.time = 0  # time of the newest row, UTC in ns
         self.taken = 0  # number of batches received
-        self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
+        self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
         self._cells: dict[int, RegisterRows | None] = {}  # by drive and register code; None: not in the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}

@@ -11,15 +11,15 @@ from typing import Any
 from multidrop import BusError, Drive, Plant, params
 from multidrop.supervisor import Hung, supervisor
 
-MOST_READS = 2  # concurrent reads of the gateway
+MOST_READS = 2  # drives whose parameters are read concurrently
 READ_S = 3600.0  # time limit of one read
 MOST_PAUSE_S = 1.0
-SHARE = 3  # the pause after a block is this many times its duration, to leave the line to polling
+SHARE = 3  # the pause after a block is this many times the block's duration, for polling
 
 
 @dataclass
 class ParameterRead:
-    """The parameters of one drive: how many are read, all of them, or the error."""
+    """One read of a drive's parameters: its progress, its result, or its error."""
 
     drive: Drive
     done: int = 0
@@ -38,7 +38,7 @@ class ParameterRead:
 
 
 class ParameterReads:
-    """The newest read of each drive. Results are kept until the next read or a reload."""
+    """The newest ParameterRead of each drive, kept until the drive's next one or a reload."""
 
     def __init__(self) -> None:
         self._reads: dict[str, ParameterRead] = {}
@@ -74,7 +74,7 @@ class ParameterReads:
 
 
 class _Paced:
-    """Counts the parameters that were read, and pauses after each block."""
+    """Progress callback: counts the parameters that were read, and pauses after each block."""
 
     def __init__(self, read: ParameterRead) -> None:
         self._read = read

@@ -30,7 +30,7 @@ class RecentStatistics:
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Use another plant. Statistics of a line or drive that was opened again count from zero."""
+        """Use another plant. Counts of a line or drive that was reopened start at zero."""
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
         self._hours = {name: minutes for name, minutes in self._hours.items() if name in self._planned}
@@ -64,7 +64,10 @@ class RecentStatistics:
         }
 
     def line(self, name: str) -> dict[str, Any]:
-        """Return a line's measured and planned use, its rate, and the last minute's delay and misses."""
+        """Return a line's figures: measured and planned share of wire time, and exchanges per second.
+
+        Also the last minute's 99th percentile of response delays in ms, and its number of misses.
+        """
         return self._figures.get(name) or self._line_figures(name, None)
 
     def _line_figures(self, name: str, minute: LineStatistics | None) -> dict[str, Any]:
@@ -89,7 +92,7 @@ class RecentStatistics:
         return round(max(0.0, used_s / seconds), 4), round(max(0.0, exchanges / seconds), 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
-        """Return a drive's share of misses in the last minute, and its response delay."""
+        """Return a drive's share of misses and its response delay (99th percentile, ms) in the last minute."""
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:

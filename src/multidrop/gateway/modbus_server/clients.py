@@ -1,7 +1,7 @@
 """Connections of Modbus TCP clients.
 
 Requests are always received, even from a client that does not read its answers. So a stop waits neither for
-earlier requests nor until its client reads.
+earlier requests nor for its client to read answers.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from multidrop.gateway.modbus_server.protocol import (
 )
 from multidrop.supervisor import supervisor
 
-SLICE = 64  # one client's turn ends after this many requests,
-SLICE_S = 0.002  # or after this time,
-ROUND_S = 0.004  # or after its share of this time among busy clients: a stop waits for one round
+SLICE = 64  # most requests of one client in its turn
+SLICE_S = 0.002  # longest turn of a client
+ROUND_S = 0.004  # time of one turn of all busy clients together: a stop waits for that long
 MOST_CLIENTS = 64  # per TCP port
 MOST_BEHIND = 1 << 18  # bytes of pending requests of one client
 MOST_UNTAKEN = 1 << 18  # bytes of answers that a client has not read
 MOST_UNDER_WAY = 16  # requests of one client waiting for lines
-IDLE_S = 300.0  # idle clients are closed after this time,
-FORGETTABLE_S = 10.0  # or after this time if a new client needs the place
+IDLE_S = 300.0  # a client that is idle for this long is disconnected
+FORGETTABLE_S = 10.0  # idle time after which a client is disconnected if a new one needs its place
 STALLED_S = 10.0  # a client that reads none of its answers for this long is disconnected
 SWEEP_S = 1.0  # interval of checking all clients
 
 _log = logging.getLogger("multidrop.gateway")
 
 
-# The frame of the answer, or an awaitable of it; None closes the connection. A later answer is cancelled when
-# the client disconnects: shield work that must be finished.
+# The frame of an answer, or an awaitable that returns the frame; None closes the connection. If the client
+# disconnects, the awaitable is cancelled: shield work that must be finished.
 Answer = bytes | Awaitable[bytes] | None
 
 
@@ -130,7 +130,7 @@ class ModbusClient(asyncio.Protocol):
         self._close_if_done()
 
     def _look(self) -> bool:
-        """Start writes and queue other requests; return False if received frames are left."""
+        """Start received writes and queue other requests; return False if time ran out before the last frame."""
         begun = self._port.clock()
         answers: list[bytes] = []
         is_in_time = True

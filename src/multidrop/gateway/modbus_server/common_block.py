@@ -1,7 +1,7 @@
 """Common block: state, values and stop of every drive at the same addresses and in the same units.
 
-Numbers of two words have the high word first. A value that is not fresh reads as a reserved number, never as
-0.
+Numbers of two 16-bit words have the high word first. A value that is not fresh reads as a reserved number,
+never as 0.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from multidrop import PolledDrive, Register
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.modbus_server.words import is_fresh
 
-COMMON_LENGTH = 16  # words of the block
+COMMON_LENGTH = 16  # length of the block in 16-bit words
 STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # offsets in words
 
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
-NO_NUMBER = -(1 << 31)  # 8000 0000H: unknown, or out of range
-NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ms
+NO_NUMBER = -(1 << 31)  # 8000 0000H: the value is unknown, or out of range
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ages in ms: no value so far; the limit
 
 _PER_UNIT = 100
 
@@ -53,7 +53,7 @@ class CommonBlock:
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: Hub, now_ns: int, woke_ns: int, state: str) -> int:
-        """Return the number that the drive's family gives the present fault, or a constant from above."""
+        """Return the family's number of the present fault, or one of the reserved fault numbers."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")

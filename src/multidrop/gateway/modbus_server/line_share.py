@@ -15,9 +15,9 @@ from typing import Any
 from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # share of a line's time
-BURST_S = 0.2  # line time available without waiting after a pause
+BURST_S = 0.2  # most line time that is saved up during a pause
 MOST_WAITING = 8  # waiting requests per line
-EXPIRY_S = 1.0  # a waiting request is dropped after this time
+EXPIRY_S = 1.0  # a request that has waited for this long is dropped
 
 
 class PassingBusy(Exception):

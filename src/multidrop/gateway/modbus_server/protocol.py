@@ -138,7 +138,7 @@ _RULES: Mapping[str, ModbusCode] = {
 
 
 def code_of(error: BaseException | None) -> int:
-    """Return the exception code for an error; a drive's exception keeps its own code."""
+    """Return the exception code for an error; an exception reply of a drive keeps its code."""
     if isinstance(error, DriveException):
         return error.code if 1 <= error.code <= 0x7F else ModbusCode.DEVICE_FAILURE
     if isinstance(error, WriteForbidden) and (code := _RULES.get(error.rule)):

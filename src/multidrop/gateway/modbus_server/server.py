@@ -1,7 +1,7 @@
 """Modbus TCP server: answers the requests of clients such as SCADA systems.
 
-Reads are answered from polled rows if possible. Writes obey the same rules as all commands; none starts a
-motor.
+Reads are answered from polled rows if possible. Writes obey the same rules as all commands, and never start
+a motor.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class ModbusServer:
     ) -> None:
         self.settings = settings
         self.answered: Counter[str] = Counter()  # requests by kind of answer
-        self.ports: dict[str, int] = {}  # TCP port numbers by line; MAIN: all other lines
+        self.ports: dict[str, int] = {}  # number of each line's own TCP port; MAIN: port of all others
         self._hub = hub
         self._commands = commands
         self._ask = ask
@@ -229,7 +229,7 @@ class ModbusServer:
         if not is_one and unit.has_stop_in(written, common.start + STOP):
             with suppress(Declined):  # too many stops are in progress already
                 self._begin_stop(unit, client)
-            raise Declined(ModbusCode.ILLEGAL_VALUE)  # other registers in it may start a motor
+            raise Declined(ModbusCode.ILLEGAL_VALUE)  # other registers in the request may start a motor
         if carrier is Carrier.WORD and address in common:
             if address != common.start + STOP:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)

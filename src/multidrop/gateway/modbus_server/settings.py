@@ -33,7 +33,7 @@ class ModbusSettings:
             raise ValueError("\n".join(wrong))
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each mistake that the plant shows, such as two drives with one unit id."""
+        """Return a sentence for each conflict with the plant, such as two drives with the same unit id."""
         try:
             Units(plant, self)
         except ValueError as mistakes:
@@ -47,7 +47,7 @@ class ModbusSettings:
 
     @property
     def port(self) -> int:
-        """The TCP port of all lines without their own."""
+        """The TCP port of all lines that have no own port."""
         return int(self.listen.rpartition(":")[2])
 
     @property

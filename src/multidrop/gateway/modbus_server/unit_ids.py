@@ -14,22 +14,22 @@ from multidrop.gateway.modbus_server.common_block import CommonBlock
 from multidrop.gateway.modbus_server.protocol import WriteRequest
 from multidrop.gateway.modbus_server.words import DriveWords, reading_function
 
-MAIN = ""  # key of the TCP port of all lines without their own
+MAIN = ""  # key of the TCP port of all lines that have no own port
 UNITS = range(1, 248)  # 0 is a broadcast, 248 to 255 are reserved
-LAST_UNIT = 255  # used by some devices nevertheless
+LAST_UNIT = 255  # reserved ids up to this one are accepted, because some devices use them
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
 _STOPS = ("stop", "coast", "emergency_stop")
 
 
 class StopWrite(NamedTuple):
-    """A register's name and a raw count: writing that count is how a verb of the drive stops the motor."""
+    """A register and a raw value of it. A stop verb of the drive writes that value to stop the motor."""
 
     register: str
     raw: float
 
 
 class Unit:
-    """A drive as Modbus clients see it: readable and writable addresses."""
+    """A drive as Modbus clients see it, with its readable and writable addresses."""
 
     def __init__(self, line: str, polled: PolledDrive) -> None:
         self.line = line
@@ -96,8 +96,8 @@ class Unit:
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
     """Yield the first write of each stop verb of the family.
 
-    Also yield other counts that the register declares harmless, such as YD1000's 8000H. Omit 0, which may
-    mean that there is no command.
+    Also yield other raw values that the register declares harmless, such as YD1000's 8000H. Omit 0, which
+    may mean "no command".
     """
     for name in _STOPS:
         try:

@@ -1,10 +1,10 @@
-"""DriveWords: the words that a drive sent, computed from polled values.
+"""DriveWords: the 16-bit words that a drive sent, computed from polled values.
 
 Rows have values in units, but Modbus clients expect the drive's raw words. Batches have no raw words, because
-these would cost 8 bytes per row. A word is computed only if it is certain: packing the value's count and
-decoding it again must give the value, and the neighbouring counts must give other values. Uncertain are
-registers that are part of a word or have a scale register, `I8` and `U32_EITHER`, which leave bits open, and
-a float's zero, which has two signs.
+these would cost 8 bytes per row. A word is computed only if it is certain: encoding the value as a raw count
+and decoding it must give the value again, and the neighbouring counts must give other values. Some words are
+always uncertain: those of registers that are part of a word or have a scale register, of `I8` and
+`U32_EITHER`, which leave bits open, and of a float's zero, which has two signs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def reading_function(table: Table) -> int:
 
 
 class Lack(Enum):
-    """The reason why a range cannot be answered from polled rows."""
+    """The reason why a range of addresses cannot be answered from polled rows."""
 
     UNPOLLED = "not polled, or the words are uncertain"
     STALE = "polled, but the newest row is a miss or old"
@@ -72,13 +72,13 @@ def exact_data(register: Register[Any], value: float) -> bytes | None:
         near = _neighbours(raw, coding.number_format)
         if any(float(coding.value_of(other)) == value for other in near):
             return None
-    except (ArithmeticError, ValueError, struct.error):  # this value has no count
+    except (ArithmeticError, ValueError, struct.error):  # no raw count has this value
         return None
     return data
 
 
 def _nearest_count(register: Register[Any], value: float) -> float | None:
-    """Return the count with the nearest value; None if others may have the same value."""
+    """Return the raw count whose value is nearest; None if other counts may have the same value."""
     multiplier, addend, divisor = register.coding.factors
     count = value if multiplier == divisor and not addend else (value * divisor - addend) / multiplier
     if register.coding.number_format not in _FLOATS:
@@ -90,7 +90,7 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
-    """Return the counts just below and above a count."""
+    """Return the raw counts just below and above a raw count."""
     if number_format not in _FLOATS:
         return (raw - 1, raw + 1)
     as_float, as_bits = _FLOATS[number_format]
@@ -111,9 +111,9 @@ class _Place:
         self._data: bytes | None = None
 
     def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
-        """Return the word (of a coil: the bit) at this offset in the newest row, or why there is none.
+        """Return the word (of a coil: the bit) at this offset in the newest row, or the reason for its lack.
 
-        Misses, stale rows and rows older than `since_ns` have none.
+        Misses, stale rows and rows older than `since_ns` are not used.
         """
         if row is None or not is_fresh(row, now_ns, since_ns):
             return Lack.STALE
@@ -175,7 +175,7 @@ class DriveWords:
 
 
 def _newest_word(found: list[tuple[Newest | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
-    """Return the word from the newest of the rows of registers that share an address."""
+    """Return the word at an address that several registers share, from the newest of their rows."""
     lack = Lack.STALE
     for row, place, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
         word = place.word(row, at, now_ns, since_ns)

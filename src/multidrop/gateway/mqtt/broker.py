@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
-MOST_UNDER_WAY = 64  # unacknowledged messages: enough for the drives of two lines
-MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant has so many
+MOST_UNDER_WAY = 64  # limit of unacknowledged messages: enough for the drives of two lines
+MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant has so many topics
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # first and longest pause before reconnecting
 KEEP_ALIVE_S = 15
@@ -100,7 +100,7 @@ class Address(NamedTuple):
 
 
 def parse_broker(text: str) -> Address:
-    """Return the parts of `mqtt://host:port`. Raises ValueError for anything else; a password is masked."""
+    """Return the parts of `mqtt://host:port`. Raises ValueError for other texts, with passwords masked."""
     try:
         parts = urlsplit(text)
         port = parts.port
@@ -127,7 +127,7 @@ class Login(NamedTuple):
 
 
 class Speaker(Protocol):
-    """A format of messages, such as JsonTopics, on one connection. Its methods are called in the loop."""
+    """A message format on one connection, such as JsonTopics. Its methods are called in the event loop."""
 
     def will(self) -> Publication:
         """Return the message that the broker publishes when this connection breaks."""
@@ -149,7 +149,7 @@ class Speaker(Protocol):
 
 
 class Broker:
-    """The connection of a speaker. Paho's thread sends; no method but `close` waits for it."""
+    """The connection of a speaker. Paho's thread sends; only the method `close` waits for that thread."""
 
     def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
         from paho.mqtt.client import Client
@@ -157,7 +157,7 @@ class Broker:
 
         self._address = address
         self._name = name
-        self._thread: threading.Thread | None = None  # paho's
+        self._thread: threading.Thread | None = None  # paho's thread for this connection
         self._speaker = speaker
         self._loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
@@ -217,9 +217,9 @@ class Broker:
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
-        """Let the speaker publish. If that fails, mark it as offline, but keep receiving commands.
+        """Let the speaker publish. If that fails, publish the speaker as offline, but keep receiving commands.
 
-        Otherwise the retained values of its drives would look current.
+        Without that message, the retained values of its drives would look fresh.
         """
         try:
             say()
@@ -234,7 +234,7 @@ class Broker:
 
     @property
     def trouble(self) -> str:
-        """The sentence for a missing connection, with the reason if known."""
+        """A sentence that there is no connection, with the reason if known."""
         return f"no connection to {self._address.host}:{self._address.port}" + (
             self._why and f": {self._why}"
         )

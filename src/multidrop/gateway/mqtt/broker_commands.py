@@ -1,4 +1,4 @@
-"""BrokerCommands: check commands from a broker, which may delay, keep and duplicate them.
+"""BrokerCommands: check commands from a broker, which may delay, retain and duplicate messages.
 
 A write or a verb is carried out only if it was sent within the last seconds, after the latest stop of its
 drive and the latest reload of the plant, and is not a copy. A verb that stops the motor is always carried
@@ -47,7 +47,7 @@ class BrokerCommands:
         self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
 
     def write(self, drive: str, register: str, value: float, time_ms: int) -> None:
-        """Write a register if the command is recent enough (see above); else report why not."""
+        """Write a register if the command may be carried out (see the module); else report why not."""
         what = f"{register} = {value!r}"
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, stopped_ns):
@@ -55,7 +55,7 @@ class BrokerCommands:
             self._begin(self._counted(self._do(drive, what, work)))
 
     def act(self, drive: str, verb: str, options: Mapping[str, object], time_ms: int) -> None:
-        """Carry out a verb if the command is recent enough (see above); else report why not."""
+        """Carry out a verb if the command may be carried out (see the module); else report why not."""
         stopped_ns = self._commands.stopped_ns(drive)
         if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, stopped_ns):
             work = self._commands.act(drive, verb, options, self._caller)
@@ -68,7 +68,10 @@ class BrokerCommands:
 
     @staticmethod
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
-        """Return True if a command may have been sent before this time: the sender's clock may be ahead."""
+        """Return True if a command of this age may have been sent before `at_ns`.
+
+        The sender's clock may be ahead by MOST_AHEAD_MS. Without `at_ns`, return False.
+        """
         if at_ns is None:
             return False
         return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
@@ -88,7 +91,7 @@ class BrokerCommands:
             self.refuse(drive, what, f"{MOST_UNDER_WAY} others are under way")
         else:
             self._came.append(command)
-            self._under_way += 1  # now, not in its task: a broker may deliver many together
+            self._under_way += 1  # here, not in the command's task: a broker may deliver many together
             return True
         return False
 

@@ -1,6 +1,7 @@
 """Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive. Pure.
 
-Each component names its state topic: one of the device would apply to its numbers and buttons too.
+Each component has its own state topic, because a state topic of the device would also apply to its numbers
+and buttons.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ CLASSES = {  # Home Assistant's device_class by unit
     "s": "duration",
 }
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
-OWN = ("problem", "running", "set", "value")  # suffixes of ids that do not mean a register
-MOST = 1e12  # limit of the range of a number
+OWN = ("problem", "running", "set", "value")  # suffixes of ids that are not names of registers
+MOST = 1e12  # limit of a number's range in Home Assistant
 LEAST_STEP = 0.001  # smallest step of a number that Home Assistant accepts
 STALE_PERIODS = 3  # a sensor is unavailable after this many periods
 # Commands carry the time of Home Assistant's clock, so the gateway can refuse delayed commands.
@@ -43,7 +44,7 @@ def discovery_topic(prefix: str, drive: str) -> str:
 
 
 def object_id(prefix: str, drive: str) -> str:
-    """Return an id with only the characters that Home Assistant allows; others become code points.
+    """Return an id with only the characters that Home Assistant allows; other characters become code points.
 
     The first "-" ends the prefix, so ids of different prefixes and drives differ.
     """
@@ -199,7 +200,7 @@ def _value_template(register: Register[Any]) -> str:
 
 
 def _span(register: Register[Any]) -> tuple[float, float]:
-    """Return the range of a register; if a message has none, Home Assistant assumes 1 to 100."""
+    """Return the range of a register; Home Assistant assumes 1 to 100 for a number without a range."""
     if register.span is not None:
         return register.span
     coding = register.coding

@@ -24,7 +24,7 @@ from multidrop.gateway.parts import PartContext
 from multidrop.plant import drive_meant
 
 ONLINE, OFFLINE = b"online", b"offline"
-MOST_KEPT = 256  # retained messages examined per connection; others are examined on the next connection
+MOST_KEPT = 256  # retained messages examined per connection; the next connection examines others
 MOST_DISCOVERY = 1 << 18  # bytes of a discovery message
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
@@ -172,7 +172,7 @@ class JsonTopics:
             self._command(levels, payload, is_retained=is_retained)
 
     def _look_back(self, topic: str, payload: bytes) -> None:
-        """Delete retained messages of removed drives."""
+        """Delete the retained messages of a drive that this message shows to be removed."""
         for left in self._retained_topics.hear(topic, payload, drives_of(self._plant)):
             self.outbox.put(self._kept(left, NOTHING))
 

@@ -35,7 +35,7 @@ class MqttSettings:
     authorities: str = ""  # path of a file of certificates that verify a broker of mqtts://
     home_assistant: bool = False
     sparkplug: str = ""  # the group; "": no Sparkplug
-    node: str = ""  # the edge node's name; default: that of the plant file
+    node: str = ""  # name of the edge node; default: the plant file's name
     commands: bool = False  # allow publishers to write the registers and verbs listed in [serve.may]
 
     def __post_init__(self) -> None:
