@@ -275,7 +275,7 @@ class Gateway:
                 self.hub.unopened.pop(line.name, None)  # a later loss has another reason
 
     def _restore_alarms(self) -> bool:
-        """Take over the alarms of earlier runs; return False while they are being read, at most for RESTORE_S."""
+        """Take over the alarms of earlier runs; return False while these are read (RESTORE_S at most)."""
         past = self.alarm_file.past if self.alarm_file is not None else []
         if past is None and self.clock() - self.begun < RESTORE_S:
             return False

@@ -16,7 +16,7 @@ class Notifier:
 
     @property
     def watchdog_s(self) -> float | None:
-        """The longest time between two WATCHDOG=1 messages that the service manager allows, in s; None: any."""
+        """The longest time between WATCHDOG=1 messages that the service manager allows, in s; None: any."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None

@@ -198,7 +198,7 @@ class Turns:
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that notes whether its client waits for each answer before the next request, and reads it."""
+    """A connection that notes whether its client reads each answer before it sends the next request."""
 
     @property
     def _connections(self) -> Connections:

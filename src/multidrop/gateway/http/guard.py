@@ -192,7 +192,7 @@ def _length(scope: Scope) -> int:
 
 
 def _secret(headers: Headers) -> tuple[str, str]:
-    """Return the token in a request, and the kind of its sender: "http" for a program, "page" for a browser."""
+    """Return the token in a request, and its sender's kind: "http" for a program, "page" for a browser."""
     scheme, _, secret = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return secret.strip(), "http"

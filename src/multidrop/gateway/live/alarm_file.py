@@ -97,7 +97,7 @@ class AlarmFile:
                 return found
 
     def _write(self, changed: list[Alarm], known: dict[str, Alarm]) -> None:
-        """Append the changed alarms; after a failure, or if the file is too long, rewrite it with all alarms."""
+        """Append the changed alarms; after a failure, or if the file is too long, rewrite the whole file."""
         is_whole = not self._failure and (not self.path.exists() or self.path.stat().st_size <= MOST_BYTES)
         if is_whole:
             with self.path.open("a", encoding="utf-8") as file:

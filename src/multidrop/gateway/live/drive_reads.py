@@ -113,7 +113,7 @@ class SideReads:
 
 
 class Identities:
-    """Checks each drive's identity once while its port is open, so that the drive's first stop is not delayed.
+    """Checks each drive's identity once while its port is open: the drive's first stop need not wait for it.
 
     `fail` is called in the `except` block of an unexpected exception, so it can log the exception.
     """

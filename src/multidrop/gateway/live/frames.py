@@ -271,8 +271,8 @@ class SeenFrames:
     """Protects commands over HTTP from networks that delay or repeat them.
 
     A write, or a verb that may move a motor, names the newest frame that its sender has seen. The command is
-    sent once, within MOST_AGE_S of that frame, and only if no stop and no reload followed the frame. Clocks of
-    other computers are not used.
+    sent once, within MOST_AGE_S of that frame, and only if no stop and no reload followed the frame. Clocks
+    of other computers are not used.
 
     `clock` returns ns and includes the computer's sleep.
     """

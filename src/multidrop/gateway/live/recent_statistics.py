@@ -92,7 +92,7 @@ class RecentStatistics:
         return round(max(0.0, used_s / seconds), 4), round(max(0.0, exchanges / seconds), 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
-        """Return a drive's share of misses and its response delay (99th percentile, ms) in the last minute."""
+        """Return a drive's share of misses and response delay (99th percentile, ms) in the last minute."""
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:

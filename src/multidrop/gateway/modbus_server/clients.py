@@ -130,7 +130,7 @@ class ModbusClient(asyncio.Protocol):
         self._close_if_done()
 
     def _look(self) -> bool:
-        """Start received writes and queue other requests; return False if time ran out before the last frame."""
+        """Start received writes and queue other requests; return False if frames are left for later."""
         begun = self._port.clock()
         answers: list[bytes] = []
         is_in_time = True

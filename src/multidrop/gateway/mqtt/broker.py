@@ -127,7 +127,7 @@ class Login(NamedTuple):
 
 
 class Speaker(Protocol):
-    """A message format on one connection, such as JsonTopics. Its methods are called in the event loop."""
+    """A message format on one connection, such as JsonTopics. Its methods run in the event loop."""
 
     def will(self) -> Publication:
         """Return the message that the broker publishes when this connection breaks."""

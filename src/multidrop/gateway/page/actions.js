@@ -1,4 +1,5 @@
-// Writes and verbs of one drive: confirmed by name, sent once, reported in the gateway's words.
+// Writes and verbs of one drive: the user confirms the drive's name, the page sends the command once and
+// shows the gateway's answer.
 
 import { Refused } from "./api.js";
 import { DANGER, STOP, confirm, confirmForm, send } from "./ask.js";
@@ -9,13 +10,13 @@ import { watchStop } from "./stop.js";
 import { key, known, mayAct, stops, store } from "./store.js";
 import { text, unit, withUnit, words } from "./values.js";
 
-const MOST = 20; // outcomes that are kept on the page; the log has all
+const MOST = 20; // outcomes kept on the page; the audit log has all
 const outcomes = [];
 const WITH_HZ = new Set(["set_frequency"]);
-const STOPS = new Set(["coast", "emergency_stop"]); // are sent whatever came before
+const STOPS = new Set(["coast", "emergency_stop"]); // sent even after a stop or a reload
 const TURNS = ["start", "jog", "run", "forward", "reverse"];
 
-// Make the verbs that the page's user may give, and the place where outcomes stand.
+// Make the buttons of the verbs that the page's user may send, and the list of outcomes.
 export function build(spec) {
   const verbs = (spec.verbs ?? []).filter(verb => verb !== "stop" && mayAct(spec.name, verb));
   const box = make(
@@ -64,9 +65,9 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-// Return a function that makes the body at confirmation, with the frame seen then. Call it when the dialog
-// opens: frames behind the dialog are not seen. It fails after a stop of the drive or a reload of the
-// plant, in which names may mean other drives.
+// Return a function that makes the request's body when the user confirms. Call this when the dialog opens:
+// the body names the newest frame that was seen. The function throws if the drive was stopped or the plant
+// was reloaded since: after a reload, names may mean other drives.
 function seen(drive) {
   const stopped = stops(drive),
     { revision } = store.plant;
@@ -96,7 +97,7 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
   }
 }
 
-// Ask for confirmation and send a verb, with a frequency if it takes one.
+// Ask for confirmation and send a verb, with a frequency if the verb takes one.
 export async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
     asked = WITH_HZ.has(verb) ? hertz(drive) : null,
@@ -117,8 +118,8 @@ export async function act(drive, verb) {
   await deliver(drive, what, "api/act", isStop ? () => body : withSeen(body), kind);
 }
 
-// Return the field of a frequency with its texts. If the setpoint has another unit than Hz, its value
-// is shown, and only the register of the maximum frequency is a limit.
+// Return the input field for a frequency, with its texts. If the setpoint register has another unit than Hz,
+// its value is shown in that unit, and only the register of the maximum frequency limits the input.
 function hertz(drive) {
   const { registers } = store.drives.get(drive);
   const setpoint = registers.get(key(drive, "setpoint"));
@@ -143,8 +144,8 @@ function held(drive, register) {
   return found && !found.isOld ? found.value : null;
 }
 
-// Return the least and the largest value that may be written: the register's own, and those that other
-// registers of the drive hold.
+// Return the least and the largest value that may be written: the stricter of the register's own limits and
+// the limits that other registers of the drive hold.
 function limits(drive, { least, most, at_least: atLeast, at_most: atMost }) {
   const ends = [
     [least, held(drive, atLeast)],
@@ -153,7 +154,7 @@ function limits(drive, { least, most, at_least: atLeast, at_most: atMost }) {
   return [Math.max(...ends[0]), Math.min(...ends[1])].map(end => (Number.isFinite(end) ? end : null));
 }
 
-// Return a sentence with a register's value.
+// Return a sentence with a register's present value.
 function present(drive, register) {
   const current = known(drive, register.name, now());
   if (!current || current.value === null) return `The value of ${words(register.name)} is unknown.`;
@@ -171,7 +172,7 @@ function span([least, most], of) {
   return bounds.length ? `Allowed: ${`${bounds.join(" ")} ${of}`.trim()}.` : "No limits known.";
 }
 
-// Ask for a value, and write it.
+// Ask for a value in a dialog, and write it to a register.
 export async function change(drive, register) {
   const name = words(register.name),
     withSeen = seen(drive),
@@ -199,7 +200,7 @@ export async function change(drive, register) {
 
 const FIELD = { id: "new-value", required: true, "data-first": true };
 
-// It is empty at first, so that Enter alone sends nothing.
+// The field is empty at first, so that Enter alone sends no value.
 function editor(register, [least, most]) {
   if (register.kind === "words" && register.words) {
     return make(

@@ -31,8 +31,9 @@ async function ask(path, options, patience, answered = () => {}) {
 
 export const get = (path, patience = PATIENCE_MS) => ask(path, {}, patience);
 
-// Browsers open six connections to a host for all tabs together, which other tabs' waiting frames may hold:
-// a command goes ahead of what is queued for them. `answered` is called when the head of the answer is here.
+// Browsers open at most six connections to a host for all tabs together, and other tabs that wait for frames
+// may occupy these. So a command gets a higher priority than other queued requests. `answered` is called when
+// the head of the answer has arrived.
 export const post = (path, body, patience = PATIENCE_MS, answered = undefined) =>
   ask(
     path,

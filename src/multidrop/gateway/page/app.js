@@ -1,4 +1,5 @@
-// The page's views, its keys and its beat: texts and plots five times a second, sparklines once.
+// The page's views, keyboard shortcuts and redraw timer: it draws texts and plots five times a second,
+// sparklines once a second.
 
 import { get } from "./api.js";
 import { askToken } from "./ask.js";
@@ -27,7 +28,7 @@ let view = "drives",
   chosen = null,
   beat = 0;
 
-// Show the view of the address, such as "#/drives/pump-1" or "#/trends?drive=pump-1".
+// Show the view that the address names, such as "#/drives/pump-1" or "#/trends?drive=pump-1".
 function route() {
   const [path, options] = location.hash.replace(/^#\/?/, "").split("?");
   const [name, rest] = path.split("/");
@@ -65,7 +66,7 @@ function showDrive(name, isOpen) {
   else if (wasOpen && !isOpen) table.focusChosen();
 }
 
-// Draw one part; if it fails, the others continue.
+// Draw one part of the page; if that fails, the other parts are drawn nevertheless.
 function safely(what) {
   try {
     what();

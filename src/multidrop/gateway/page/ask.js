@@ -1,25 +1,25 @@
-// The page's only dialog: asks for confirmation, for a token, and shows results.
+// The page's only dialog: it asks for confirmation or for a token, and shows results.
 
 import { post } from "./api.js";
 import { find, fill, make } from "./dom.js";
 
-let answer = null, // resolves the open question
-  stopAsked = null; // the answer to the open question if it asks for a stop
+let answer = null, // function that answers the open question
+  stopAsked = null; // promise of the answer, if the open question is about a stop
 
 const dialog = () => find("#ask");
 
-// The second click of a double click belongs to the button of the first. If the dialog opened or closed in
-// between, it would press an unseen button, so it is ignored, except for a stop. The same holds for clicks,
-// Enter and Space that came before the change was drawn, for example on a slow page, and for held keys.
+// If the dialog opens or closes during a double click, the second click would press a button that the user
+// has not seen. So that click is ignored, unless it asks for a stop. Also ignored are clicks, Enter and Space
+// from before the change was drawn, for example on a slow page, and repetitions of held keys.
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
 export const DANGER = "danger",
-  STOP = "danger stop"; // classes of buttons
-const STOP_PATIENCE_MS = 45000; // a drive that does not answer is sent its stop for 30 s
-let drawn = -Infinity, // when the latest opening or closing of the dialog could be seen
-  changes = 0, // how often it opened or closed
-  last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was taken
+  STOP = "danger stop"; // CSS classes of a button that stops
+const STOP_PATIENCE_MS = 45000; // longer than the 30 s for which a stop is repeated to a silent drive
+let drawn = -Infinity, // time at which the latest opening or closing of the dialog was drawn
+  changes = 0, // how often the dialog opened or closed
+  last = { x: 0, y: 0, time: -Infinity, changes }; // the latest click that was not ignored
 
 function changed() {
   const change = ++changes;
@@ -37,14 +37,14 @@ function isOfBefore({ clientX: x, clientY: y, timeStamp: time, detail }) {
   return time < drawn || (isNear && (detail > 1 || time - Math.max(last.time, drawn) < TWICE_MS));
 }
 
-// Outside the dialog only Stop all can be used, which lies behind it.
+// While the dialog is open, Stop all is the only button outside it that works.
 const isAtOnce = target => target === dialog() || target.closest?.(AT_ONCE);
 
 addEventListener(
   "click",
   event => {
     const { clientX: x, clientY: y, timeStamp: time, detail } = event;
-    if (detail === 0) return; // by a key
+    if (detail === 0) return; // a key caused this click
     if (isOfBefore(event) && !isAtOnce(event.target)) {
       event.preventDefault();
       event.stopImmediatePropagation();
@@ -55,7 +55,7 @@ addEventListener(
 addEventListener(
   "keydown",
   event => {
-    last.x = -Infinity; // a click after a key is a click of its own
+    last.x = -Infinity; // a click after a key is not the second click of a double click
     if (event.repeat && isPress(event)) event.preventDefault();
   },
   true,

@@ -24,7 +24,7 @@ export function begin() {
   );
 }
 
-// Fetch and draw the newest entries, in place of older ones.
+// Fetch the newest entries, and draw them in place of the entries shown before.
 export async function show() {
   [entries, more] = [[], false];
   await fetchMore("");
@@ -48,10 +48,10 @@ async function fetchMore(before) {
   find("#older").hidden = !more;
 }
 
-// Redraw in another time zone.
+// Redraw all times after a change of the time zone.
 export const redraw = () => entries.length && fill(find("#log-list"), auditRows(entries, true));
 
-// Return a table of entries, at most so many rows; `isWhole`: with the drive and the frame too.
+// Return a table of at most `most` entries; with `isWhole` also columns for the drive and the Modbus frame.
 export function auditRows(list, isWhole, most = Infinity) {
   const heads = [
     `Time, ${clock.zoneName()}`,
@@ -75,8 +75,9 @@ export function auditRows(list, isWhole, most = Infinity) {
   );
 }
 
-// Return the entries, of what was sent to a drive again and became the same the newest alone: a stop is
-// repeated until it is seen. `times` says how often, and `since` from when on.
+// Return the entries without repetitions: a stop is repeated until the drive confirms it. Of equal successive
+// commands to a drive with equal results, only the newest is returned; `times` is their number, `since` the
+// time of the first.
 function repeats(list) {
   const newest = new Map(),
     kept = [];

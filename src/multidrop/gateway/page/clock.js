@@ -1,4 +1,4 @@
-// Times as people read them: UTC or local by a switch, 24 hours always.
+// Times as texts: in UTC or local time, as the user chooses, and always with 24 hours.
 
 const KEY = "multidrop-times";
 let zone = kept() === "local" ? "local" : "UTC";
@@ -9,7 +9,7 @@ function kept() {
     return localStorage.getItem(KEY);
   } catch {
     return null;
-  } // a browser may forbid storage
+  } // the browser forbids storage
 }
 
 export const isUtc = () => zone === "UTC";
@@ -21,7 +21,7 @@ export function switchZone() {
   try {
     localStorage.setItem(KEY, zone);
   } catch {
-    /* it lasts as long as the page, then */
+    /* the browser forbids storage: the choice lasts until the page is closed */
   }
   dispatchEvent(new Event("timezone"));
 }
@@ -44,18 +44,18 @@ export const day = ms => formatted(ms, "day", DAY);
 export const milli = ms =>
   `${time(ms)}.${String(((Math.floor(ms) % 1000) + 1000) % 1000).padStart(3, "0")}`;
 
-// Return date and time, with the year if it is not the present one.
+// Return date and time, with the year if that is not the present year.
 export function moment(ms) {
   const far = Math.abs(Date.now() - ms) > 300 * 86400e3;
   return `${formatted(ms, far ? "year" : "day", far ? { ...DAY, year: "numeric" } : DAY)}, ${time(ms)}`;
 }
 
-// Return the time alone for today, else the day too.
+// Return the time alone if it is of today, else date and time.
 export const when = ms => (day(ms) === day(Date.now()) ? time(ms) : moment(ms));
 
 export const zoneName = () => (isUtc() ? "UTC" : "local");
 
-// Return a time as a field for dates and times has it, and the time (ms) of such a text.
+// Convert a time (ms) to the text of an input field of type datetime-local, and such a text to a time.
 export function field(ms) {
   const shift = isUtc() ? 0 : new Date(ms).getTimezoneOffset() * 60000;
   return new Date(ms - shift).toISOString().slice(0, 19);
@@ -72,11 +72,11 @@ export function lasting(ms) {
   return `${Math.round(s / 86400)} days`;
 }
 
-// Return how long an alarm has lasted; one present at the start began before.
+// Return for how long an alarm has lasted; an alarm present at the gateway's start may have begun before.
 export const since = ({ time: begin, is_before: isBefore }, t) =>
   isBefore ? `since before ${when(begin).slice(0, -3)}` : lasting(t - begin);
 
-// Return texts for a plot's time axis, as fine as its ticks lie apart. uPlot counts in seconds.
+// Return texts for a plot's time axis, as precise as the distance of its ticks needs. uPlot's times are in s.
 export function ticks(splits, step) {
   return splits.map(s => {
     const ms = s * 1000;
@@ -87,6 +87,6 @@ export function ticks(splits, step) {
   });
 }
 
-// Return the date whose local fields uPlot may lay its ticks by.
+// Return a Date whose local fields show the chosen time zone: uPlot places its ticks by these fields.
 export const tickDate = s =>
   isUtc() ? globalThis.uPlot.tzDate(new Date(s * 1000), "Etc/UTC") : new Date(s * 1000);

@@ -1,4 +1,4 @@
-// What frames do not hold of the chosen drive: response delays, misses by reason, EEPROM budgets, its writes.
+// Details of the chosen drive that frames lack: response delays, misses by reason, EEPROM budgets, writes.
 
 import { get } from "./api.js";
 import { auditRows } from "./audit.js";
@@ -19,7 +19,7 @@ export function build(spec) {
   );
 }
 
-// Fetch and redraw; a failure is shown in place of its data.
+// Fetch the details and redraw; if a request fails, its error is shown in place of its data.
 export async function refresh() {
   const asked = name;
   const [told, log] = await Promise.allSettled([
@@ -81,7 +81,7 @@ function delays({ delays, misses, asked, ledger }) {
   ].filter(Boolean);
 }
 
-// Draw counts by delay as bars, each with its span and number as a text.
+// Draw a histogram of response delays: a bar for each range of delays, with the range and the number as text.
 function histogram(counts) {
   const most = Math.max(...counts.map(([, n]) => n)),
     last = counts[counts.length - 1][0];

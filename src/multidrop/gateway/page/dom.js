@@ -1,9 +1,9 @@
-// Elements made of names and texts. A text is always a text node: no name of a drive can become markup.
+// Makes HTML elements. A text always becomes a text node, so no drive's name can become markup.
 
 const SVG = "http://www.w3.org/2000/svg";
 
-// Return an element. `attributes` are set one by one, those with the prefix "on" as listeners, `class` as
-// the class; null and false leave an attribute away. Children are elements, texts, or null for none.
+// Return an element. An attribute with the prefix "on" becomes a listener; an attribute with the value null
+// or false is left out. Children are elements, texts, or null, which is ignored.
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -17,11 +17,11 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-// Return a name from outside, which cannot change the order of the text around it.
+// Return a name from outside, isolated so that its writing direction cannot reorder the text around it.
 export const named = (text, attributes = {}) => make("bdi", attributes, String(text));
 
-// Return the head of a table. A head is a text, or a text and its class; an empty text is a cell that names
-// no column.
+// Return the head of a table. Each column's head is a text, or a text and its CSS class; an empty text makes
+// a cell without a heading.
 export const tableHead = heads =>
   make(
     "thead",
@@ -47,7 +47,7 @@ export function glyph(name) {
   return svg;
 }
 
-// Set a text if it has changed: most cells stay the same.
+// Set an element's text only if it differs, because most cells stay the same.
 export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -61,7 +61,7 @@ export const fill = (element, ...children) =>
 
 export const find = (selector, at = document) => at.querySelector(selector);
 
-// Return a colour of style.css as the canvas takes it, in the theme that is shown.
+// Return the value of a colour of style.css for a canvas, in the present theme.
 export function colour(name) {
   const probe = make("i", { class: "hidden" });
   document.body.append(probe);
@@ -71,7 +71,7 @@ export function colour(name) {
   return found;
 }
 
-// Say a sentence to who listens to the page.
+// Announce a sentence to screen readers.
 export function say(text) {
   put(find("#said"), text);
 }

@@ -28,7 +28,7 @@ export function begin() {
   onPlant(() => show(chosen, false));
 }
 
-// Show this drive, or say that there is none of this name. `isOpen`: on a small screen, over all else.
+// Show this drive, or a message if no drive has this name. With `isOpen`, its panel covers a small screen.
 export function show(name, isOpen) {
   chosen = name;
   const drive = store.drives.get(name);
@@ -126,5 +126,5 @@ export function draw() {
 
 export const drawPlots = () => parts && plots.draw();
 
-// Ask the gateway for what frames do not hold.
+// Fetch the details that frames do not contain.
 export const refresh = () => parts && details.refresh();

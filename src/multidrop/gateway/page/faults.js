@@ -1,4 +1,4 @@
-// Alarms: faults, motors that stopped by themselves, lost ports and silences; those that last and that ended.
+// Active and ended alarms: faults, motors that stopped by themselves, lost ports and silent drives.
 
 import { get, query } from "./api.js";
 import { confirmForm, send, tell } from "./ask.js";
@@ -10,13 +10,13 @@ import { ALARMS } from "./values.js";
 
 const SPAN_MS = 30 * 86400e3;
 const AROUND_MS = 15 * 60e3;
-const MOST_NOTE = 500; // characters
+const MOST_NOTE = 500; // characters of a note
 
 let shown = "",
   shownAt = 0;
 
-// Return what was wrong between two times, newest first: as the gateway remembers it, or as the frame has it;
-// and since when the gateway knows of all, null where it does not say.
+// Return the alarms between two times, newest first, from the gateway's memory or else from the frame. Also
+// return the time from which the gateway knows all alarms, or null if that is unknown.
 export async function read(from, to) {
   try {
     const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
@@ -50,7 +50,7 @@ export async function show() {
     list = find("#fault-list");
   if (sign === shown && (now() - shownAt < 5000 || list.contains(document.activeElement))) return;
   [shown, shownAt] = [sign, now()];
-  const kinds = Object.keys(ALARMS), // the gravest first
+  const kinds = Object.keys(ALARMS), // the gravest kind first
     rank = ({ kind, acknowledged }) => [acknowledged ? 1 : 0, kinds.indexOf(kind)].join(),
     lasting = found
       .filter(alarm => alarm.ended === null)
@@ -95,7 +95,7 @@ function row(alarm) {
 // Return an alarm's duration; it is frozen when the gateway is lost.
 function lasted({ time, ended, is_before: isBefore }) {
   const t = now(),
-    isNew = isLive(t) || store.frame === null, // before the first frame the list is fresh
+    isNew = isLive(t) || store.frame === null, // before the first frame the fetched list counts as fresh
     seen = ended ?? (isNew ? t : store.time);
   return `${isBefore ? "over " : ""}${clock.lasting(seen - time)}${ended === null ? " so far" : ""}`;
 }
@@ -121,7 +121,7 @@ function trendLink({ drive, time, ended }) {
   return make("a", { href: `#/trends?drive=${encodeURIComponent(drive)}&from=${from}&to=${to}` }, "Trend");
 }
 
-// Ask for a note, and acknowledge an alarm.
+// Ask the user for a note, and acknowledge an alarm.
 async function acknowledge({ id, drive, line, text }) {
   const field = make("input", { id: "ack-note", maxlength: MOST_NOTE, "data-first": true });
   const contents = [

@@ -1,5 +1,5 @@
-// The fleet: its gateways, the master of each line, and the latest moves.
-// Old data are marked with their age; missing answers are dashes.
+// The fleet: its gateways, the gateway that is master of each line, and the latest moves of lines.
+// Old data are shown with their age, missing data as dashes.
 
 import { get } from "./api.js";
 import * as clock from "./clock.js";
@@ -8,7 +8,7 @@ import { onPlant, store } from "./store.js";
 import { UNKNOWN } from "./values.js";
 
 const OLD_S = 3;
-const MOST_LINES = 200; // are drawn, those without a master that answers first
+const MOST_LINES = 200; // limit of lines drawn: first those whose master does not answer
 const NAMES = new Intl.Collator("en", { numeric: true }); // line-2 before line-10
 const UNITS = ["B", "kB", "MB", "GB", "TB"];
 const TABLES = {
@@ -26,7 +26,7 @@ const TABLES = {
 let newest = null,
   silent = new Set(), // gateways that do not answer: their lines may be unpolled
   ordered = [], // lines
-  cameAt = 0, // by this device's own clock
+  cameAt = 0, // when the newest data arrived, by this device's clock
   why = "",
   isAsking = false;
 
@@ -125,7 +125,7 @@ function drawAge(age, isOld) {
   setClass(find("#fleet"), "stale", isOld);
 }
 
-// Draw rows of cells; each cell knows its column's head, which a narrow screen shows beside it.
+// Draw a table's rows. Each cell also has its column's head, which a narrow screen shows beside the cell.
 function drawTable(id, made) {
   const heads = TABLES[id][1];
   fill(
@@ -141,7 +141,7 @@ function drawTable(id, made) {
   );
 }
 
-// Return the cells of a gateway; values that it does not report are unknown.
+// Return the table cells of a gateway, with dashes for values that the gateway does not report.
 function gateway([name, { host, session, began_ms: began, lines, says }]) {
   const spool = says?.spool;
   return [

@@ -8,8 +8,8 @@ export const label = (drive, register) => `${drive}.${register}`;
 
 const COLUMNS = ["time", "least", "mean", "most", "missed"];
 
-// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or
-// nobody asked for longer than a value holds. Raises Refused where no history is kept.
+// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or the
+// register was not polled for longer than a value stays current. Throws Refused if no history is kept.
 export async function read(labels, from, to, points) {
   const told = await get(
     `api/history?${query([
@@ -27,7 +27,7 @@ export async function read(labels, from, to, points) {
   return told;
 }
 
-// A register may be asked less often than there are points: what lies between two answers is no gap.
+// A register may be polled less often than the plot has points: empty points between two values are no gap.
 function withoutPauses(series, longest) {
   const kept = [];
   let pause = [],
@@ -48,13 +48,13 @@ function withoutPauses(series, longest) {
   return Object.fromEntries(COLUMNS.map(column => [column, kept.map(i => series[column][i])]));
 }
 
-// Return the unit of a series: a name may have been another drive's when it was recorded.
+// Return the unit in which a series was recorded; the name may have meant another drive then.
 export const unitOf = (told, spec) => told.unit ?? unit(spec);
 
 // Return true if a series has the present unit of its register.
 export const isPresent = (told, spec) => unitOf(told, spec) === unit(spec);
 
-// Return a sentence for each series with a part in another unit, which is not drawn.
+// Return a sentence for each series that has a part in another unit; such parts are not drawn.
 export const leftOut = series =>
   Object.entries(series)
     .filter(([, told]) => told.left_out?.length)

@@ -1,4 +1,4 @@
-// Faults and silences as bars over the time that the trends show.
+// Faults and silences as bars over the time axis of the trends.
 
 import { fill, glyph, make, named } from "./dom.js";
 import { read } from "./faults.js";
@@ -44,7 +44,7 @@ export async function draw(place, from, to, drives) {
   );
 }
 
-// Return a bar over the time before the gateway started.
+// Return a bar over the time from before the gateway started, of which no alarms are known.
 function unknown(since, from, to) {
   const text = "unknown: the gateway started later",
     shown = make("span", { class: "unknown", title: text }, text);

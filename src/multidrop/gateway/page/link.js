@@ -3,16 +3,17 @@
 import { get } from "./api.js";
 import { store, takeFrame, takeMinute, takePlant } from "./store.js";
 
-const PATIENCE_MS = 25000; // the gateway answers after 20 s without news
+const PATIENCE_MS = 25000; // request timeout; the gateway answers after 20 s even without news
 const AGAIN_MS = 500;
-const NONE = -1; // the number of no frame
-const HIDDEN_MS = 1000; // a hidden tab asks once a second and holds no connection
+const NONE = -1; // frame number in requests of a page that has no frame yet
+const HIDDEN_MS = 1000; // interval of requests from a hidden tab, which holds no connection open
 
 export const link = { why: "" };
-let under = null; // what cancels the request under way
+let under = null; // AbortController of the pending request
 
-// The gateway's clock less ours, in ms, as far as its answers' Date headers prove a difference. Date is cut
-// to whole seconds: the truth lies between `least` and `most`, and no correction is made where 0 does too.
+// The gateway's clock minus this device's clock in ms, from the Date headers of answers. A Date header has
+// whole seconds, so the difference is only known to lie between `least` and `most`. If 0 also lies between
+// them, no correction is made.
 const skew = { least: -Infinity, most: Infinity };
 
 function learnSkew(date, sent, received) {
@@ -27,16 +28,17 @@ function learnSkew(date, sent, received) {
 
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
-// Return the gateway's time in ms, the later of two clocks because this device's may be set back.
+// Return the gateway's time in ms: the later one by two clocks, because this device's clock may be set back.
 export const now = () =>
   Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
-// A command is about to be sent: give the connection free, and ask for the next frame behind it. All pages of
-// a browser have six connections together: so the others give theirs free too, and ask a little later.
+// Call this before a command is sent: it cancels the pending request, and requests the next frame after the
+// command. A browser has six connections for all its pages together, so the other pages also cancel their
+// requests, and repeat them a little later.
 const pages = new BroadcastChannel("command");
-let restMs = 0; // before the next request
+let restMs = 0; // pause before the next request
 addEventListener("command", () => {
   pages.postMessage(null);
   under?.abort();
@@ -76,7 +78,8 @@ export async function run() {
   }
 }
 
-// Return the changes since frame `n`, a whole frame if the gateway has forgotten it, or null without news.
+// Return the changes since frame `n`, or a whole frame if the gateway has forgotten frame `n`. Return null
+// without news.
 async function newer(n) {
   const sent = Date.now();
   under = new AbortController();

@@ -1,4 +1,4 @@
-// Two markers in trends, A and B: values at each, and what lies between.
+// Two markers in trends, A and B: the values at each marker, and the time and differences between them.
 
 import * as clock from "./clock.js";
 import { colour, fill, find, make, named, tableHead } from "./dom.js";
@@ -6,16 +6,17 @@ import { label } from "./history.js";
 import { heldAt } from "./plots.js";
 import { number } from "./values.js";
 
-const marks = { A: null, B: null }; // ms
+const marks = { A: null, B: null }; // time of each marker in ms
 let plots = () => [],
   view = () => ({ from: 0, to: 0 });
 
-// `getPlots` returns trends' plots, `getView` the span that is shown.
+// `getPlots` returns the plots of the trends, `getView` the time range that they show.
 export function begin(getPlots, getView) {
   [plots, view] = [getPlots, getView];
 }
 
-// Return the buttons. One puts its marker under the cursor, or into the span; arrow keys move it.
+// Return the two buttons. A button puts its marker under the cursor, or into the shown range if there is no
+// cursor; arrow keys move the marker.
 export const buttons = () =>
   ["A", "B"].map(name =>
     make(
@@ -32,7 +33,7 @@ export const buttons = () =>
     ),
   );
 
-// Put a marker under the cursor. Called by the button and by the keys a and b.
+// Put a marker under the cursor. The buttons and the keys a and b call this.
 export function place(name) {
   const { from, to } = view(),
     u = plots()[0]?.plot,
@@ -63,7 +64,7 @@ function set(name, ms) {
   draw();
 }
 
-// Draw the markers into a plot: uPlot calls this when it has drawn.
+// Draw the markers into a plot. uPlot calls this after it has drawn the plot.
 export function mark(u) {
   for (const [name, ms] of Object.entries(marks)) {
     if (ms === null || ms < view().from || ms > view().to) continue;
@@ -84,7 +85,7 @@ export function mark(u) {
   }
 }
 
-// Return the mean of a column at a time, while it holds, or null in a gap.
+// Return the value of a column at a time if it is still current then, or null in a gap.
 const at = (u, column, ms, holdMs) => (ms === null ? null : heldAt(u, column, ms / 1000, holdMs));
 
 // Write the table of the values at the markers.

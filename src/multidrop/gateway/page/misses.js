@@ -7,7 +7,7 @@ import { share } from "./values.js";
 const HOUR = 60; // minutes
 const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"];
 
-// Draw one bar for each minute, stacked by reason, and the hour's sums as a table.
+// Draw a bar for each minute, stacked by reason, and a table of the hour's sums.
 export function misses(minutes) {
   const sums = new Map();
   let asked = 0;

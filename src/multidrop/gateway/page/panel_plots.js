@@ -1,4 +1,4 @@
-// The stacked plots of the chosen drive on one cursor: setpoint against actual, current, one register more.
+// The chosen drive's plots with a common cursor: frequency and setpoint, electric current, another register.
 
 import * as clock from "./clock.js";
 import { colour, fill, find, make, put } from "./dom.js";
@@ -15,7 +15,7 @@ const RANGES = [
   [3600, "1 h"],
   [86400, "24 h"],
 ];
-const FROM_HISTORY = 600; // seconds: longer ranges are fetched, shorter ones drawn from frames
+const FROM_HISTORY = 600; // s: longer ranges are fetched from the history, shorter ones drawn from frames
 const ANEW_MS = 5000;
 const POINTS = 400;
 const SYNC = "panel";
@@ -33,7 +33,8 @@ export function clear() {
   serial++;
 }
 
-// Make ranges and places; the plots themselves follow when they are in the document.
+// Make the buttons for ranges, and empty elements for plots. `begin` makes the plots when these elements are
+// in the document.
 export function build(drive) {
   const ranges = make(
     "div",
@@ -186,7 +187,7 @@ function under(u, specs) {
 const until = () => (isLive(now()) ? store.time : now());
 const needsHistory = () => range > FROM_HISTORY;
 
-// Fetch the recorded past: all of a long range, or the part before this page's first frame.
+// Fetch recorded values: of a long range all, of a short range those from before this page's first frame.
 async function fetchPast() {
   const mine = ++serial,
     to = until(),
@@ -218,7 +219,7 @@ function link(labels, from, to) {
   if (csv && labels.length) csv.href = exportLink(labels, from, to, "csv");
 }
 
-// Draw the newest samples; fetched ranges are drawn when they arrive.
+// Draw the newest samples of frames; fetched ranges are drawn when they arrive.
 export function draw() {
   for (const { plot, specs, box } of plots) {
     const tables = specs.map(r => samples(r));
@@ -231,7 +232,7 @@ export function draw() {
   }
 }
 
-// Return [times, values, most, least] of a register over the range that is shown.
+// Return [times, values, most, least] of a register over the shown range.
 function samples(register) {
   const from = until() - range * 1000;
   const kept = past?.series?.[label(spec.name, register.name)],

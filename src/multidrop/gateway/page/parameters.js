@@ -1,10 +1,10 @@
-// All parameters of the selected drive, read on request: a table, and files of it. Nothing is written.
+// All parameters of the selected drive, read on request: as a table, and as files. No parameter is written.
 
 import { get, query } from "./api.js";
 import { fill, find, make, tableHead } from "./dom.js";
 import { words } from "./values.js";
 
-const AGAIN_MS = 1000; // between two requests while the gateway reads
+const AGAIN_MS = 1000; // interval of requests while the gateway reads the parameters
 
 let name = null;
 
@@ -17,7 +17,8 @@ export function build(spec) {
 
 const path = (drive, pairs) => `api/parameters/${encodeURIComponent(drive)}?${query(pairs)}`;
 
-// Fetch and redraw, and again while the gateway reads; a failure is shown in place of the data.
+// Fetch and redraw the parameters, repeatedly while the gateway reads them. A failed request's error is shown
+// in place of the data.
 async function ask(drive, pairs) {
   const found = await get(path(drive, pairs)).catch(error => ({ state: "failed", error: error.message }));
   if (drive !== name || !find("#parameters")) return;

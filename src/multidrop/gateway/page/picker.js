@@ -1,4 +1,4 @@
-// The choice of drives and quantities for trends.
+// The selection of drives and quantities for trends.
 
 import { fill, find, make, named } from "./dom.js";
 import { COLOURS, DASHES, swatch } from "./plots.js";
@@ -22,9 +22,9 @@ export function begin(into, what) {
   [place, changed] = [into, what];
 }
 
-let wanted = null; // named by an address before the plant was known
+let wanted = null; // drive named by the page's address before the plant was known
 
-// Keep the selection as far as this plant has it; select a default if it is empty.
+// Remove drives and quantities from the selection that this plant lacks; if none are left, select a default.
 export function takePlant() {
   chosen = chosen.filter(name => store.drives.has(name));
   if (wanted !== null) choose(wanted);
@@ -47,7 +47,7 @@ export function choose(name) {
 }
 
 export const drives = () => chosen;
-// Return the chosen registers that a chosen drive has polled: others cannot be taken away by their box.
+// Return the selected registers that a selected drive polls. Others have no checkbox to deselect them.
 export const quantities = () => {
   const there = numbers().map(({ name }) => name);
   return registers.filter(name => there.includes(name));

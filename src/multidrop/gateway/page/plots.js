@@ -1,4 +1,4 @@
-// Plots made by uPlot: its theme, its axes, and series of different times on one.
+// Plots made by uPlot: theme, axes, and one time axis for series with different sample times.
 
 import * as clock from "./clock.js";
 import { colour, make } from "./dom.js";
@@ -11,17 +11,17 @@ const FONT = "11px system-ui, DejaVu Sans, sans-serif";
 
 export const isThere = () => Boolean(globalThis.uPlot);
 
-// Return the range of an axis with a margin, at least so wide that noise does not fill the plot.
+// Return the range of a value axis with a margin, and wide enough that noise does not fill the plot.
 export const wide = least => (_, low, high) => {
   if (low === null || high === null) return [0, 1];
   const margin = Math.max((high - low) * 0.12, least);
   return [low - margin, high + margin];
 };
 
-// Return a number of an axis as numbers are written elsewhere: with a point, and not in groups.
+// Return a number of an axis as the page writes all numbers: with a decimal point, without groups of digits.
 const plain = value => (value === null ? null : String(Number(value.toPrecision(12))));
 
-// Return a plot. `options` may have series, height, bands, range, hasTimes, cursor, hooks; times are seconds.
+// Return a plot. `options` may have series, height, bands, range, hasTimes, cursor, hooks; times are in s.
 export function makePlot(
   into,
   data,
@@ -57,16 +57,16 @@ export function makePlot(
   );
 }
 
-// Return the places of values that no line leads to: between two gaps, as where a register is read less often
-// than the plot has points.
+// Return the indices of isolated values, which have a gap on both sides and so no line. They occur if a
+// register is read less often than the plot has points.
 export function alone({ data }, k) {
-  const places = [...data[k].keys()].filter(i => data[k][i] !== undefined), // other series have the rest
+  const places = [...data[k].keys()].filter(i => data[k][i] !== undefined), // skip times of other series
     isGap = n => (data[k][places[n]] ?? null) === null;
   return places.filter((_, n) => !isGap(n) && isGap(n - 1) && isGap(n + 1));
 }
 
-// Return the newest value of a column at a time (s), as long as it holds (ms), or null: several registers are
-// read one after the other, and at the time of one the others have no sample of their own.
+// Return the newest value of a column at a time (s), or null if that value is older than `holdMs`. Registers
+// are read one after the other, so at the time of one register's sample the others have none.
 export function heldAt({ data }, column, time, holdMs) {
   const times = data[0],
     values = data[column];
@@ -75,11 +75,11 @@ export function heldAt({ data }, column, time, holdMs) {
   return i >= 0 && (time - times[i]) * 1000 <= holdMs ? values[i] : null;
 }
 
-// Return the dashes of the series of this index: neighbours differ in dashes and colour, and the first 24
-// series are unique.
+// Return the dash pattern of the series of this index: neighbours differ in pattern and colour, and the first
+// 24 series have different combinations.
 export const dashes = index => DASHES[(index + Math.floor(index / 12)) % DASHES.length];
 
-// Return a visible line. `index` gives its colour.
+// Return the options of a series drawn as a line, in the colour of this index.
 export const line = (index, label, dash = []) => ({
   label,
   stroke: colour(COLOURS[index % COLOURS.length]),
@@ -101,7 +101,7 @@ export function swatch(index) {
   return mark;
 }
 
-// Return one table of times (s) and columns from several [times in ms, column, column …].
+// Merge several [times in ms, column, column …] into one table of times (s) and columns.
 export function join(tables) {
   const there = tables.map(([times, ...columns]) => [times.map(ms => ms / 1000), ...columns]);
   return there.length === 1 ? there[0] : globalThis.uPlot.join(there);

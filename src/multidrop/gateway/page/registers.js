@@ -1,5 +1,5 @@
-// All registers of the selected drive, polled ones first and commands last: value, unit, place in the manual,
-// and a button to write.
+// All registers of the selected drive, polled registers first and commands last. Each has its value, unit,
+// place in the manual, and a button to write it if allowed.
 
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
@@ -59,7 +59,7 @@ function row({ register, value, age }) {
   );
 }
 
-// Commands are given by verbs, but for the setpoint.
+// Of the command registers only the setpoint can be written; verbs write the others.
 const isOffered = ({ name: register, access }) =>
   (access === "setting" || register === key(name, "setpoint")) && mayWrite(name, register);
 

@@ -4,15 +4,15 @@ import { confirm, send, tell } from "./ask.js";
 import { glyph, make, named } from "./dom.js";
 import { store } from "./store.js";
 
-const PATIENCE_MS = 60000; // a plan of many lines is long work
+const PATIENCE_MS = 60000; // request timeout: planning many lines takes long
 const WHAT =
   "Polling follows the new file. No motor is started or stopped, and motors of removed drives keep their " +
   "state. If the file has a mistake, nothing changes.";
 
-// Return whether this page's user may have the file read again.
+// Return whether this page's user may reload the plant file.
 export const mayReload = () => store.plant?.file === true && store.plant.may?.role === "write";
 
-// Ask, and have the plant file read again.
+// Ask for confirmation, and reload the plant file.
 export async function reload() {
   const file = () => named(store.plant.name);
   if (!(await confirm(["Reload ", file(), "?"], [make("p", {}, WHAT)], ["Reload ", file()]))) return;
@@ -29,7 +29,7 @@ export async function reload() {
   await tell(...shown);
 }
 
-// Return a title, and what to show of the gateway's answer.
+// Return the title and contents of a dialog that shows the gateway's answer.
 function outcome({ done, text, mistakes = [], restart = [] }) {
   if (done === true) {
     const waits = restart.length
@@ -48,7 +48,7 @@ const list = (sentences, kind) =>
   sentences.length
     ? make(
         "ul",
-        { class: "outcome", tabindex: "0", "aria-label": "Messages" }, // keys scroll it
+        { class: "outcome", tabindex: "0", "aria-label": "Messages" }, // focusable, so that keys scroll it
         sentences.map(sentence =>
           make("li", { class: kind }, kind ? glyph("fault") : null, named(sentence)),
         ),

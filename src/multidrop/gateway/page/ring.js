@@ -11,7 +11,7 @@ export class Ring {
     this.values = new Float32Array(this.times.length);
   }
 
-  // Add a sample, unless it is the newest one again.
+  // Add a sample, unless it is already the newest one.
   add(ms, value) {
     if (this.count && this.times[(this.at + this.times.length - 1) % this.times.length] === ms) return;
     if (this.count === this.times.length && this.count < this.most) this.grow();

@@ -1,4 +1,4 @@
-// One row of the table for each drive, and one above each line's.
+// Rows of the table: one for each drive, and one for each line above the line's drives.
 
 import * as clock from "./clock.js";
 import { fill, glyph, make, named, put, setClass } from "./dom.js";
@@ -6,10 +6,10 @@ import { driveAge, isLive, key, noteOf, reading, state, store } from "./store.js
 import { STATES, UNKNOWN, makeValue, share, showValue } from "./values.js";
 
 export const COLUMNS = 8;
-const MANY = 0.01; // a share of misses from which they are a warning
-const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // a full bar's length
+const MANY = 0.01; // share of misses from which a warning is shown
+const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // ends of a bar's scale
 
-// Return a line's row and its parts. A click on its name calls `unfold`, unless that is null.
+// Return a line's row and its changing elements. A click on the line's name calls `unfold`, if not null.
 export function makeHead(line, unfold) {
   const name = named(line.name, { class: "linename" });
   const parts = {
@@ -44,7 +44,7 @@ export function makeHead(line, unfold) {
   return parts;
 }
 
-// Return a drive's row and its parts.
+// Return a drive's row and the row's changing elements.
 export function makeRow(drive) {
   const parts = {
     name: drive.name,
@@ -89,7 +89,7 @@ function stateWord(is, drive, age) {
   return age === null ? "silent, never answered" : `silent for ${clock.lasting(age)}`;
 }
 
-// Return the absolute value of a drive's frequency or setpoint in hertz, or null if it is old.
+// Return the absolute value of a drive's frequency or setpoint in hertz, or null if the value is old.
 function hertz(name, part, t) {
   const register = key(name, part),
     found = register && reading(name, register, t);
@@ -99,7 +99,7 @@ function hertz(name, part, t) {
     : null;
 }
 
-// Return the frequency of a full bar, the same for all drives, or null without bars.
+// Return the frequency that a full bar means, the same for all drives, or null if no bars are drawn.
 export function fullBar(t) {
   const shown = [...store.drives.keys()].flatMap(name => {
     const actual = hertz(name, "frequency", t);
@@ -122,7 +122,7 @@ function drawBar(r, t, full) {
   if (!r.set.hidden) r.set.style.left = length(set);
 }
 
-// Update a row; `full` is the frequency of a full bar in hertz. Return true if the state has changed.
+// Update a drive's row; `full` is the frequency of a full bar in hertz. Return true if the state has changed.
 export function drawRow(r, t, full) {
   const drive = store.frame?.drives[r.name],
     is = state(r.name),
@@ -176,7 +176,7 @@ export function drawHead(h) {
           ? `${misses} missed in the last minute`
           : "none missed",
   );
-  const asked = rate === null ? 0 : rate * 60; // in the last minute
+  const asked = rate === null ? 0 : rate * 60; // requests in the last minute
   setClass(h.missed, "lost", Boolean(lost));
   setClass(h.missed, "warn", Boolean(lost) || (misses > 1 && misses >= MANY * asked));
 }

@@ -1,4 +1,4 @@
-// Settings of this browser: times, theme, rights, and a list of keys.
+// Settings of this browser: time zone, theme, token, and a list of keyboard shortcuts.
 
 import { post } from "./api.js";
 import { askToken, tell } from "./ask.js";
@@ -55,7 +55,7 @@ function setTheme(name) {
   try {
     localStorage.setItem(THEME, name);
   } catch {
-    /* it lasts as long as the page, then */
+    /* the browser forbids storage: the choice lasts until the page is closed */
   }
   dispatchEvent(new Event("theme"));
 }

@@ -1,7 +1,7 @@
-// Sparklines: the last minute of a register in a row of the table. A miss is a gap.
+// Sparklines: the last minute of a register, drawn in a row of the table. A miss is a gap.
 
 const SECONDS = 60;
-const LEAST_SPAN = 1; // so that noise of a standing motor does not look like a run
+const LEAST_SPAN = 1; // least range of values, so that noise of a standing motor does not look like a run
 
 // Draw samples of the last minute before `until` (ms) into a canvas.
 export function spark(canvas, ring, until, colour) {

@@ -13,9 +13,9 @@ const TAKEN =
 const UNTAKEN = "The gateway has not accepted the stop";
 const HARD = "Use the hard-wired stop at the machine if a motor must stop now.";
 const HARD_NOW = "Use the hard-wired stop at the machine now. This page keeps waiting for the gateway.";
-const TAKEN_MS = 1500; // within which a gateway that works confirms that it has taken a stop
+const TAKEN_MS = 1500; // time limit for the gateway to confirm that it has accepted a stop
 
-// Return what "Stop all" stops in the view that is shown: its label, its name, and its requests.
+// Return the target of "Stop all" in the present view: the button's label, the target's name, the requests.
 function target() {
   const { drives, lines, plant, fleet } = find("#stopall").dataset;
   const all = drives > 1 ? `all ${drives} drives` : "all drives";
@@ -48,22 +48,22 @@ export function showTarget() {
   find("#stopall").title = `Stop ${what}`;
 }
 
-// Ask, and stop all drives.
+// Ask for confirmation, and stop all drives.
 export async function stopAll() {
   const { what, where, requests } = target();
   if (await confirm(`Stop ${what}?`, [make("p", {}, where + HOW)], `Stop ${what}`, STOP))
     await stop(requests, what);
 }
 
-// Ask, and stop this drive.
+// Ask for confirmation, and stop this drive.
 export async function stopOne(name) {
   const [title, yes] = [["Stop ", named(name), "?"], ["Stop ", named(name)]];
   if (await confirm(title, [make("p", {}, HOW)], yes, STOP))
     await stop([["api/stop", { drives: [name] }]], name);
 }
 
-// Show how far a stop is. Return what watches each of its requests: a gateway that works confirms within
-// half a second that it has taken the stop.
+// Show the progress of a stop, and return callbacks for its requests. A working gateway confirms within half
+// a second that it has accepted the stop.
 function showProgress(what, isShown) {
   const title = make("span"),
     words = make("p", { role: "alert" });
@@ -76,7 +76,7 @@ function showProgress(what, isShown) {
   const stopping = ["Stopping ", named(what), " …"];
   show(stopping, `${SENT} ${HARD}`, false);
   if (isShown) open();
-  const waiting = new Set(); // timers of requests that are not confirmed
+  const waiting = new Set(); // timers of requests that the gateway has not confirmed yet
   const late = () => {
     show([UNTAKEN], `No confirmation within ${TAKEN_MS / 1000} s. ${HARD_NOW}`, true);
     if (!words.closest("dialog[open]")) open();
@@ -93,7 +93,7 @@ function showProgress(what, isShown) {
   };
 }
 
-// Return what watches a verb that stops a drive: a dialog opens only if the gateway does not take it.
+// Return callbacks for a verb that stops a drive: they open a dialog only if the gateway does not confirm it.
 export const watchStop = name => showProgress(name, false)();
 
 async function stop(requests, what) {
@@ -119,7 +119,7 @@ async function ending(path, body, watch) {
   }
 }
 
-// Return title and contents for a stop with a failed request: the failure and the other results.
+// Return a dialog's title and contents for a stop with a failed request: the failure, and the other results.
 function failure(error, ends) {
   const isRefused = error.status >= 400 && error.status < 500;
   const others = ends.filter(end => end.told).map(end => outcome(end.told));
@@ -132,7 +132,7 @@ function failure(error, ends) {
   };
 }
 
-// Return a title, what to show and whether every drive stands, of the gateway's answer.
+// Return, for the gateway's answer, a dialog's title and contents, and whether all drives have stopped.
 function outcome(told) {
   const rows = Object.entries(told),
     failed = rows.filter(([, { done }]) => done !== true);
@@ -161,9 +161,9 @@ function outcome(told) {
   return { title, contents: contents.filter(Boolean), isWhole };
 }
 
-const WHOLE_MS = 8000; // in which the other parts of the page should be there
+const WHOLE_MS = 8000; // time limit for loading the other parts of the page
 
-// Report if other parts of the page were not loaded.
+// Show a message if other parts of the page were not loaded in time.
 setTimeout(() => {
   if (document.body.dataset.begun) return;
   find("#notice").textContent =
@@ -174,7 +174,7 @@ setTimeout(() => {
 
 find("#stopall").addEventListener("click", stopAll);
 addEventListener("hashchange", showTarget);
-// Stop all works behind an open dialog too, in place of the dialog's question.
+// Stop all also works while a dialog is open; its question then replaces the dialog's.
 find("#ask").addEventListener("click", event => {
   const isIn = element => {
     const { left, right, top, bottom } = element.getBoundingClientRect();
@@ -187,15 +187,15 @@ find("#stopall").disabled = false;
 find("#notice").hidden = true;
 find("#notice").classList.remove("loading", "bad");
 
-// Return "one" or "all" for the keys that ask for a stop, S and Shift S, else null. Where a layout has no
-// such letter it is that key; with caps lock on, S is "all" with Shift or without.
+// Return "one" for the key S, "all" for Shift+S, else null. On a keyboard layout without the letter S, the
+// key at its place counts. With caps lock on, S means "all" with or without Shift.
 export function stopKey({ key, code, shiftKey }) {
   const isStop = /^[a-z]$/i.test(key) ? key.toLowerCase() === "s" : code === "KeyS";
   return !isStop ? null : shiftKey || key === "S" ? "all" : "one";
 }
 
 addEventListener("keydown", event => {
-  // The key works like the button, unless the user types text.
+  // The key works like the button, except in text fields.
   const isTyped = event.target.closest?.("input, select, textarea");
   const isOther = event.ctrlKey || event.metaKey || event.altKey || event.repeat;
   if (stopKey(event) === "all" && !isOther && !isTyped) stopAll();

@@ -1,28 +1,28 @@
-// The plant and its newest values, as the gateway sends them, and a short past of each for plots.
-// Each value has its time, and an old value never looks new.
+// The plant and its newest values, as the gateway sends them, and recent samples of each register for plots.
+// Each value has its time, so that an old value never looks new.
 
 import { Ring } from "./ring.js";
 
-const SAMPLES = 2e6; // of all registers together
-const UNPOLLED_S = 5; // for which a value of a register holds that is no longer polled
-const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
-const LOOK_MS = 60000; // in which the gateway reads all registers of a viewed drive
-const UNSEEN_MS = 5000; // between two frames: values in between are unknown
-export const LIVE_MS = 1500; // a frame comes each second at least
+const SAMPLES = 2e6; // limit of samples kept, of all registers together
+const UNPOLLED_S = 5; // how long a value of an unpolled register stays current
+const FAILED_LIMIT_MS = 1000; // how long a value stays current after a failed request
+const LOOK_MS = 60000; // time in which the gateway reads all registers of a viewed drive
+const UNSEEN_MS = 5000; // if frames are further apart than this, plots have a gap
+export const LIVE_MS = 1500; // a frame is live for this long; a new frame comes each second at least
 
-// `time` of the frame is in ms of the gateway's clock, `came` in ms of a monotonic clock.
+// The frame's `time` is in ms of the gateway's clock, `came` in ms of this device's monotonic clock.
 export const store = { plant: null, frame: null, time: 0, came: 0, isLost: false, drives: new Map() };
 store.lines = new Map();
 const watchers = [];
 
-// Call `what` when there is another plant.
+// Register a function that is called when the gateway has another plant.
 export function onPlant(what) {
   watchers.push(what);
   if (store.plant) what();
 }
 
-// Take a plant description. Values and pasts go on where drive and register are the same ones: under the same
-// name may be another drive now, or the same number in another unit.
+// Use a plant description. Values and samples are kept only if drive and register are unchanged: the same
+// name may mean another drive now, or a value in another unit.
 export function takePlant(plant) {
   const before = store.drives;
   store.plant = plant;
@@ -39,8 +39,8 @@ export function takePlant(plant) {
         registers,
         good: known("good"),
         pasts: known("pasts"),
-        newest: new Map(), // {ms, status} of each register's newest request
-        seen: null, // request of its newest value, in ms
+        newest: new Map(), // by register: {ms, status} of its newest request
+        seen: null, // time of the request for the drive's newest value, in ms
       });
     }
   }
@@ -52,13 +52,13 @@ function sameDrive(old, { family, address }, { port }) {
   return isSame ? old : null;
 }
 
-// Return whether a register of a drive has the same unit, step and words as it had before.
+// Return whether a register of a drive has the same unit, step and names of values as before.
 function isSame(before, registers, name) {
   const meaning = ({ unit, step, kind, words } = {}) => JSON.stringify([unit, step, kind, words]);
   return meaning(before.registers.get(name)) === meaning(registers.get(name));
 }
 
-// Take the last minute of registers, which fills sparklines at once: {drive: {register: [[ms, value]]}}.
+// Add the last minute's samples, so that sparklines are full immediately: {drive: {register: [[ms, value]]}}.
 export function takeMinute(minute) {
   for (const [name, registers] of Object.entries(minute)) {
     const pasts = store.drives.get(name)?.pasts;
@@ -71,7 +71,7 @@ export function takeMinute(minute) {
   }
 }
 
-// Take a frame, or what changed since the one before: keep each value that is newer than its last one.
+// Process a frame, or the changes since the previous frame: store each value that is newer than before.
 export function takeFrame(told) {
   const frame = told.since === undefined ? told : merged(store.frame, told);
   const before = store.time;
@@ -89,7 +89,7 @@ export function takeFrame(told) {
   }
 }
 
-// Values after this time (ms) were missed, for example while the page slept: no line is drawn over the gap.
+// Note that values after this time (ms) were missed, for example while the page slept: plots get a gap.
 function leaveGap(ms) {
   for (const { pasts } of store.drives.values()) for (const ring of pasts.values()) ring.add(ms, NaN);
 }
@@ -120,10 +120,10 @@ function most() {
   return Math.max(120, Math.min(6000, Math.floor(SAMPLES / registers)));
 }
 
-// Return the present reading of a register, or null if there never was one:
-// {value, ms, status, age (ms), isOld}. `now` is the gateway's time; a value is old when the gateway says so,
-// a second after it if the newest request failed, or when the frame itself is old. A time in the future is
-// from before the gateway's clock was set back.
+// Return the present reading of a register: {value, ms, status, age (ms), isOld}, or null if there never was
+// one. `now` is the gateway's time. A value is old if the gateway says so, if it is a second old and the
+// newest request failed, or if the frame itself is old. A time in the future is from before the gateway's
+// clock was set back.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
     newest = drive?.newest.get(register);
@@ -141,14 +141,14 @@ export function reading(name, register, now) {
   };
 }
 
-let others = { drive: null, values: {} }; // of a drive's registers that are not polled
+let others = { drive: null, values: {} }; // values of the viewed drive's unpolled registers
 
-// Take the newest values of a drive's registers that are not polled: {register: [value, ms, status]}.
+// Store the newest values of a drive's unpolled registers: {register: [value, ms, status]}.
 export function takeOthers(drive, values) {
   others = { drive, values: values ?? {} };
 }
 
-// Return the reading of a register, polled or read for viewing.
+// Return the reading of a register that is polled, or that is read because its drive is viewed.
 export function known(drive, register, t) {
   const polled = reading(drive, register, t),
     row = others.drive === drive ? others.values[register] : undefined;
@@ -159,23 +159,23 @@ export function known(drive, register, t) {
   return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS || isSilent };
 }
 
-// Return for how long, in ms, a value of a register holds.
+// Return for how long a value of a register stays current, in ms.
 export const holdsFor = (name, register) =>
   1000 * (store.drives.get(name)?.registers.get(register)?.holds_s ?? UNPOLLED_S);
 
 export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
 
-// Return the age of the drive's newest good reply in ms, or null without one.
+// Return the age of the drive's newest good reply in ms, or null if there is none.
 export function driveAge(name, now) {
   const seen = store.drives.get(name)?.seen ?? null;
   return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
 }
 
-// Return how many stops of a drive were called so far.
+// Return the number of stops of a drive that were called so far.
 export const stops = name => store.frame?.drives[name]?.stops ?? 0;
 
-// Return a drive's state. One of unknown state whose frequency is 0 is "still", which is no fault: at rest,
-// or running at a setpoint of 0.
+// Return a drive's state. If the state is unknown and the frequency is 0, return "still": the motor is at
+// rest, or runs at a setpoint of 0, which is no fault.
 export function state(name) {
   const drive = store.frame?.drives[name],
     is = drive?.state ?? "unknown";
@@ -185,7 +185,7 @@ export function state(name) {
 // Return a drive's note, or why its state is unknown.
 export const noteOf = name => store.frame?.drives[name]?.note ?? "";
 
-// Return the register that has this part in the drive, "frequency" for one, or null.
+// Return the drive's register for a purpose such as "frequency", or null.
 export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
 
 // Return the alarms: active ones first, the most serious before the others.
@@ -193,7 +193,7 @@ export const alarms = () => store.frame?.alarms ?? [];
 
 export const lasting = () => alarms().filter(alarm => alarm.ended === null);
 
-// Return whether the page's user may do this here: a register or a verb of a drive.
+// Return whether the page's user may write this register or send this verb of a drive.
 export const mayWrite = (drive, register) =>
   store.plant?.may?.write?.includes(`${drive}.${register}`) ?? false;
 export const mayAct = (drive, verb) => store.plant?.may?.verbs?.includes(`${drive}.${verb}`) ?? false;

@@ -1,4 +1,4 @@
-// The drives by line: which rows there are, which are shown, and which one is chosen.
+// The table of drives by line: its rows, its filter, and the chosen drive.
 
 import { colour, fill, find, make, put, setClass, tableHead } from "./dom.js";
 import { now } from "./link.js";
@@ -25,16 +25,16 @@ const SHOWN = {
 };
 
 const scale = make("span", { class: "full" });
-const MANY = 60; // a plant with more drives shows of each line only drives with a problem, until it is opened
+const MANY = 60; // in a plant with more drives, a closed line shows only its drives with a problem
 let rows = [],
   heads = [],
   show = "all",
   query = "",
   chosen = null;
-const opened = new Set(), // names of lines
+const opened = new Set(), // names of the lines whose drives are all shown
   none = make("p", { class: "note", id: "none", role: "status" });
 
-// Build the table for the plant, and its filter.
+// Build the table and its filter for the plant.
 export function begin() {
   onPlant(build);
   const filter = find("#filter");
@@ -100,7 +100,7 @@ function unfold(line) {
   drawFilter();
 }
 
-// Let the heads of lines span the columns that this width shows.
+// Make the rows of lines span all columns that the window's width shows.
 export function fit() {
   const columns = [...document.querySelectorAll("#table thead th")].filter(
     th => getComputedStyle(th).display !== "none",
@@ -108,7 +108,7 @@ export function fit() {
   for (const th of document.querySelectorAll("#table tr.head th")) th.colSpan = Math.max(1, columns);
 }
 
-// Mark the chosen drive; Tab leads to it.
+// Mark the chosen drive, and make Tab focus it.
 export function choose(name) {
   chosen = name;
   const first = rows.find(r => r.name === name) ?? rows[0];
@@ -121,7 +121,7 @@ export function choose(name) {
   drawFilter();
 }
 
-// Return the link of the drive that lies so many rows below the one that has the focus, or null.
+// Return the link of the drive that is this many rows below the focused drive, or null.
 export function neighbour(step) {
   const there = rows.filter(r => !r.row.hidden);
   const focused = there.findIndex(r => r.link === document.activeElement);
@@ -129,7 +129,7 @@ export function neighbour(step) {
   return there[Math.max(0, Math.min(there.length - 1, at < 0 ? 0 : at + step))]?.link ?? null;
 }
 
-// Give the focus to the chosen drive's row.
+// Focus the chosen drive's row.
 export const focusChosen = () => rows.find(r => r.name === chosen)?.link.focus();
 
 export function drawRows() {

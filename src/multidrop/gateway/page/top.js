@@ -1,4 +1,4 @@
-// The head of the page: plant, views, age of the frame, clock, rights, and the strip of alarms.
+// The head of the page: plant, views, the frame's age, clock, the user's rights, and the strip of alarms.
 
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
@@ -8,12 +8,12 @@ import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
 import { count } from "./values.js";
 
 const DEAD_MS = 3000;
-const SKEW_MS = 2000; // a larger error of the viewer's clock is shown
+const SKEW_MS = 2000; // larger errors of the viewer's clock are reported
 let told = "";
 let shownStrip = "",
-  ages = []; // [element, alarm] of each age in the strip
+  ages = []; // [element, alarm] for each duration in the strip
 
-// Show the plant in the head.
+// Show the plant's name and views in the head.
 export function showPlant() {
   const { plant } = store;
   const name = plant.name.replace(/\.toml$/, "");
@@ -101,7 +101,7 @@ function drawStrip(t) {
   for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, t)}`);
 }
 
-// Return the text of a plant without active alarms.
+// Return the text that the strip shows without active alarms.
 function calm() {
   if (!store.frame) return "No values yet.";
   const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;

@@ -1,4 +1,4 @@
-// One quantity of several drives over recorded time, each with the band of its least and largest value.
+// A plot of one quantity of several drives from the history. Bands show each drive's least and largest value.
 
 import * as clock from "./clock.js";
 import { colour, fill, make, named } from "./dom.js";
@@ -9,7 +9,7 @@ import { COLOURS, dashes, heldAt, join, line, makePlot, summary, swatch, wide } 
 import { holdsFor, store } from "./store.js";
 import { number, words } from "./values.js";
 
-// Make the plot of one quantity of these drives. `set` shows the range selected by a drag.
+// Make the plot of one quantity of these drives. `set` is called with the time range of a mouse drag.
 export function makeTrend(place, { register, unit, drives }, told, { view, set, count, stepMs }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
   const out = make("output"),
@@ -79,15 +79,15 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
   return { plot, drives, holds, spec, register, unit };
 }
 
-// Return the characters of the longest value.
+// Return the number of characters of the longest value.
 function widest(values, digits) {
   const there = values.filter(value => value !== null && value !== undefined),
     ends = [there.reduce((a, b) => Math.min(a, b), 0), there.reduce((a, b) => Math.max(a, b), 0)];
   return Math.max(...ends.map(value => number(value, digits).length));
 }
 
-// Return the legend: each drive's value at the cursor; without a cursor the names, if there are
-// several. It takes the same room then: else the plot would move under the cursor that comes.
+// Return the legend: each drive's value at the cursor. Without a cursor, the names of several drives take the
+// same space, so that the plot does not move when the cursor enters it.
 function under(u, { drives, marks, widths, holds, spec }) {
   const i = u.cursor.idx ?? null,
     at = i === null ? undefined : u.data[0][i];

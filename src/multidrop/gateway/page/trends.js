@@ -1,4 +1,4 @@
-// Recorded values over any time: zoom, markers, faults beside them, and files to take away.
+// Trends of recorded values over any time range: zoom, markers, a lane of faults, and export files.
 
 import { confirmForm } from "./ask.js";
 import * as clock from "./clock.js";
@@ -21,7 +21,7 @@ const RANGES = [
 ];
 const LEAST_MS = 1000;
 const ANEW_MS = 5000;
-const SETTLE_MS = 150; // only the last of several clicks is fetched
+const SETTLE_MS = 150; // delay before a fetch, so that of several clicks only the last is fetched
 
 const view = { from: 0, to: 0, follows: true, back: [] };
 let plots = [],
@@ -29,8 +29,8 @@ let plots = [],
   waiting = null,
   serial = 0,
   isShown = false,
-  isDragged = false, // over a plot, which must not be rebuilt then
-  isDue = false; // drawing, after the mouse button is released
+  isDragged = false, // the mouse drags over a plot, which must not be rebuilt meanwhile
+  isDue = false; // the plots must be drawn when the mouse button is released
 
 export function begin() {
   onPlant(() => {
@@ -72,7 +72,7 @@ export function begin() {
     ),
   );
   find("#trend-plots").addEventListener("mousedown", () => (isDragged = true));
-  for (const end of ["mouseup", "blur"]) addEventListener(end, letGo); // the plots have had it by then
+  for (const end of ["mouseup", "blur"]) addEventListener(end, letGo); // runs after the plots' listeners
   picker.begin(find("#picker"), ask);
   markers.begin(
     () => plots,
@@ -80,7 +80,7 @@ export function begin() {
   );
 }
 
-// Show the view; a link may name a drive and a span.
+// Show the view; a link to it may name a drive and a time range.
 export function show(options) {
   isShown = true;
   if (options.get("drive")) picker.choose(options.get("drive"));
@@ -96,7 +96,7 @@ export function hide() {
 
 function set(from, to, follows) {
   const isSame = Math.abs(from - view.from) + Math.abs(to - view.to) < (view.to - view.from) / 1000;
-  if (isSame && !follows) return; // each plot reports a drag
+  if (isSame && !follows) return; // every plot reports the same drag
   if (view.to) view.back.push([view.from, view.to, view.follows]);
   view.back.splice(0, view.back.length - 50);
   Object.assign(view, { from, to: Math.max(to, from + LEAST_MS), follows });
@@ -114,7 +114,7 @@ const zoom = by => {
   set(middle - half, middle + half, false);
 };
 
-// Ask for two dates, and show what lies between them.
+// Ask for two dates in a dialog, and show the time range between them.
 async function askDates() {
   const [from, to] = [
     ["dates-from", view.from],
@@ -143,7 +143,7 @@ export function back() {
   ask();
 }
 
-// Fetch the selection soon; a later request supersedes an earlier one.
+// Fetch the selected series after SETTLE_MS; a later call replaces this one.
 function ask() {
   clearTimeout(waiting);
   showSpan();
@@ -215,7 +215,7 @@ function letGo() {
   if (isDue) draw();
 }
 
-// Draw the last answer; also after a change of size, theme or time zone.
+// Draw the newest fetched data; called again after a change of size, theme or time zone.
 export function draw() {
   isDue = isDragged;
   if (isDue) return;
@@ -230,7 +230,7 @@ export function draw() {
   markers.draw();
 }
 
-// Return a quantity, its unit and its drives for each plot: another unit is another plot.
+// Return quantity, unit and drives of each plot: drives with different units need different plots.
 function parted() {
   const found = new Map();
   for (const register of picker.quantities())

@@ -1,4 +1,4 @@
-// Values as texts. An unknown value is a dash, never 0; an old one has its time.
+// Values as texts. An unknown value is a dash, never 0; an old value has its time.
 
 import * as clock from "./clock.js";
 import { make, setClass } from "./dom.js";
@@ -17,7 +17,7 @@ const MOST_BITS = 32;
 
 export const words = name => name.replaceAll("_", " ");
 
-// Return the number or word of a value, without its unit.
+// Return a value's number, or its name if the register names its values, without a unit.
 export function text(value, register) {
   if (value === null || value === undefined || Number.isNaN(value)) return UNKNOWN;
   if (register?.kind === "words")
@@ -26,7 +26,7 @@ export function text(value, register) {
   return number(Number(value), register?.digits);
 }
 
-// Return a number with these digits behind the point; without them, as of a float, all that it has.
+// Return a number with this many decimals; if `digits` is null, as for a float, with all decimals it needs.
 export function number(value, digits) {
   if (Number.isInteger(digits)) return value.toFixed(digits);
   if (Math.fround(value) === value)
@@ -53,7 +53,7 @@ export const withUnit = (told, register) => (unit(register) ? `${told} ${unit(re
 // Return a register's name with its unit, as the head of a plot or a field.
 export const title = register => words(register.name) + (unit(register) ? `, ${unit(register)}` : "");
 
-// Make a cell's inside once: the number, its unit, and since when it is old.
+// Make the elements of a cell once: the number, its unit, and the time of an old value.
 export function makeValue() {
   const parts = {
     number: make("span", { class: "number" }),
@@ -78,7 +78,7 @@ export function showValue(parts, reading, register, isDated = true, isNamed = is
   if (parts.whole.title !== why) parts.whole.title = why;
 }
 
-// Return why a value is not there or old, or "" for a good one.
+// Return why a value is missing or old, or "" for a fresh value.
 function reason(reading) {
   if (reading === null) return "never read";
   if (reading.value === null) return `never read: ${reading.status}`;
@@ -91,10 +91,10 @@ function set(element, value) {
   if (element.textContent !== value) element.textContent = value;
 }
 
-// Return a number of things: "1 drive", "31 drives".
+// Return a number with its noun: "1 drive", "31 drives".
 export const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 
-// Return a share as per cent, or a dash for unknown; a small share is never shown as none.
+// Return a share in per cent, or a dash if it is unknown; a small share is never shown as 0.
 export function share(part) {
   if (part === null || part === undefined) return UNKNOWN;
   const percent = part * 100;
