@@ -51,7 +51,7 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_a_command_s_end_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
+def test_time_of_the_latest_commands_end_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
@@ -71,7 +71,7 @@ def test_a_command_s_end_is_known(command: Callable[[Commands], Awaitable[Any]])
     ],
     ids=["a write", "a verb"],
 )
-def test_a_drive_that_left_its_line_is_named_in_the_result(
+def test_result_names_a_drive_that_was_removed_from_its_line(
     command: Callable[[Commands], Awaitable[CommandResult]],
 ) -> None:
     async def carry_out() -> CommandResult:
@@ -104,14 +104,14 @@ def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch:
     assert len(line.written) == told.ok
 
 
-async def test_a_command_that_was_not_carried_out_has_no_end() -> None:
+async def test_refused_command_has_no_end_time() -> None:
     commands = Commands(UnopenedLines(), MAY)
     await commands.write("fan", "setpoint", 10.0, CALLER)
     assert commands.ended_ns("fan") == 0
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
+def test_other_unicode_spelling_of_a_drive_works_for_stops_only(
     verb: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
@@ -142,7 +142,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     assert commands.stopped_ns(fan) is not None
 
 
-async def test_a_drive_s_view_is_found_by_another_spelling(tmp_path: Path) -> None:
+async def test_view_of_a_drive_is_found_by_another_unicode_spelling(tmp_path: Path) -> None:
     gateway: Any = SimpleNamespace(
         plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
         ledger=Ledger(tmp_path / "wear.sqlite"),

@@ -78,7 +78,7 @@ def dropped(gateway: Served) -> float:
 
 
 @pytest.mark.long
-def test_polling_and_stops_go_on_and_it_is_said_until_there_is_room(disk: Path, tmp_path: Path) -> None:
+def test_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_path: Path) -> None:
     with served(tmp_path, SERVE) as gateway:
         gateway.await_state("pump-2", "stands")
         history = gateway.gateway.feeds["history"]

@@ -298,7 +298,7 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
 
 
 @pytest.mark.slow
-def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_does_not_wait_for_hanging_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Writes that hang fill all that is kept for them, and further ones are refused; stops go on."""
     held, entered = threading.Event(), []
     with served(tmp_path, MAY) as gateway:
@@ -366,7 +366,7 @@ def test_commands_from_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_stop_is_sent_without_free_threads(tmp_path: Path) -> None:
+def test_stop_is_sent_although_no_thread_can_be_started(tmp_path: Path) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:
             raise RuntimeError("can't start new thread")
@@ -385,7 +385,7 @@ def test_stop_is_sent_without_free_threads(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_stop_of_a_silent_drive_says_so_and_delays_no_other(tmp_path: Path) -> None:
+def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -439,7 +439,7 @@ def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.long
-def test_stop_of_a_restarted_drive_is_a_new_stop(tmp_path: Path) -> None:
+def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None:
     """The first stop is still repeated for the silent drive, but has ended for the restarted one."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
@@ -537,7 +537,7 @@ def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(
 
 
 @pytest.mark.usefixtures("_broken_parts")
-def test_part_that_cannot_start_is_one_sentence(tmp_path: Path) -> None:
+def test_part_that_cannot_start_is_reported_in_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
         (
             "library",

@@ -99,7 +99,7 @@ def reload_as(gateway: Served, serve: str) -> Any:
 # ---- history ----
 
 
-def test_history_that_hangs_at_the_start_starts_later(tmp_path: Path, fifos: Fifos) -> None:
+def test_history_whose_disk_hangs_at_the_start_starts_later(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway:
         assert_stops_and_polls(gateway)
@@ -112,7 +112,7 @@ def test_history_that_hangs_at_the_start_starts_later(tmp_path: Path, fifos: Fif
         assert gateway.get("/api/history?series=pump-1.status&from=0&to=1").status == 200
 
 
-def test_history_that_hangs_during_a_reload_starts_later(tmp_path: Path, fifos: Fifos) -> None:
+def test_history_whose_disk_hangs_during_a_reload_starts_later(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE) as gateway:
         assert reload_as(gateway, SERVE + HISTORY)["done"] is True
@@ -125,7 +125,7 @@ def test_history_that_hangs_during_a_reload_starts_later(tmp_path: Path, fifos: 
         assert gateway.gateway.feeds == {}  # it is not needed now
 
 
-def test_history_that_fails_when_its_disk_answers_is_dead(tmp_path: Path, fifos: Fifos) -> None:
+def test_history_that_fails_after_its_disk_answers_is_reported_as_dead(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway, pytest.MonkeyPatch.context() as patch:
         patch.setattr(historian, "History", fail)
@@ -138,7 +138,9 @@ def fail(*arguments: object) -> NoReturn:
     raise OSError("the disk is broken")
 
 
-def test_a_query_that_hangs_is_ended_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hanging_history_query_is_answered_with_an_error_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = threading.Event()
     with served(tmp_path, SERVE + HISTORY) as gateway:
         monkeypatch.setattr(historian, "QUERY_S", SHORT_S)
@@ -286,7 +288,7 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
 # ---- the page's files ----
 
 
-def test_hung_page_files_end_their_requests_and_hold_no_other(
+def test_hung_page_files_end_their_requests_and_delay_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, read = threading.Event(), Path.read_bytes

@@ -65,7 +65,7 @@ def falls_silent(drive: Counting) -> None:
 
 
 @pytest.mark.parametrize("step", [1009, pytest.param(53, marks=pytest.mark.slow)])
-def test_gateway_interrupted_anywhere_ends(drive: Counting, tmp_path: Path, step: int) -> None:
+def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
     """KeyboardInterrupt before every so many bytecodes of the main thread, from its making to its end."""
     plant = Plant.load(tmp_path / "plant.toml")
 

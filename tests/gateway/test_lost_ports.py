@@ -19,7 +19,7 @@ SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.slow
-def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Path) -> None:
+def test_line_with_a_missing_port_is_polled_as_soon_as_the_port_appears(tmp_path: Path) -> None:
     port = tmp_path / "late"
     sims = [simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")]
     with Simulator([Wire([sim], unpaced=True) for sim in sims]) as simulator:
@@ -52,7 +52,7 @@ def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_port_that_is_lost_later_says_why_too(tmp_path: Path) -> None:
+def test_reason_of_a_port_lost_later_is_reported(tmp_path: Path) -> None:
     port = tmp_path / "hall"
     plant = written(tmp_path, SERVE, port=str(port))
     gateway = Gateway(plant, read_settings(plant, {}))

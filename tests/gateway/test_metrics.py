@@ -47,7 +47,7 @@ def states(gateway: Served) -> dict[str, str]:
 
 
 @pytest.mark.long
-def test_values_states_and_counters(tmp_path: Path) -> None:
+def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
     odd = 'fan, the \\"old\\" one'  # as TOML has it
     with served(tmp_path, "", "pump-1", odd) as gateway:
         until(lambda: len(values(gateway)) == 8)
@@ -74,7 +74,7 @@ def unanswered(gateway: Served) -> float:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_silent_drives_values_vanish_and_come_back(tmp_path: Path) -> None:
+def test_metrics_of_a_silent_drive_disappear_and_return(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         until(lambda: len(values(gateway)) == 8)
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -86,7 +86,7 @@ def test_a_silent_drives_values_vanish_and_come_back(tmp_path: Path) -> None:
         assert states(gateway)["pump-2"] == "stands"
 
 
-def test_labels_are_spelled_out_once_and_not_at_each_scrape(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_label_texts_are_cached_between_scrapes(monkeypatch: pytest.MonkeyPatch) -> None:
     spelled: list[str] = []
     escaped = exposition._escaped
 

@@ -138,7 +138,7 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) -> None:
+def test_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, rows):
         revision = gateway.gateway.revision
         gateway.await_state("fan-1", "stands")
@@ -190,7 +190,7 @@ def test_a_missing_port_is_reported(tmp_path: Path) -> None:
         until(lambda: gateway.frame()["lines"]["roof"]["lost"] is None)
 
 
-def test_rights_names_and_tokens_take_effect_at_once_and_the_rest_after_a_restart(tmp_path: Path) -> None:
+def test_rights_names_and_tokens_are_reloaded_and_other_keys_need_a_restart(tmp_path: Path) -> None:
     with served(tmp_path, f'[serve]\nnames = ["old.example"]\nlisten = "localhost:1"\n{MAY}') as gateway:
         gateway.await_state("pump-1", "stands")
         assert gateway.get("/health", host="old.example").status == 200
@@ -222,7 +222,7 @@ def test_local_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
         assert gateway.post("/api/stop").status == 401
 
 
-def test_a_certificate_that_was_renewed_in_place_waits_for_a_restart(tmp_path: Path) -> None:
+def test_renewed_certificate_is_reported_to_need_a_restart(tmp_path: Path) -> None:
     """Without that report, browsers would be the first to show the expired one, a month later."""
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
@@ -339,7 +339,7 @@ def test_a_start_from_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
 
 
 @pytest.mark.slow
-def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
+def test_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with two_lines(tmp_path, MAY.replace("pump-1", "fan-1")) as (gateway, _):
@@ -400,7 +400,7 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["stop", "coast"])
-def test_a_stop_waits_for_no_port_that_a_reload_opens(
+def test_stop_does_not_wait_for_ports_that_a_reload_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
     """The drive has been exchanged already, and another line takes its time."""
@@ -494,7 +494,7 @@ def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
 
 
 @pytest.mark.slow
-def test_a_stop_that_is_under_way_goes_on(tmp_path: Path) -> None:
+def test_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
     """The reload waits for it, and exchanges the drive only then."""
     with two_lines(tmp_path) as (gateway, _):
         revision = gateway.gateway.revision

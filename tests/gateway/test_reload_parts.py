@@ -56,7 +56,7 @@ def status_of(port: int, unit: int) -> list[int]:
 IN_EFFECT = {"done": True, "text": "plant.toml is in effect", "mistakes": [], "restart": []}
 
 
-def test_modbus_server_starts_changes_and_ends_with_the_file(gateway: Served) -> None:
+def test_reload_starts_changes_and_ends_the_modbus_server(gateway: Served) -> None:
     first, second = free_port(), free_port()
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
@@ -73,7 +73,7 @@ def test_modbus_server_starts_changes_and_ends_with_the_file(gateway: Served) ->
     assert parts(gateway) == {}
 
 
-def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
+def test_reload_with_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -91,7 +91,7 @@ def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_unexpected_failure_of_a_part_changes_nothing(
+def test_reload_with_an_unexpected_failure_of_a_part_changes_nothing(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = free_port()
@@ -164,7 +164,7 @@ def test_slow_part_delays_no_stop(gateway: Served, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.long
-def test_a_history_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> None:
+def test_reload_starts_changes_and_ends_the_history(gateway: Served, tmp_path: Path) -> None:
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
     for folder in ("first", "second"):
         assert reload(gateway, f'[serve.history]\nfolder = "{folder}"\n') == IN_EFFECT
@@ -177,7 +177,7 @@ def test_a_history_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_mqtt_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> None:
+def test_reload_starts_changes_and_ends_mqtt(gateway: Served, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker:
         heard = Listener(broker)

@@ -88,7 +88,7 @@ def test_sighup_reloads_and_notifies_systemd(tmp_path: Path) -> None:
     assert "the plant file is in effect" in messages
 
 
-def test_the_demo_has_no_file_to_be_read_again(tmp_path: Path) -> None:
+def test_plant_without_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         gateway.gateway.reload._read = None
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -149,7 +149,7 @@ def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_tls(tmp_path: Path) -> None:
+def test_serve_with_tls_answers_over_https(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     serve = '[serve]\nlisten = "127.0.0.1:0"\ncertificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n'
     (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
@@ -168,7 +168,7 @@ def test_tls(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path) -> None:
+def test_port_in_use_is_reported_in_one_sentence(tmp_path: Path) -> None:
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         written(tmp_path, f'[serve]\nlisten = "127.0.0.1:{port}"\n')
@@ -180,7 +180,7 @@ def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path) -> None:
     )
 
 
-def test_check_and_its_mistakes(run: Run, tmp_path: Path) -> None:
+def test_serve_check_reports_mistakes(run: Run, tmp_path: Path) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\n')
     assert run("serve", "--check", plant.path) == (
         0,
@@ -201,7 +201,7 @@ def test_check_and_its_mistakes(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "plan"])
-def test_other_commands_leave_the_table_alone(run: Run, tmp_path: Path, command: str) -> None:
+def test_other_commands_ignore_the_serve_table(run: Run, tmp_path: Path, command: str) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\nnot_known = 1\n')
     status, out, errors = run(command, plant.path)
     assert (status, errors) == (0, "")
@@ -235,7 +235,7 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
         ),
     ],
 )
-def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None:
+def test_invalid_serve_options_are_refused(run: Run, words: tuple[str, ...], sentence: str) -> None:
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
 
 
@@ -251,7 +251,7 @@ def test_a_web_demo_warns_about_ignored_options(run: Run, monkeypatch: pytest.Mo
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["demo", "--web"], ["serve", "--demo"]])
-def test_the_demo_is_live_and_everybody_here_may_stop_it(words: list[str]) -> None:
+def test_demo_is_live_and_anyone_on_this_machine_may_stop_it(words: list[str]) -> None:
     with BoundProcess([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -274,7 +274,7 @@ def test_the_demo_is_live_and_everybody_here_may_stop_it(words: list[str]) -> No
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.stem)
-def test_a_unit_file_is_right_and_exposes_little(tmp_path: Path, path: Path) -> None:
+def test_systemd_unit_file_is_valid_and_exposes_little(tmp_path: Path, path: Path) -> None:
     unit = tmp_path / path.name.replace("@", "@hall")
     unit.write_text(path.read_text().replace("/opt/multidrop/bin/multidrop", "/bin/true"))
     verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)

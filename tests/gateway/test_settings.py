@@ -24,7 +24,7 @@ def mistakes(folder: Path, serve: str) -> list[str]:
     return [mistake.removeprefix(start) for mistake in wrong.value.mistakes]
 
 
-def test_without_a_table_only_this_machine_may_look(tmp_path: Path) -> None:
+def test_without_a_serve_table_only_this_machine_may_look(tmp_path: Path) -> None:
     settings = read_settings(written(tmp_path), {})
     assert (settings.host, settings.port) == ("127.0.0.1", 8750)
     assert settings.may.without_token(is_loopback=True) is Right.LOOK
@@ -33,7 +33,7 @@ def test_without_a_table_only_this_machine_may_look(tmp_path: Path) -> None:
     assert not (tmp_path / "audit.jsonl").exists()
 
 
-def test_all_that_a_table_may_say(tmp_path: Path) -> None:
+def test_all_keys_of_the_serve_table_are_read(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"# people\n\nanna stop {SHA}\nscada write {digest('other')}\n")
     serve = """
@@ -180,7 +180,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (("own.pem", "own.pem"), "must be a certificate and a key in PEM, without password"),
     ],
 )
-def test_certificates_that_do_not_fit(
+def test_mismatched_or_invalid_certificates_are_reported(
     tmp_path: Path, certificates: Path, pair: tuple[str, str], why: str
 ) -> None:
     paths = [certificates / name for name in pair]
@@ -188,12 +188,12 @@ def test_certificates_that_do_not_fit(
     assert only == f"[serve]: certificate {paths[0]} and key {paths[1]} {why}"
 
 
-def test_a_certificate_without_its_key(tmp_path: Path, certificates: Path) -> None:
+def test_certificate_without_its_key_is_reported(tmp_path: Path, certificates: Path) -> None:
     (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{certificates}/own.pem"\n')
     assert only == "[serve]: certificate alone is not enough: give certificate and key"
 
 
-def test_no_rights_on_the_folder(tmp_path: Path) -> None:
+def test_unwritable_audit_folder_is_reported(tmp_path: Path) -> None:
     """Not even root may create a file in /sys."""
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path), {"STATE_DIRECTORY": "/sys"})
@@ -201,7 +201,7 @@ def test_no_rights_on_the_folder(tmp_path: Path) -> None:
     assert only.endswith(": [serve]: audit /sys/audit.jsonl cannot be written: Permission denied")
 
 
-def test_what_a_service_manager_gives(tmp_path: Path) -> None:
+def test_credentials_and_state_folder_of_the_service_manager_are_used(tmp_path: Path) -> None:
     """Credentials are found before files beside the plant file; output files are in the state folder."""
     credentials, state = tmp_path / "credentials", tmp_path / "state"
     credentials.mkdir()
@@ -214,12 +214,12 @@ def test_what_a_service_manager_gives(tmp_path: Path) -> None:
     assert settings.audit == state / "audit.jsonl"
 
 
-def test_a_token_to_look_is_required(tmp_path: Path) -> None:
+def test_look_by_token_without_a_token_file_is_reported(tmp_path: Path) -> None:
     (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
     assert only == ('[serve]: look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
 
 
-def test_a_tokens_file_holds_no_token() -> None:
+def test_token_file_contains_no_secret() -> None:
     secret, token = new_token("anna", Right.STOP)
     assert read_tokens(f"{token.line}\n") == ([token], [])
     assert secret not in token.line
@@ -228,7 +228,7 @@ def test_a_tokens_file_holds_no_token() -> None:
     ]
 
 
-def test_a_port_that_is_taken() -> None:
+def test_port_in_use_is_reported() -> None:
     with listen("127.0.0.1", 0) as first:
         port = first.getsockname()[1]
         with pytest.raises(

@@ -72,7 +72,7 @@ NEW_FAN = InvtCHE(2, name="fan")
 
 
 @pytest.mark.parametrize("names", [["fan"], None])
-def test_a_joining_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
+def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
     names: list[str] | None,
 ) -> None:
     """Such as of a drive that is silent: that one takes half a minute."""
@@ -111,7 +111,7 @@ def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
     assert lines.begun == [FAN, FAN]
 
 
-async def test_a_stop_by_a_name_of_the_new_plant_is_sent_when_its_drive_is_attached() -> None:
+async def test_stop_by_a_name_of_the_new_plant_is_sent_once_the_drive_is_attached() -> None:
     """The name may have another spelling. Present drives of other names go on."""
     new = InvtCHE(2, name="L\u00fcfter")
     lines = Lines(plant_of(PUMP, FAN), plant_of(new, FAN))

@@ -78,7 +78,7 @@ def dead(gateway: Served) -> Any:
     return answer.json["dead"]
 
 
-def test_the_list_of_all_tasks_and_threads(gateway: Served) -> None:
+def test_gateway_has_only_the_listed_tasks_and_threads(gateway: Served) -> None:
     assert in_loop(gateway.loop, lambda found: set(found.kept)) == TASKS
     assert gateway.get("/health").json["dead"] == {}
     names = {thread.name for thread in threading.enumerate() if "multidrop" in thread.name}
@@ -87,7 +87,7 @@ def test_the_list_of_all_tasks_and_threads(gateway: Served) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TASKS - {"web"}))
-def test_a_task_that_is_killed_makes_health_fail_and_no_stop(
+def test_killed_task_makes_health_fail_but_stops_work(
     gateway: Served, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert dead(gateway) == {}
@@ -97,7 +97,7 @@ def test_a_task_that_is_killed_makes_health_fail_and_no_stop(
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-def test_a_poller_that_fails_makes_health_fail_and_no_stop(
+def test_failing_poller_makes_health_fail_but_stops_work(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail() -> None:
@@ -149,7 +149,7 @@ def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
     until(lambda: dead(gateway) == {"log": "its thread has ended"})
 
 
-def test_a_web_server_that_ends_ends_the_gateway(tmp_path: Path) -> None:
+def test_gateway_ends_if_its_web_server_ends(tmp_path: Path) -> None:
     with simulated_plant(tmp_path, "") as path:
         gateway = Gateway(Plant.load(path), ServeSettings(port=0))
         ended = pytest.raises(RuntimeError, match="the web server has ended: it was cancelled")
@@ -161,7 +161,7 @@ def test_a_web_server_that_ends_ends_the_gateway(tmp_path: Path) -> None:
 # ---- the supervisor alone ----
 
 
-def test_a_task_that_is_released_is_not_dead() -> None:
+def test_released_task_is_not_reported_as_dead() -> None:
     async def live() -> dict[str, str]:
         supervisor().keep("released", asyncio.sleep(60))
         supervisor().keep("let go of", asyncio.sleep(0))
@@ -174,7 +174,7 @@ def test_a_task_that_is_released_is_not_dead() -> None:
     assert asyncio.run(live()) == {}
 
 
-def test_task_that_is_kept_again_is_alive() -> None:
+def test_task_that_is_started_again_is_no_longer_reported_as_dead() -> None:
     async def live() -> list[dict[str, str]]:
         found = []
         await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
@@ -189,7 +189,7 @@ def test_task_that_is_kept_again_is_alive() -> None:
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-async def test_errors_of_work_are_raised_and_the_loop_continues(failure: BaseException) -> None:
+async def test_within_raises_the_errors_of_the_work(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 
@@ -197,7 +197,7 @@ async def test_errors_of_work_are_raised_and_the_loop_continues(failure: BaseExc
         await supervisor().within("work", 60, work)
 
 
-async def test_work_that_hangs_is_given_up_reported_and_forgotten() -> None:
+async def test_hanging_work_raises_hung_and_is_reported_until_work_succeeds() -> None:
     go_on = threading.Event()
     threads = supervisor()
     with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
@@ -214,7 +214,7 @@ async def test_work_that_hangs_is_given_up_reported_and_forgotten() -> None:
         await asyncio.sleep(0)
 
 
-def test_work_raises_an_error_without_free_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_within_raises_an_error_if_no_thread_can_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -227,7 +227,7 @@ def test_work_raises_an_error_without_free_threads(monkeypatch: pytest.MonkeyPat
     assert asyncio.run(live()) == []
 
 
-def test_in_time() -> None:
+def test_in_time_returns_results_and_raises_hung_after_the_limit() -> None:
     go_on = threading.Event()
 
     def fail() -> None:

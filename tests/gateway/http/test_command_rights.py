@@ -53,14 +53,14 @@ def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_the_role_look_sends_no_command(way: str) -> None:
+def test_callers_with_the_role_look_can_send_no_command(way: str) -> None:
     by_verb = NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED
     expected = dict.fromkeys(VERBS, by_verb) | {"write": NOT_ALLOWED, "stop all": NOT_ALLOWED}
     assert rules_of(ALL, way, Right.LOOK) == expected
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_stop_right_only_stops(way: str) -> None:
+def test_callers_with_the_role_stop_can_only_stop(way: str) -> None:
     rules = rules_of(ALL, way, Right.STOP)
     moving = [rules[verb] for verb in VERBS if verb not in STOPPING]
     assert {*moving} == {NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED}
@@ -77,13 +77,13 @@ def test_unlisted_writes_are_refused_to_writers(way: str) -> None:
     assert rules["stop all"] not in (NOT_ALLOWED, NOT_LISTED)
 
 
-def test_no_verb_comes_by_modbus_though_it_is_listed() -> None:
+def test_verbs_over_modbus_are_refused_even_if_listed() -> None:
     """Modbus has no dialog in which a person confirms."""
     rules = rules_of(ALL, "modbus", Right.WRITE)
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
-def test_a_line_has_a_few_writes_under_way_and_takes_any_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each write has a thread, and a blocked line would otherwise have any number of threads."""
     go_on = threading.Event()
 

@@ -63,7 +63,7 @@ def descriptors(pid: int) -> int:
 @pytest.mark.long
 @pytest.mark.parametrize("sent", usually(*SLOW), ids=["silent", "headers", "body"])
 @pytest.mark.parametrize("way", usually("http", "https"))
-def test_stop_is_accepted_beside_500_slow_clients(tmp_path: Path, sent: bytes, way: str) -> None:
+def test_stop_is_accepted_while_500_slow_clients_are_connected(tmp_path: Path, sent: bytes, way: str) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
     keys = 'certificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n' if way == "https" else ""
@@ -89,7 +89,7 @@ def test_stop_is_accepted_beside_500_slow_clients(tmp_path: Path, sent: bytes, w
             assert "Traceback" not in process.communicate(timeout=PATIENCE)[1]
 
 
-def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_body_is_answered_with_408(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(messages, "BODY_S", 0.1)
     with (
         served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
@@ -101,7 +101,7 @@ def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_slow_headers_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connection_with_slow_headers_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "FIRST_S", 0.1)
     with (
         served(tmp_path) as gateway,
@@ -112,7 +112,7 @@ def test_slow_headers_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert gateway.get("/api/plant").status == 200
 
 
-def test_long_headers_are_refused_and_no_stop_is(tmp_path: Path) -> None:
+def test_long_headers_are_refused_except_for_stops(tmp_path: Path) -> None:
     with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
         cookie = "a=" + "b" * MOST_HEAD
         assert gateway.get("/api/plant", cookie=cookie).status == 431
@@ -120,7 +120,7 @@ def test_long_headers_are_refused_and_no_stop_is(tmp_path: Path) -> None:
         assert gateway.post("/api/stop", {}, cookie=cookie).status == 200
 
 
-def test_headers_in_pieces_are_taken_up_to_a_length(tmp_path: Path) -> None:
+def test_headers_in_pieces_are_accepted_up_to_the_limit(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         address = "127.0.0.1", gateway.gateway.port
         head = b"GET /api/plant HTTP/1.1\r\nhost: localhost:%d\r\ncookie: " % address[1]
@@ -157,7 +157,7 @@ def is_ended(pair: tuple[socket.socket, socket.socket]) -> bool:
         return False
 
 
-def test_the_first_request_and_later_ones_have_their_time(
+def test_connections_are_closed_at_the_time_limits_of_their_requests(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -181,7 +181,7 @@ def test_the_first_request_and_later_ones_have_their_time(
     assert len(connections) == 1
 
 
-def test_the_one_that_was_idle_for_longest_makes_room(
+def test_longest_idle_connection_is_closed_for_a_new_one(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -200,7 +200,7 @@ def test_the_one_that_was_idle_for_longest_makes_room(
     assert not is_ended(pairs[MOST_OPEN + 1])  # the newest one is never the one that goes
 
 
-def test_new_connection_has_time_for_its_request_beside_busy_ones(
+def test_new_connection_is_not_closed_before_its_first_request(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     """It may bring a stop: the next one that comes must not end it."""
@@ -214,7 +214,7 @@ def test_new_connection_has_time_for_its_request_beside_busy_ones(
 
 
 @pytest.mark.parametrize("is_stalled", [False, True], ids=["sends ahead", "reads nothing"])
-def test_a_greedy_client_goes_before_those_that_are_idle_and_a_stop_goes_last(
+def test_greedy_connections_are_closed_first_and_stops_last(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]], is_stalled: bool
 ) -> None:
     connections = Connections(clock)
@@ -248,7 +248,7 @@ def test_client_that_reads_no_answers_is_closed(
     assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
 
 
-async def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> None:
+async def test_one_request_starts_per_loop_round_and_stops_start_first() -> None:
     order: list[str] = []
 
     async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:
@@ -267,7 +267,7 @@ async def test_one_request_has_its_turn_in_a_round_and_stops_come_first() -> Non
     assert order[-1] == "later"
 
 
-def test_a_stop_is_taken_ahead_of_reads_that_came_before(
+def test_stop_is_answered_before_reads_that_arrived_earlier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """100 clients send 20 requests each, all together, and read no answers."""
@@ -306,7 +306,7 @@ def test_a_stop_is_taken_ahead_of_reads_that_came_before(
     assert order.index("stop") < 10
 
 
-def test_a_request_that_outlasts_the_gateway_is_answered(
+def test_unfinished_request_is_answered_with_503_at_shutdown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(gateway_module, "GRACE_S", 0)
@@ -328,7 +328,7 @@ def test_a_request_that_outlasts_the_gateway_is_answered(
     assert "Traceback" not in caplog.text
 
 
-def test_client_that_sends_ahead_is_marked_until_answered(tmp_path: Path) -> None:
+def test_client_that_sends_ahead_counts_as_greedy_until_answered(tmp_path: Path) -> None:
     go_on = asyncio.Event()
 
     async def after(n: int) -> None:

@@ -41,7 +41,7 @@ class SlowHistory:
     async def close(self) -> None: ...
 
 
-def test_few_exports_go_on_at_a_time_and_hold_no_stop_up(tmp_path: Path) -> None:
+def test_concurrent_exports_are_limited_and_delay_no_stop(tmp_path: Path) -> None:
     with (
         served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
         ThreadPoolExecutor(MOST_EXPORTS) as clients,
@@ -76,7 +76,7 @@ def test_few_exports_go_on_at_a_time_and_hold_no_stop_up(tmp_path: Path) -> None
         ("series=%D0%BD%D0%B0%D1%81%D0%BE%D1%81.y&", "насос.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
     ],
 )
-def test_a_files_name_says_drive_and_range(asked: str, name: str) -> None:
+def test_export_file_name_has_drive_and_time_range(asked: str, name: str) -> None:
     noon = 1_795_262_400_000
 
     class Quick(SlowHistory):

@@ -18,7 +18,7 @@ TYPES = {
 }
 
 
-def test_page_files_have_types_and_an_etag_that_saves_the_body(tmp_path: Path) -> None:
+def test_page_files_have_types_and_a_known_etag_is_answered_with_304(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         for path, media_type in TYPES.items():
             answer = gateway.get(path)
@@ -30,13 +30,13 @@ def test_page_files_have_types_and_an_etag_that_saves_the_body(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["", "app", "../gateway.py", "%2e%2e/gateway.py", "vendor", "/etc/passwd"])
-def test_no_other_file_is_served(tmp_path: Path, name: str) -> None:
+def test_files_outside_the_page_folder_are_not_served(tmp_path: Path, name: str) -> None:
     with served(tmp_path) as gateway:
         answer = gateway.get(f"/page/{name}")
         assert (answer.status, answer.json) == (404, {"error": "unknown path"})
 
 
-def test_installation_without_a_page_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_installation_without_a_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
     with served(tmp_path) as gateway:
         assert "this version of multidrop has no page" in gateway.get("/").json["error"]

@@ -116,9 +116,7 @@ def test_token_is_ignored_without_a_token_file(tmp_path: Path) -> None:
         assert gateway.post(WRITE[0], {**WRITE[1], "seen": 1}, authorization="Bearer any").status == 401
 
 
-def test_a_wrong_token_that_comes_again_is_logged_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_repeated_wrong_token_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with served(tmp_path) as gateway:
         for _ in range(3):
             assert gateway.get("/api/plant", cookie="multidrop=taken-away").status == 401
@@ -150,7 +148,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("case", FOREIGN)
-def test_pages_that_are_not_ours_send_no_frame(open_gateway: Served, case: str) -> None:
+def test_stop_from_a_foreign_page_is_refused(open_gateway: Served, case: str) -> None:
     headers, status = FOREIGN[case]
     before = open_gateway.gateway.commands.called
     assert open_gateway.post(*STOP, **headers).status == status
@@ -174,13 +172,13 @@ ORIGINS = {  # with the host that was asked, and how: is it a page of ours?
 
 
 @pytest.mark.parametrize("case", ORIGINS)
-def test_a_page_of_ours_has_our_scheme_host_and_port(case: tuple[str, str, tuple[str, ...]]) -> None:
+def test_origin_is_ours_only_with_our_scheme_host_and_port(case: tuple[str, str, tuple[str, ...]]) -> None:
     origin, host, schemes = case
     names = OwnNames(["plant.example"], "0.0.0.0", 443)
     assert names.has_origin(origin, host, schemes) is ORIGINS[case]
 
 
-def test_our_own_page_and_programs_do(open_gateway: Served) -> None:
+def test_stops_from_our_own_page_and_from_programs_are_sent(open_gateway: Served) -> None:
     port = open_gateway.gateway.port
     before = open_gateway.gateway.commands.called
     for headers in (
@@ -193,7 +191,7 @@ def test_our_own_page_and_programs_do(open_gateway: Served) -> None:
     assert open_gateway.gateway.commands.called == before + 4
 
 
-def test_two_host_headers(open_gateway: Served) -> None:
+def test_request_with_two_host_headers_is_refused(open_gateway: Served) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", open_gateway.gateway.port)
     connection.putrequest("GET", "/health", skip_host=True)
     connection.putheader("host", "localhost")
@@ -204,7 +202,7 @@ def test_two_host_headers(open_gateway: Served) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
-def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, path: str) -> None:
+def test_every_answer_forbids_framing_and_type_guessing(open_gateway: Served, path: str) -> None:
     headers = open_gateway.get(path).headers
     if path == "/":
         policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"
@@ -218,7 +216,7 @@ def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, pat
     assert headers["cache-control"] == ("no-cache" if path == "/" else "no-store")
 
 
-def test_methods_and_bodies(open_gateway: Served) -> None:
+def test_wrong_methods_and_bodies_are_refused(open_gateway: Served) -> None:
     post, get = open_gateway.post, open_gateway.get
     assert get("/api/stop").status == 405
     assert post("/api/plant").status == 405
@@ -240,7 +238,7 @@ def test_methods_and_bodies(open_gateway: Served) -> None:
     assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
 
 
-def test_texts_that_are_no_unicode_are_answered_like_others(open_gateway: Served) -> None:
+def test_lone_surrogates_in_texts_are_answered_like_other_texts(open_gateway: Served) -> None:
     post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
     odd = "\ud800"
     assert post("/api/token", {"token": odd}).status == 401
@@ -266,7 +264,7 @@ def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Serv
     assert "Max-Age=0" in gone
 
 
-def test_five_wrong_tokens_a_minute_are_checked(tmp_path: Path) -> None:
+def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Path) -> None:
     """Neither a right token on another address nor any stop is held up by them."""
     now = [1000.0]
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
@@ -317,7 +315,7 @@ def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) ->
         assert gateway.get("/api/plant", **anna | {"x_forwarded_for": "10.0.0.66"}).status == 429
 
 
-def test_a_revoked_token_blocks_no_stop(tmp_path: Path) -> None:
+def test_new_token_is_accepted_after_many_requests_with_a_revoked_one(tmp_path: Path) -> None:
     """A browser goes on sending its cookie with every frame."""
     with served(tmp_path, CLOSED) as gateway:
         old = {"cookie": "multidrop=taken-away"}
@@ -336,7 +334,7 @@ def guard_clock(gateway: Served, now: list[float]) -> None:
 
 
 @pytest.mark.slow
-def test_audit_log_has_caller_and_way(tmp_path: Path) -> None:
+def test_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         writer = {"authorization": gateway.bearer(Right.WRITE)}

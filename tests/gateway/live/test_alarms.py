@@ -61,7 +61,7 @@ def take(hub: Hub, at_s: float, **values: int) -> None:
     hub.take(Batch(columns, Names(("pump-1",)), Names(REGISTERS)))
 
 
-def test_a_trip_that_only_a_fault_record_tells_is_a_fault(tmp_path: Path) -> None:
+def test_changed_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
     assert hub.seen("pump-1").state == "runs"
@@ -91,7 +91,7 @@ def test_reset_ends_a_recorded_fault_and_an_old_record_is_no_fault(tmp_path: Pat
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_unknown_state_has_a_reason_and_yd1000_shows_trips(tmp_path: Path) -> None:
+def test_unknown_state_has_a_reason_and_yd1000_trip_is_a_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "yd1000", '["output_frequency", "status", "fault_record_1"]')
     take(hub, 10, output_frequency=0, status=0, fault_record_1=1)
     shown = hub.seen("pump-1")
@@ -118,7 +118,9 @@ def test_unknown_state_has_a_reason_and_yd1000_shows_trips(tmp_path: Path) -> No
         ("delixi-native", ("status",), True),
     ],
 )
-def test_registers_that_cannot_show_a_fault(model: str, polled: tuple[str, ...], is_seen: bool) -> None:
+def test_can_show_fault_depends_on_the_polled_registers(
+    model: str, polled: tuple[str, ...], is_seen: bool
+) -> None:
     assert can_show_fault(MODELS[model](1), polled) is is_seen
 
 
@@ -195,7 +197,7 @@ def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     assert ("hall", "port", 4, 11) in seen(events)
 
 
-def test_an_alarm_at_the_first_look_began_before() -> None:
+def test_alarm_at_the_first_observation_may_have_started_earlier() -> None:
     events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(1, "pump-2", RUNS)
@@ -208,7 +210,7 @@ def test_an_alarm_at_the_first_look_began_before() -> None:
     }  # fmt: skip
 
 
-def test_alarms_of_an_earlier_run_go_on_or_are_over() -> None:
+def test_alarms_of_an_earlier_run_continue_or_end() -> None:
     kept: dict[str, Alarm] = {}
     before = Alarms(0, lambda alarm: kept.update({alarm.id: alarm}))
     for drive in ("goes-on", "is-over", "is-another", "is-gone", "is-silent"):
@@ -235,7 +237,7 @@ def test_alarms_of_an_earlier_run_go_on_or_are_over() -> None:
     assert [one.note for one in events.between(0, 999) if one.by] == ["seen"]
 
 
-def test_alarms_that_are_read_late_meet_those_of_now() -> None:
+def test_alarms_read_late_are_merged_with_present_alarms() -> None:
     """A slow disk: the drives were observed before."""
     events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
@@ -265,7 +267,7 @@ def past_of(path: Path) -> list[Alarm]:
     return kept.past or []
 
 
-def test_the_file_keeps_the_newest_line_of_each_alarm(tmp_path: Path) -> None:
+def test_newest_line_of_each_alarm_in_the_file_is_valid(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):
@@ -283,7 +285,7 @@ def test_the_file_keeps_the_newest_line_of_each_alarm(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change", [{"time": "1"}, {"time": True}, {"ended": 1.5}, {"kind": "x"}, {"drive": None}, {"note": 1}]
 )
-def test_a_line_that_is_no_alarm_is_left_out(change: Mapping[str, object]) -> None:
+def test_invalid_lines_of_the_alarm_file_are_ignored(change: Mapping[str, object]) -> None:
     whole = json.loads(json.dumps(ALARM.as_json()))
     assert alarm_in(json.dumps(whole).encode()) == ALARM
     assert alarm_in(json.dumps(whole | change).encode()) is None
@@ -291,7 +293,7 @@ def test_a_line_that_is_no_alarm_is_left_out(change: Mapping[str, object]) -> No
         assert alarm_in(line) is None
 
 
-def test_a_long_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_alarm_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("multidrop.gateway.live.alarm_file.MOST_BYTES", 2000)
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
@@ -303,7 +305,7 @@ def test_a_long_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert past_of(path) == [ALARM]
 
 
-def test_failing_disk_is_reported_and_rewritten_later(tmp_path: Path) -> None:
+def test_failing_disk_is_reported_and_the_alarm_file_rewritten_later(tmp_path: Path) -> None:
     folder = tmp_path / "none"
     kept = started(folder / "alarms.jsonl")
     kept.note(ALARM)
@@ -323,7 +325,7 @@ def faults(gateway: Served) -> list[Any]:
     return [one for one in gateway.frame()["alarms"] if one["kind"] == "fault"]
 
 
-def test_alarms_are_logged_acknowledged_and_last_over_a_restart(
+def test_alarms_are_logged_acknowledged_and_kept_over_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.gateway")
@@ -354,7 +356,7 @@ def test_alarms_are_logged_acknowledged_and_last_over_a_restart(
     assert f"alarm of pump-1 is over: fault: {words}" in caplog.messages
 
 
-def test_alarms_that_cannot_be_kept_are_in_the_health(tmp_path: Path) -> None:
+def test_unwritable_alarm_file_is_reported_in_health(tmp_path: Path) -> None:
     (tmp_path / "alarms.jsonl").mkdir()
     with served(tmp_path) as gateway:
         until(lambda: "alarms are not kept" in gateway.get("/health").json["parts"].get("alarms", ""))
@@ -381,7 +383,7 @@ def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
         assert "there is no such port" in alarm["text"]
 
 
-def test_stop_from_here_is_no_alarm_and_another_one_is(tmp_path: Path) -> None:
+def test_motor_stopped_by_us_raises_no_alarm_and_by_others_does(tmp_path: Path) -> None:
     serve = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
     with served(tmp_path, serve) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -418,5 +420,5 @@ def test_stop_from_here_is_no_alarm_and_another_one_is(tmp_path: Path) -> None:
         (BusError("pump-1.coast: no stop of start"), "pump-1.coast: no stop of start"),
     ],
 )
-def test_page_texts_have_no_function_names(failure: BusError, said: str) -> None:
+def test_errors_for_page_users_have_no_function_names(failure: BusError, said: str) -> None:
     assert in_words(str(failure), failure) == said

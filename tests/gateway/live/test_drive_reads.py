@@ -21,7 +21,7 @@ MAY = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_a_first_stop_is_sent_at_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_stop_reads_no_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """No identity is read between the call of a stop and its frame."""
     asked: list[str] = []
     with served(tmp_path, MAY) as gateway:
@@ -79,13 +79,13 @@ def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ROUND_S", 0.0)
 
 
-def test_who_does_not_answer_is_not_asked() -> None:
+def test_identity_of_a_silent_drive_is_not_read() -> None:
     bus = Asked({})
     assert ask_all(bus, lambda name: name != "silent", "pump-1", "silent", "pump-2") == []
     assert bus.names == ["pump-1", "pump-2"] * 2
 
 
-def test_who_is_known_is_not_asked() -> None:
+def test_known_identity_is_not_read_again() -> None:
     """Nor is a thread started for a known identity."""
     bus = Asked({})
     bus.known.add("pump-1")

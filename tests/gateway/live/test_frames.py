@@ -93,7 +93,7 @@ async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: 
     assert 45 <= len(made) <= 51
 
 
-async def test_news_that_come_too_soon_are_not_forgotten(frames: Frames, clock: Clock) -> None:
+async def test_news_within_the_frame_interval_get_a_later_frame(frames: Frames, clock: Clock) -> None:
     """Viewers see them without any other event."""
     first = await frames.after(-1)
     assert first is not None
@@ -192,14 +192,16 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_viewer_ends_with_the_newest_frame_however_late(
+def test_viewer_that_skips_frames_ends_with_the_newest_one(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
     """There is another plant in the middle."""
     asyncio.run(view(pictures, begin))
 
 
-async def test_a_viewer_waits_and_is_let_go(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_waiting_viewer_gets_none_at_timeout_and_close(
+    frames: Frames, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.01)
     monkeypatch.setattr(module, "MOST_VIEWERS", 2)
     first = await frames.after(-1)

@@ -79,7 +79,7 @@ def test_registers_are_unknown_before_their_first_request(hub: Hub) -> None:
     assert hub.state("pump-9") == "unknown"
 
 
-def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub) -> None:
+def test_after_a_miss_the_value_before_it_stays_the_last_good_row(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
     good = next(good for one, _, good, _ in hub.known("pump-1") if one.name == "output_frequency")
@@ -92,13 +92,15 @@ def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub)
     ("status", "frequency", "state"),
     [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
 )
-def test_state_follows_the_family(hub: Hub, status: int, frequency: int, state: str) -> None:
+def test_state_follows_the_status_register_of_the_family(
+    hub: Hub, status: int, frequency: int, state: str
+) -> None:
     hub.take(all_of(10, status, frequency))
     assert hub.state("pump-1") == state
     assert hub.seen("pump-1").fault is None
 
 
-def test_a_fault_has_the_drives_words(hub: Hub) -> None:
+def test_a_fault_has_the_text_of_its_family(hub: Hub) -> None:
     hub.take(all_of(10, TRIPPED, fault=4))
     assert hub.state("pump-1") == "fault"
     assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
@@ -113,7 +115,7 @@ def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
     assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
 
 
-def test_drive_is_silent_after_many_lost_replies_not_one(hub: Hub, clock: HubClock) -> None:
+def test_drive_is_silent_after_many_lost_replies_but_not_after_one(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     for at in range(11, 20):
         hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))
@@ -130,7 +132,7 @@ def test_drive_is_silent_after_many_lost_replies_not_one(hub: Hub, clock: HubClo
     assert hub.state("pump-1") == "stands"
 
 
-def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
+def test_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
     columns = Columns(4)
     for register in range(4):
         layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
@@ -139,7 +141,7 @@ def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
     assert hub.state("pump-1") == "unknown"
 
 
-def test_line_is_lost_if_all_its_newest_rows_say_so(hub: Hub, clock: HubClock) -> None:
+def test_line_is_lost_if_all_its_newest_rows_have_that_status(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     assert lost_of(hub, "hall") is None
     hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
@@ -177,14 +179,14 @@ def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None
     assert hub.state("pump-1") == "runs"
 
 
-def test_a_machine_that_slept_before_it_began_is_awake(tmp_path: Path) -> None:
+def test_sleep_before_the_start_makes_no_value_stale(tmp_path: Path) -> None:
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, 8 * 3600 * SECOND))
     hub.take(all_of(19, FORWARD, 25))
     assert is_fresh(hub)
     assert hub.woke_ns() == 0
 
 
-def test_two_clocks_that_are_not_read_at_once_are_no_sleep(tmp_path: Path) -> None:
+def test_pause_between_reading_two_clocks_is_not_taken_for_sleep(tmp_path: Path) -> None:
     slept = [0]
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
     hub.take(all_of(19, FORWARD, 25))
@@ -219,7 +221,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     assert not is_fresh(hub)
 
 
-def test_the_last_minute_has_a_point_a_second_and_null_for_a_miss(hub: Hub) -> None:
+def test_last_minute_has_one_point_a_second_and_null_for_a_miss(hub: Hub) -> None:
     assert hub.last_minute() == {}
     for at in range(0, 1000, 5):  # periods of 100 ms
         hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
@@ -231,7 +233,7 @@ def test_the_last_minute_has_a_point_a_second_and_null_for_a_miss(hub: Hub) -> N
     assert points[-2][1] == 980.0
 
 
-def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:
+def test_rows_of_a_removed_drive_are_ignored(hub: Hub) -> None:
     hub.take(rows((10, STATUS, FORWARD), drive="pump-9"))
     assert "pump-9" not in list(hub.drives)
 
@@ -290,7 +292,7 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
 
 
 @pytest.mark.parametrize(("status", "is_over"), [(STANDBY, True), (9, True), (TRIPPED, False)])
-def test_fault_stays_while_its_drive_is_partly_known(
+def test_fault_stays_while_some_values_of_its_drive_are_unknown(
     hub: Hub, clock: HubClock, status: int, is_over: bool
 ) -> None:
     """A busy line misses its status for a second, and reads its current: the fault may last."""
@@ -311,7 +313,7 @@ def test_fault_stays_while_its_drive_is_partly_known(
     assert look() == [(10, 31 if is_over else None)]
 
 
-def test_a_fault_that_gets_its_name_goes_on() -> None:
+def test_fault_that_gets_its_name_later_is_the_same_alarm() -> None:
     events = Alarms()
     for time, words in enumerate(("it shows a fault", "overcurrent", "it shows a fault"), 1):
         events.look(time, "pump-1", Shown("fault", words))
@@ -330,7 +332,7 @@ def test_ended_alarms_are_bounded() -> None:
     assert len(events.shown()) <= 21
 
 
-def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, clock: HubClock) -> None:
+def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, clock: HubClock) -> None:
     hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
     for now, frequency, current in (
         (12, [25.0], [None, "no reply", 12.0]),  # a miss is shown immediately
@@ -348,7 +350,7 @@ def test_a_frame_gives_no_value_that_is_overdue_or_was_missed_since(hub: Hub, cl
         assert fresh_values(hub, "pump-1") == said  # by MQTT
 
 
-def test_an_age_is_right_though_a_clock_was_set_back_or_slept(hub: Hub, clock: HubClock) -> None:
+def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, clock: HubClock) -> None:
     """One that is too short would make the last value of a silent drive a new one."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD

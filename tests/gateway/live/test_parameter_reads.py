@@ -40,7 +40,7 @@ def test_parameters_are_read_on_request_and_exported(tmp_path: Path, monkeypatch
     parameters._parameters_of.cache_clear()
 
 
-def test_family_without_a_rule_is_reported(tmp_path: Path) -> None:
+def test_parameters_of_a_family_without_known_addresses_are_refused(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         gateway.get(f"{PATH}?read=1")
         until(lambda: state(gateway) == "failed")

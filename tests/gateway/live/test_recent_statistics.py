@@ -35,7 +35,7 @@ def recent(tmp_path: Path) -> RecentStatistics:
 
 
 @pytest.mark.slow
-def test_an_hour_of_minutes_and_no_hour_of_readings(recent: RecentStatistics) -> None:
+def test_hour_has_60_minutes_of_figures_but_few_readings_are_stored(recent: RecentStatistics) -> None:
     alive: list[weakref.ref[LineStatistics]] = []
     for second in range(0, 70 * 60 + 31, 5):
         found = reading(second)
@@ -51,7 +51,7 @@ def test_an_hour_of_minutes_and_no_hour_of_readings(recent: RecentStatistics) ->
     assert recent.hour("roof") == []
 
 
-def test_figures_of_a_line_are_those_of_the_last_seconds(recent: RecentStatistics) -> None:
+def test_line_figures_cover_the_last_seconds(recent: RecentStatistics) -> None:
     for second in range(200):
         recent.tick(float(second), second * 1000, {"hall": reading(second)})
         if second == 100:

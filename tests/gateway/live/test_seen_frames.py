@@ -73,7 +73,7 @@ def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_unknown_and_foreign_frames_give_a_whole_frame(times: Times) -> None:
+def test_command_that_names_an_unknown_frame_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 
@@ -88,7 +88,7 @@ def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
     assert times.rule(8) == ""
 
 
-def test_frames_of_another_plant_count_for_nothing(times: Times) -> None:
+def test_command_that_names_a_frame_from_before_a_reload_is_refused(times: Times) -> None:
     times.frames.note(7)
     times.commands.plant_ns = times.now_ns
     assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
@@ -98,14 +98,14 @@ def test_frames_of_another_plant_count_for_nothing(times: Times) -> None:
     assert times.rule(7) == ANOTHER_PLANT
 
 
-def test_a_command_comes_once_for_each_frame(times: Times) -> None:
+def test_repeated_command_for_the_same_frame_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(7, command=one) for one in ("start", "jog", "start")] == ["", "", DOUBLED]
     times.frames.note(8)
     assert times.rule(8) == ""
 
 
-def test_old_frames_take_no_memory(times: Times) -> None:
+def test_old_frames_are_forgotten(times: Times) -> None:
     for n in range(1000):
         times.now_ns += 200_000_000
         times.frames.note(n)
@@ -165,7 +165,7 @@ def test_command_delayed_too_long_is_not_sent(tmp_path: Path, path: str, body: d
         assert commands(gateway) == []
 
 
-def test_a_stop_that_was_held_up_as_long_is_sent(tmp_path: Path) -> None:
+def test_stop_delayed_as_long_is_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
         assert gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json["done"]
@@ -198,7 +198,7 @@ def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
         assert gateway.command("/api/act", START, **writer).json["done"] is True
 
 
-def test_command_that_waits_too_long_for_its_thread_is_not_sent(tmp_path: Path) -> None:
+def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -> None:
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -247,7 +247,7 @@ def test_frame_of_a_previous_process_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["start", "jog", "reset_fault", "set_frequency"])
-def test_commands_that_may_move_a_motor_name_a_frame(tmp_path: Path, verb: str) -> None:
+def test_writes_and_verbs_without_a_frame_number_are_refused(tmp_path: Path, verb: str) -> None:
     with served(tmp_path, MAY) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         options = {"hz": 20.0} if verb == "set_frequency" else {}
@@ -268,7 +268,7 @@ def test_stops_need_no_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_start_from_a_shell_as_the_documentation_has_it(tmp_path: Path) -> None:
+def test_documented_start_from_a_shell_works(tmp_path: Path) -> None:
     for program in ("curl", "jq"):
         require_program(program)
     page = (Path(__file__).parents[3] / "docs/howto/serve.md").read_text("utf-8")

@@ -68,14 +68,14 @@ def test_the_common_block_has_no_number_for_a_raw_count() -> None:
     assert [number(pump, at) for at in (FREQUENCY, CURRENT, SETPOINT)] == [2500, 2500, NO_NUMBER]
 
 
-def test_a_metric_of_raw_counts_says_so() -> None:
+def test_metric_of_raw_counts_has_the_unit_raw_count() -> None:
     drive = DelixiModbus(1, name="fan")
     hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
     (values,) = (family for family in plant_families(hub, {}) if family.name == "multidrop_value")
     assert [labels["unit"] for _, labels, _ in values.samples] == ["Hz", "raw count"]
 
 
-def test_home_assistant_writes_raw_counts() -> None:
+def test_home_assistant_number_of_raw_counts_has_that_unit() -> None:
     topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
     details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
     found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]
@@ -92,14 +92,14 @@ class Transmitter(Drive):
     power_scale = reading(5, number_format=NumberFormat.I16)
 
 
-def test_the_page_knows_no_digits_of_a_float() -> None:
+def test_description_gives_no_digits_for_a_float() -> None:
     told = described(polled(Transmitter(1), Transmitter.readings()))
     registers = {each["name"]: each for each in told["drives"][0]["registers"]}
     assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
     assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
 
 
-def test_home_assistant_rounds_no_float() -> None:
+def test_home_assistant_gets_no_precision_for_a_float() -> None:
     topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
     details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure", "level"]}
     drive = Transmitter(1, name="tank")

@@ -30,7 +30,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
         yield found
 
 
-def test_description_has_data_of_plant_file_and_manual(gateway: Served) -> None:
+def test_plant_description_has_data_of_plant_file_and_manual(gateway: Served) -> None:
     plant = gateway.get("/api/plant").json
     assert plant["name"] == "plant.toml"
     assert plant["may"] == {"role": "look", "write": [], "verbs": []}
@@ -85,7 +85,7 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     assert "revision" not in following  # it is as before
 
 
-def test_the_last_minute_is_there_for_a_page_that_opens(gateway: Served) -> None:
+def test_new_page_gets_the_samples_of_the_last_minute(gateway: Served) -> None:
     def points() -> list[Any]:
         found: list[Any] = gateway.get("/api/minute").json.get("pump-1", {}).get("output_frequency", [])
         return found
@@ -97,7 +97,7 @@ def test_the_last_minute_is_there_for_a_page_that_opens(gateway: Served) -> None
 
 
 @pytest.mark.long
-def test_a_silent_drives_values_are_said_to_be_old(gateway: Served) -> None:
+def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
     gateway.sims["pump-2"]["output_current"] = 45.6
     until(lambda: gateway.frame()["drives"]["pump-2"]["values"]["output_current"][0] == 45.6)
     gateway.sims["pump-2"].deaf_until = float("inf")
@@ -183,7 +183,7 @@ def test_lines_show_the_delays_of_each_drive(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_a_silent_drives_misses_are_a_share_of_its_values(gateway: Served) -> None:
+def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: Served) -> None:
     """They were set against its requests, of which each brings several values, and a silent drive has few."""
     recent = gateway.gateway.recent
 
@@ -205,7 +205,7 @@ def test_a_silent_drives_misses_are_a_share_of_its_values(gateway: Served) -> No
     assert drive["asked"] >= sum(drive["misses"].values()) + before
 
 
-def test_a_drive_shows_no_eeprom_writes_of_another_line_s_or_family_s(gateway: Served) -> None:
+def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: Served) -> None:
     """Another drive may have its address on another port, and may have had it on this one."""
     drive = gateway.gateway.plant.find_drive("pump-1")[1]
     assert gateway.gateway.poller
@@ -222,7 +222,7 @@ def test_a_drive_shows_no_eeprom_writes_of_another_line_s_or_family_s(gateway: S
 
 
 @pytest.mark.slow
-def test_reads_past_the_table(gateway: Served) -> None:
+def test_ask_reads_words_outside_the_register_table(gateway: Served) -> None:
     """Words as they lie in the drive, for masters that get in through the gateway."""
     gateway.sims["pump-1"]["output_current"] = 12.3
 
@@ -244,6 +244,6 @@ def test_reads_past_the_table(gateway: Served) -> None:
         ask("pump-2", 60.0)
 
 
-def test_all_is_well(gateway: Served) -> None:
+def test_health_is_ok_while_all_drives_answer(gateway: Served) -> None:
     health = gateway.get("/health")
     assert (health.status, health.json["status"], health.json["lines"]) == (200, "ok", {"hall": "ok"})

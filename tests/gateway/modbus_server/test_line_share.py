@@ -72,7 +72,7 @@ async def test_a_flood_gets_exactly_a_fifth_of_the_line_s_time(seconds: float) -
 
 
 @pytest.mark.long
-async def test_no_second_begins_with_more_than_its_share_and_what_was_saved() -> None:
+async def test_line_time_used_in_any_second_is_at_most_share_plus_burst() -> None:
     share, line = LineShare(), PacedLine(0.01)
     await flood(share, line, 30.0)
     first = line.begun[0]
@@ -81,7 +81,7 @@ async def test_no_second_begins_with_more_than_its_share_and_what_was_saved() ->
         assert len(window) * 0.01 <= SHARE + BURST_S + 0.01 + 1e-6
 
 
-async def test_the_ninth_that_waits_is_refused_at_once() -> None:
+async def test_ninth_waiting_request_is_refused_immediately() -> None:
     share, line = LineShare(), PacedLine(0.5)
     asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is under way
     await asyncio.sleep(0)
@@ -92,7 +92,7 @@ async def test_the_ninth_that_waits_is_refused_at_once() -> None:
     assert all(isinstance(result, PassingBusy) for result in results[1:])  # the share is used up
 
 
-async def test_a_request_that_waited_a_second_is_never_asked() -> None:
+async def test_request_that_waited_a_second_is_dropped() -> None:
     loop = asyncio.get_running_loop()
     share, line = LineShare(), PacedLine(1.5)
     first, second = share.ask("one", line.ask), share.ask("two", line.ask)
@@ -105,14 +105,14 @@ async def test_a_request_that_waited_a_second_is_never_asked() -> None:
     assert len(line.begun) == 1
 
 
-async def test_work_gets_the_seconds_that_are_left() -> None:
+async def test_work_gets_the_seconds_until_its_expiry() -> None:
     share, line = LineShare(), PacedLine(0.15)
     first, second = share.ask("one", line.ask), share.ask("one", line.ask)
     await asyncio.gather(first, second)
     assert line.left == [pytest.approx(1.0), pytest.approx(0.85)]
 
 
-async def test_a_greedy_client_makes_place_for_one_that_asks_for_less() -> None:
+async def test_last_request_of_a_greedy_client_is_dropped_for_another_client() -> None:
     share, line = LineShare(), PacedLine(0.01)
     greedy = [share.ask("greedy", line.ask) for _ in range(1 + MOST_WAITING)]
     await asyncio.sleep(0)
@@ -134,7 +134,7 @@ async def test_requests_of_a_disconnected_client_are_dropped_but_the_current_one
     assert line.begun[1] - line.begun[0] >= 0.1
 
 
-async def test_a_failure_is_the_asker_s_and_the_next_has_its_turn() -> None:
+async def test_failed_request_raises_for_its_client_and_the_next_one_runs() -> None:
     async def fails(left: float) -> list[int]:
         raise TimeoutError("no reply")
 

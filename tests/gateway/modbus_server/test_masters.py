@@ -369,7 +369,7 @@ def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
 
 
 @pytest.mark.slow
-def test_a_setpoint_is_written_and_read_back(
+def test_master_writes_and_reads_back_a_setpoint(
     rig: Rig, master: Master, request: pytest.FixtureRequest
 ) -> None:
     value = 3000 + 100 * MASTERS.index(request.node.callspec.params["master"])
@@ -379,7 +379,7 @@ def test_a_setpoint_is_written_and_read_back(
     assert patiently(master.read, COMMANDED, 3, SETPOINT, 1) == [value]
 
 
-def test_exception_codes_reach_the_master(rig: Rig, master: Master) -> None:
+def test_master_gets_the_exception_codes_of_refused_writes(rig: Rig, master: Master) -> None:
     writes = len(rig.drives[COMMANDED].counters.writes)
     assert patiently(master.write, COMMANDED, 6, SETPOINT, 60000) == 3  # above its range
     assert patiently(master.write, COMMANDED, 6, CONTROL, 1) == 3  # FORWARD
@@ -389,7 +389,7 @@ def test_exception_codes_reach_the_master(rig: Rig, master: Master) -> None:
     assert len(rig.drives[COMMANDED].counters.writes) == writes
 
 
-def test_a_motor_is_stopped(rig: Rig, master: Master) -> None:
+def test_master_stops_a_motor_by_control_register_and_common_block(rig: Rig, master: Master) -> None:
     drive = rig.drives[COMMANDED]
     for address, value in ((CONTROL, STOP), (0xF00A, 1)):
         drive.counters.writes.clear()
@@ -398,7 +398,7 @@ def test_a_motor_is_stopped(rig: Rig, master: Master) -> None:
         assert [(one.name, one.raw) for one in drive.counters.writes][-1] == ("control", STOP)
 
 
-def test_the_common_block_is_the_same_for_all(rig: Rig, master: Master) -> None:
+def test_common_block_is_equal_for_all_masters(rig: Rig, master: Master) -> None:
     for unit in rig.drives:
         found = patiently(master.read, unit, 3, 0xF000, 11)
         assert isinstance(found, list)

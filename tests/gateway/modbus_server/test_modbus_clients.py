@@ -83,7 +83,7 @@ def transactions(written: bytes) -> list[int]:
     return found
 
 
-async def test_answers_come_under_their_own_ids_in_the_order_in_which_they_are_done() -> None:
+async def test_answers_have_their_requests_ids_and_are_sent_as_they_are_ready() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(found.transaction)
         return found.reply(bytes([found.transaction]))
@@ -95,7 +95,7 @@ async def test_answers_come_under_their_own_ids_in_the_order_in_which_they_are_d
     assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
 
 
-async def test_an_internal_failure_is_answered(caplog: pytest.LogCaptureFixture) -> None:
+async def test_internal_failure_is_answered_with_an_exception_code(caplog: pytest.LogCaptureFixture) -> None:
     async def fails(found: MbapRequest) -> bytes:
         raise RuntimeError("a mistake of ours")
 
@@ -124,7 +124,7 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
     return found.reply(b"")
 
 
-async def test_many_clients_share_the_time_that_one_of_them_had() -> None:
+async def test_busy_clients_share_the_time_of_one_round() -> None:
     """A stop through any interface waits until each client had its turn."""
     share = modbus_clients.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
@@ -144,7 +144,7 @@ async def test_many_clients_share_the_time_that_one_of_them_had() -> None:
     assert share.slice_s == modbus_clients.SLICE_S
 
 
-async def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
+async def test_slow_answers_end_a_clients_turn_early() -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
     assert len(transactions(transport.written)) < 10
@@ -152,7 +152,7 @@ async def test_requests_that_take_long_to_answer_let_others_have_their_turn_soon
     assert transactions(transport.written) == list(range(100))
 
 
-async def test_garbage_closes_its_client_after_the_answers_before_it() -> None:
+async def test_garbage_closes_the_connection_after_earlier_answers() -> None:
     port = port_of()
     client, transport = connected(port)
     _, other = connected(port)
@@ -210,7 +210,7 @@ async def test_writes_start_on_arrival_in_their_order(is_stalled: bool) -> None:
     assert begun == transactions(transport.written) == [500, 501, *range(500)]
 
 
-async def test_received_writes_are_parsed_for_one_slice_at_a_time() -> None:
+async def test_parsing_of_received_writes_pauses_after_each_time_slice() -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(writes(0, 100))
     assert len(transactions(transport.written)) < 10
@@ -220,7 +220,7 @@ async def test_received_writes_are_parsed_for_one_slice_at_a_time() -> None:
     assert transport.is_reading
 
 
-def test_client_that_reads_no_answers_is_still_read_within_bounds(
+def test_requests_of_a_client_that_reads_no_answers_are_read_within_limits(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)
@@ -254,7 +254,7 @@ def test_client_that_reads_no_answers_is_still_read_within_bounds(
     assert caplog.text.count("does not read its answers") == 1
 
 
-async def test_requests_beyond_the_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_pending_requests_beyond_the_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
     client, transport = connected(port_of())
     client.data_received(reads(0, 1002))
@@ -264,7 +264,7 @@ async def test_requests_beyond_the_limit_are_answered_busy(monkeypatch: pytest.M
     assert transactions(rest) == list(range(1000))
 
 
-async def test_an_idle_client_is_closed_unless_it_waits_for_an_answer() -> None:
+async def test_idle_client_is_disconnected_unless_it_waits_for_an_answer() -> None:
     never = asyncio.get_running_loop().create_future()
     port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
     connections = [connected(port) for _ in range(3)]
@@ -292,7 +292,7 @@ async def test_a_client_beyond_the_limit_replaces_the_longest_idle_one() -> None
     assert port.refused == 1
 
 
-async def test_a_client_outside_the_list_is_refused() -> None:
+async def test_client_whose_address_is_not_listed_is_refused() -> None:
     port = port_of()
     assert connected(port, "10.0.0.1")[1].ended == "aborted"
     assert not port.clients
@@ -352,7 +352,7 @@ def test_garbage_of_one_client_does_not_affect_another() -> None:
             assert good.ask(1, 3, 0x3003, 1).words == [231]
 
 
-def test_a_reset_connection_is_only_gone() -> None:
+def test_reset_connections_do_not_affect_other_clients() -> None:
     plant = plant_of(("hall", InvtCHE(1, name="mill")))
     with serving(plant, ModbusSettings(listen="127.0.0.1:0")) as gateway, gateway.client() as good:
         gateway.hub.values["mill", "output_voltage"] = 231.0
@@ -499,7 +499,7 @@ def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -
 
 
 @pytest.mark.long
-def test_a_reader_that_is_slower_than_its_requests_gets_all_answers(gateway: Gateway) -> None:
+def test_client_that_reads_late_gets_all_answers(gateway: Gateway) -> None:
     """The client sends all requests before it reads; requests wait while earlier answers are unread."""
     requests = 20_000
     with gateway.client() as client:

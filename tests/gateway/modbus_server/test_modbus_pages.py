@@ -23,7 +23,7 @@ PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", HOWTO, re.DOTALL)
 
 
 @pytest.mark.parametrize(("name", "text"), PLANTS, ids=[name for name, _ in PLANTS])
-def test_a_plant_file_of_the_page_is_taken(tmp_path: Path, name: str, text: str) -> None:
+def test_plant_files_of_the_page_load(tmp_path: Path, name: str, text: str) -> None:
     path = tmp_path / name
     path.write_text(text)
     assert isinstance(read_settings(Plant.load(path), {}).parts["modbus"], ModbusSettings)
@@ -35,7 +35,7 @@ def rows(heading: str) -> dict[str, str]:
     return {name.strip("` "): rest for name, rest in found}
 
 
-def test_every_key_has_its_row() -> None:
+def test_every_settings_key_has_a_row_in_the_page() -> None:
     assert list(rows("`[serve.modbus]`")) == [one.name for one in fields(ModbusSettings)]
     for name, rest in rows("`[serve.modbus]`").items():
         default = getattr(ModbusSettings(), name)
@@ -43,7 +43,7 @@ def test_every_key_has_its_row() -> None:
             assert f'"{default}"' in rest
 
 
-def test_every_exception_has_its_row() -> None:
+def test_every_exception_code_has_a_row_in_the_page() -> None:
     assert set(rows("Exceptions")) == {f"{code:02X}" for code in ModbusCode} | {"others"}
 
 

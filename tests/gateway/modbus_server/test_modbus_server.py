@@ -104,7 +104,7 @@ def test_stale_values_are_requested_from_the_drive(gateway: Gateway, why: str) -
     assert gateway.line.asked == [("mill", 3, CHE_OUTPUT_VOLTAGE, 1)]
 
 
-def test_bits_that_are_passed_are_packed_the_first_one_lowest() -> None:
+def test_passed_bits_are_packed_from_the_lowest_bit_on() -> None:
     with (
         serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway,
         gateway.client() as client,
@@ -112,20 +112,20 @@ def test_bits_that_are_passed_are_packed_the_first_one_lowest() -> None:
         assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])  # odd addresses are 1
 
 
-def test_only_declared_addresses_are_passed(gateway: Gateway) -> None:
+def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
     assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # another table
     assert code(gateway, 4, 3, 0, 1) == 2  # no Modbus behind this one
     assert gateway.line.asked == []
 
 
-def test_with_any_all_addresses_are_passed() -> None:
+def test_passing_any_passes_all_addresses_to_the_drive() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_with_off_the_line_is_never_asked() -> None:
+def test_passing_off_sends_no_read_to_the_drive() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -135,14 +135,14 @@ def test_with_off_the_line_is_never_asked() -> None:
         assert gateway.line.asked == []
 
 
-def test_a_silent_drive_costs_the_others_no_time(gateway: Gateway) -> None:
+def test_read_of_a_silent_drive_is_answered_without_a_request(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_voltage"] = None
     gateway.hub.states["mill"] = "silent"
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == 0x0B
     assert gateway.line.asked == []
 
 
-def test_a_value_from_before_a_write_is_not_given_after_it(gateway: Gateway) -> None:
+def test_value_from_before_a_write_is_not_used_after_the_write(gateway: Gateway) -> None:
     gateway.hub.values["mill", "setpoint"] = 10.0
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
@@ -152,7 +152,7 @@ def test_a_value_from_before_a_write_is_not_given_after_it(gateway: Gateway) -> 
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
 
 
-def test_a_value_from_before_a_write_is_not_given_after_a_reload(gateway: Gateway) -> None:
+def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway) -> None:
     """Nor is one from before a command that came by another way."""
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
@@ -167,24 +167,24 @@ def test_a_value_from_before_a_write_is_not_given_after_a_reload(gateway: Gatewa
     ("start", "count", "expected"),
     [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)],
 )
-def test_a_range_that_cannot_be(
+def test_invalid_address_ranges_have_exception_codes(
     gateway: Gateway, function: int, start: int, count: int, expected: int
 ) -> None:
     assert code(gateway, 1, function, start, count) == expected
 
 
-def test_126_words_are_one_too_many(gateway: Gateway) -> None:
+def test_read_of_126_words_is_refused(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0, 126) == 3
 
 
 @pytest.mark.parametrize("function", [1, 3, 5, 6])
 @pytest.mark.parametrize("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
-def test_a_request_of_another_length_is_no_value(gateway: Gateway, function: int, data: bytes) -> None:
+def test_request_of_a_wrong_length_is_an_illegal_value(gateway: Gateway, function: int, data: bytes) -> None:
     assert code(gateway, 1, function, data=data) == 3
 
 
 @pytest.mark.parametrize("function", [0, 7, 8, 11, 17, 20, 22, 23, 43, 0x41, 0x80, 0x83, 0xFF])
-def test_other_functions_are_not_offered(gateway: Gateway, function: int) -> None:
+def test_unsupported_functions_are_refused(gateway: Gateway, function: int) -> None:
     with gateway.client() as client:
         client.send(request(1, 1, function, 0, 1))
         reply = client.receive()
@@ -193,14 +193,14 @@ def test_other_functions_are_not_offered(gateway: Gateway, function: int) -> Non
     assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
 
 
-def test_an_unknown_unit_is_no_path(gateway: Gateway) -> None:
+def test_unknown_unit_id_is_answered_with_no_path(gateway: Gateway) -> None:
     for unit in (5, 247, 255):
         assert code(gateway, unit, 3, 0, 1) == 0x0A
         assert code(gateway, unit, 6, 0, 1) == 0x0A
 
 
 @pytest.mark.parametrize("function", [3, 5, 6, 16, 8])
-def test_a_broadcast_is_closed_without_an_answer_and_goes_nowhere(gateway: Gateway, function: int) -> None:
+def test_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway, function: int) -> None:
     with gateway.client() as client:
         client.send(request(1, 0, function, BLOCK + 10, 1))
         assert client.receive() is None
@@ -226,14 +226,16 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), FAILURES, ids=lambda one: type(one).__name__)
-def test_a_failure_on_the_line_has_its_code(gateway: Gateway, failure: Exception, expected: int) -> None:
+def test_error_of_a_passed_read_has_its_exception_code(
+    gateway: Gateway, failure: Exception, expected: int
+) -> None:
     gateway.hub.values.clear()
     gateway.line.failure = failure
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == expected
 
 
 @pytest.mark.slow
-def test_reads_that_find_the_queue_full_are_busy(gateway: Gateway) -> None:
+def test_passed_reads_beyond_the_queue_are_answered_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     gateway.line.seconds = 0.6  # three times what may be used at once
     with gateway.client() as client:
@@ -247,7 +249,7 @@ def test_reads_that_find_the_queue_full_are_busy(gateway: Gateway) -> None:
 # ---- writes ----
 
 
-def test_a_write_goes_through_commands_and_is_echoed(gateway: Gateway) -> None:
+def test_write_is_carried_out_by_commands_and_echoed(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).data == bytes.fromhex("20 00 13 88")
         reply = client.ask(1, 16, CHE_SETPOINT, 1, data=bytes.fromhex("02 13 88"))
@@ -313,12 +315,12 @@ OUTCOMES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
-def test_each_result_of_a_write_has_its_code(gateway: Gateway, failure: Any, expected: int) -> None:
+def test_each_result_of_a_write_has_its_exception_code(gateway: Gateway, failure: Any, expected: int) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
 
-def test_a_read_only_gateway_says_so() -> None:
+def test_read_only_gateway_refuses_writes_as_illegal_function() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
         for function, words in (
             (5, (5, 0xFF00)),
@@ -344,12 +346,12 @@ def test_clients_with_the_role_stop_can_only_stop() -> None:
 
 
 @pytest.mark.parametrize("value", [v for v in range(20) if v not in (5, 6, 8)])
-def test_of_a_control_register_only_a_stop_is_taken(gateway: Gateway, value: int) -> None:
+def test_only_stops_are_accepted_in_a_control_register(gateway: Gateway, value: int) -> None:
     assert code(gateway, 1, 6, CHE_CONTROL, value) == 3
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_every_way_to_say_stop_goes_to_commands(gateway: Gateway) -> None:
+def test_every_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_CONTROL, 5).data == bytes.fromhex("10 00 00 05")
         assert client.ask(1, 16, CHE_CONTROL, 1, data=bytes.fromhex("02 00 05")).code is None
@@ -373,7 +375,7 @@ def test_every_way_to_say_stop_goes_to_commands(gateway: Gateway) -> None:
         (16, (BLOCK + 11, 1), b"\2\0\1", 2),
     ],
 )
-def test_anything_else_in_the_common_block_is_no_stop(
+def test_other_writes_to_the_common_block_are_refused_and_do_not_stop(
     gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
 ) -> None:
     assert code(gateway, 1, function, *words, data=data) == expected
@@ -393,7 +395,7 @@ MIXED = {  # addresses, and words as the manuals and the common block have them
 
 @pytest.mark.parametrize("mixed", MIXED)
 @pytest.mark.parametrize("may", ["stop", "write"])
-def test_a_stop_among_other_words_is_sent_without_the_others(mixed: str, may: str) -> None:
+def test_stop_in_a_write_of_several_words_is_sent_alone(mixed: str, may: str) -> None:
     unit, address, words = MIXED[mixed]
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
@@ -405,7 +407,7 @@ def test_a_stop_among_other_words_is_sent_without_the_others(mixed: str, may: st
         assert gateway.commands.written == []
 
 
-def test_a_stop_among_other_coils_is_sent_without_the_others() -> None:
+def test_stop_in_a_write_of_several_coils_is_sent_alone() -> None:
     """Start off, stop on, emergency stop off: the ER-G-220's coils 0 to 2 (section 10)."""
     drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
     with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
@@ -420,13 +422,15 @@ def test_a_stop_among_other_coils_is_sent_without_the_others() -> None:
 @pytest.mark.parametrize(
     ("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))]
 )
-def test_words_without_a_stop_are_refused(gateway: Gateway, address: int, words: tuple[int, ...]) -> None:
+def test_write_of_several_words_without_a_stop_is_refused(
+    gateway: Gateway, address: int, words: tuple[int, ...]
+) -> None:
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     assert code(gateway, 1, 16, address, len(words), data=data) in (2, 3)
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_a_read_only_gateway_takes_no_stop_among_other_words() -> None:
+def test_read_only_gateway_ignores_a_stop_in_a_write_of_several_words() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
         assert code(gateway, 1, 16, CHE_CONTROL, 2, data=b"\4\0\5\0\0") == 1
         assert gateway.commands.stopped == []
@@ -446,14 +450,14 @@ def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:
 
 
 @pytest.mark.slow
-def test_a_stop_that_takes_long_is_acknowledged_and_goes_on(gateway: Gateway) -> None:
+def test_slow_stop_is_answered_with_acknowledge_and_continues(gateway: Gateway) -> None:
     ended = stop_slowly(gateway, 1.0)
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_CONTROL, 5).code == 5
     assert ended.wait(30)
 
 
-def test_a_stop_is_carried_out_though_its_client_is_gone(gateway: Gateway) -> None:
+def test_stop_continues_after_its_client_is_disconnected(gateway: Gateway) -> None:
     ended = stop_slowly(gateway, 0.2)
     with gateway.client() as client:
         client.send(request(1, 1, 6, CHE_CONTROL, 5))
@@ -492,7 +496,7 @@ def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gatewa
         assert {reply.transaction for _ in range(16) if (reply := client.receive())} == set(range(16))
 
 
-def test_a_flood_of_stops_is_bounded_and_each_is_answered(gateway: Gateway) -> None:
+def test_concurrent_stops_are_limited_and_each_request_is_answered(gateway: Gateway) -> None:
     release = threading.Event()
 
     async def hanging() -> CommandResult:
@@ -514,12 +518,12 @@ def test_a_flood_of_stops_is_bounded_and_each_is_answered(gateway: Gateway) -> N
     ("failure", "expected"),
     [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
 )
-def test_a_stop_that_failed_says_so(gateway: Gateway, failure: BusError, expected: int) -> None:
+def test_failed_stop_has_an_exception_code(gateway: Gateway, failure: BusError, expected: int) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
-def test_an_unexpected_failure_of_a_stop_is_reported(
+def test_unexpected_exception_in_a_stop_is_logged_and_answered(
     gateway: Gateway, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def fails() -> CommandResult:
@@ -530,7 +534,9 @@ def test_an_unexpected_failure_of_a_stop_is_reported(
     assert "a mistake of ours" in caplog.text
 
 
-def test_a_reply_of_another_length_is_none(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_reply_of_a_wrong_length_is_answered_as_no_reply(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def short(*request: object) -> list[int]:
         return [1]
 
@@ -550,7 +556,7 @@ def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
 UNKNOWN = [0x8000, 0]
 
 
-def test_the_common_block_of_a_drive_that_runs(gateway: Gateway) -> None:
+def test_common_block_of_a_running_drive_has_its_values(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "runs"
     gateway.hub.values.update(
         {("mill", "output_frequency"): 49.99, ("mill", "output_current"): 12.3, ("mill", "setpoint"): -5.0}
@@ -565,12 +571,12 @@ def test_the_common_block_of_a_drive_that_runs(gateway: Gateway) -> None:
     assert gateway.line.asked == []
 
 
-def test_large_numbers_have_both_words(gateway: Gateway) -> None:
+def test_large_numbers_use_both_words(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 1500.0
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
 
 
-def test_an_unknown_value_is_never_0(gateway: Gateway) -> None:
+def test_unknown_values_read_as_reserved_numbers(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
     gateway.hub.states["mill"] = "silent"
@@ -581,7 +587,7 @@ def test_an_unknown_value_is_never_0(gateway: Gateway) -> None:
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_values_from_before_a_sleep_are_unknown(gateway: Gateway) -> None:
+def test_values_from_before_a_sleep_read_as_unknown(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
@@ -590,7 +596,9 @@ def test_values_from_before_a_sleep_are_unknown(gateway: Gateway) -> None:
 
 
 @pytest.mark.parametrize(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
-def test_a_fault_has_the_drive_s_number(gateway: Gateway, number: float | None, expected: int) -> None:
+def test_fault_has_the_number_of_the_drives_family(
+    gateway: Gateway, number: float | None, expected: int
+) -> None:
     gateway.hub.states["mill"] = "fault"
     gateway.hub.values["mill", "fault"] = number
     assert block(gateway)[:2] == [3, expected]
@@ -606,7 +614,7 @@ def test_reads_across_the_ends_of_the_common_block_are_refused(gateway: Gateway)
         assert client.ask(1, 3, BLOCK - 1, 18).code == 2
 
 
-def test_every_family_has_the_block(gateway: Gateway) -> None:
+def test_every_family_has_the_common_block(gateway: Gateway) -> None:
     for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
         gateway.hub.states[drive] = "runs"
         assert block(gateway, unit)[0] == 2
@@ -615,7 +623,7 @@ def test_every_family_has_the_block(gateway: Gateway) -> None:
 # ---- ports of lines, and a plant that changes ----
 
 
-def test_a_line_may_have_a_port_of_its_own() -> None:
+def test_line_with_its_own_port_is_served_there() -> None:
     found = plant_of(("hall", InvtCHE(1, name="mill")), ("yard", Meter(1, name="meter")))
     with serving(found, ModbusSettings(listen="127.0.0.1:0", ports={"yard": 0})) as gateway:
         gateway.hub.values.update({("mill", "output_voltage"): 231.0, ("meter", "level"): 12.5})
@@ -624,7 +632,7 @@ def test_a_line_may_have_a_port_of_its_own() -> None:
             assert yard.ask(1, 3, 0, 1).words == [125]
 
 
-def test_another_plant_is_taken_or_the_old_one_goes_on(gateway: Gateway) -> None:
+def test_adopt_replaces_the_plant_unless_unit_ids_clash(gateway: Gateway) -> None:
     with gateway.client() as client:
         with pytest.raises(ValueError, match="unit 1 would be"):
             gateway.server.adopt(plant_of(("hall", InvtCHE(1, name="a")), ("yard", InvtCHE(1, name="b"))))

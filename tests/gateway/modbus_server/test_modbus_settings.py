@@ -38,7 +38,7 @@ def test_all_mistakes_are_reported_together() -> None:
     assert len(str(mistake.value).splitlines()) == 4
 
 
-def test_clients_are_this_machine_s_or_those_that_are_named() -> None:
+def test_only_listed_clients_may_connect_or_local_ones_without_a_list() -> None:
     alone = ModbusSettings()
     assert [alone.may_connect(address) for address in ("127.0.0.1", "::1", "10.0.0.5")] == [True, True, False]
     named = ModbusSettings(listen="0.0.0.0:1502", clients=("10.0.0.0/24", "fe80::1"))

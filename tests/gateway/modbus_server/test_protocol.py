@@ -16,7 +16,7 @@ from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_
 PRINTED = bytes.fromhex("15 01 00 00 00 06 FF 03 00 04 00 01")
 
 
-def test_the_guide_s_example_is_taken_and_answered() -> None:
+def test_example_of_the_modbus_guide_is_parsed_and_answered() -> None:
     buffer = bytearray(PRINTED)
     found = take_request(buffer)
     assert found == MbapRequest(0x1501, 0xFF, 3, bytes.fromhex("00 04 00 01"))
@@ -25,7 +25,7 @@ def test_the_guide_s_example_is_taken_and_answered() -> None:
     assert found.exception(2) == bytes.fromhex("15 01 00 00 00 03 FF 83 02")
 
 
-def test_each_byte_may_come_alone() -> None:
+def test_request_that_arrives_byte_by_byte_is_parsed() -> None:
     buffer = bytearray()
     for byte in PRINTED[:-1]:
         buffer.append(byte)
@@ -47,7 +47,7 @@ def test_each_byte_may_come_alone() -> None:
         "00 01 00 00 FF FF",
     ],
 )
-def test_no_header_is_garbage_as_soon_as_it_is_seen(header: str) -> None:
+def test_invalid_header_raises_garbage_as_soon_as_it_is_visible(header: str) -> None:
     with pytest.raises(Garbage):
         take_request(bytearray.fromhex(header))
 
@@ -64,7 +64,7 @@ frames = st.builds(
 
 
 @given(st.lists(frames, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=40))
-def test_requests_are_the_same_however_they_are_cut(sent: list[bytes], cuts: list[int]) -> None:
+def test_requests_are_parsed_the_same_however_they_are_divided(sent: list[bytes], cuts: list[int]) -> None:
     whole = b"".join(sent)
     buffer, found, at = bytearray(), [], 0
     while at < len(whole):

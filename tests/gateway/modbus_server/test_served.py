@@ -110,7 +110,7 @@ def reply_to(client: RawClient, *words: int) -> RawReply:
 
 
 @pytest.mark.slow
-def test_a_plant_file_s_drives_are_read_written_and_stopped(tmp_path: Path) -> None:
+def test_drives_of_a_plant_file_are_read_written_and_stopped(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), gateway_of(path) as gateway:
         drive["output_voltage"] = 231
         server = gateway.feeds["modbus"]

@@ -24,7 +24,7 @@ def numbers(units: Units) -> dict[tuple[str, int], str]:
     return {(port, number): unit.drive.name for port, number, unit in units}
 
 
-def test_a_unit_is_the_drive_s_address() -> None:
+def test_unit_id_is_the_drives_address() -> None:
     units = Units(
         plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill"))), ModbusSettings()
     )
@@ -36,7 +36,7 @@ def test_a_unit_is_the_drive_s_address() -> None:
     assert units.find("yard", 9) is None
 
 
-def test_all_clashes_are_reported_with_the_free_numbers() -> None:
+def test_all_clashing_unit_ids_are_reported_with_the_free_ones() -> None:
     plant = plant_of(
         ("hall", InnovertIBD(1, name="pump")),
         ("hall", InnovertIBD(2, name="fan")),
@@ -53,7 +53,7 @@ def test_all_clashes_are_reported_with_the_free_numbers() -> None:
     assert last.endswith("free numbers: 3 to 4, 6 to 247")
 
 
-def test_a_unit_id_or_a_port_of_its_own_ends_a_clash() -> None:
+def test_configured_unit_id_or_port_resolves_a_clash() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
     assert numbers(Units(plant, ModbusSettings(units={"mill": 21}))) == {
         (MAIN, 1): "pump",
@@ -63,20 +63,20 @@ def test_a_unit_id_or_a_port_of_its_own_ends_a_clash() -> None:
     assert numbers(own) == {(MAIN, 1): "pump", ("yard", 1): "mill"}
 
 
-def test_a_number_that_is_given_may_clash_too() -> None:
+def test_configured_unit_id_that_clashes_is_reported() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill")))
     with pytest.raises(ValueError, match=r"unit 1 would be pump .* and mill"):
         Units(plant, ModbusSettings(units={"mill": 1}))
 
 
-def test_files_in_the_settings_must_exist() -> None:
+def test_unknown_drives_and_lines_in_the_settings_are_reported() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")))
     with pytest.raises(ValueError, match="units: there is no drive 'pumb'") as mistake:
         Units(plant, ModbusSettings(units={"pumb": 3}, ports={"hal": 1503}))
     assert str(mistake.value).splitlines()[1].endswith("there is no line 'hal'; did you mean hall?")
 
 
-def test_address_0_is_no_unit() -> None:
+def test_drive_with_address_0_cannot_be_a_unit() -> None:
     class Behind(Drive):
         addresses = range(256)
         level = reading(0, "m")
@@ -98,7 +98,7 @@ def test_common_block_must_not_overlap_registers() -> None:
     Units(plant, ModbusSettings(common=0xE000))
 
 
-def test_no_family_of_ours_has_anything_where_the_common_block_is() -> None:
+def test_no_family_has_registers_in_the_range_of_the_common_block() -> None:
     families = [find_model(name) for name in MODELS] + [load_family(path) for path in FAMILIES.glob("*.toml")]
     assert len(families) > 10
     common = set(ModbusSettings().common_addresses)
@@ -132,13 +132,13 @@ class Stop:
         Stop("delta-ms300", "control", 1),
     ],
 )
-def test_a_unit_knows_its_family_s_own_ways_to_stop(stop: Stop) -> None:
+def test_unit_has_the_stop_writes_of_its_family(stop: Stop) -> None:
     family = find_model(stop.model)
     unit = Unit("hall", PolledDrive(family(1), ()))
     assert StopWrite(stop.register, stop.raw) in unit.stops
 
 
-def test_a_count_without_effect_is_not_a_stop() -> None:
+def test_raw_value_without_effect_is_not_a_stop() -> None:
     unit = Unit("hall", PolledDrive(InnovertIBD(1), ()))
     assert unit.stops == {StopWrite("control", 1)}  # and not 0, "no command"
 
@@ -161,7 +161,7 @@ def test_declared_addresses_are_registers_texts_and_gaps() -> None:
     assert unit.writable(Carrier.WORD, 3) is None
 
 
-def test_the_settings_are_checked_against_the_plant() -> None:
+def test_settings_that_do_not_fit_the_plant_are_reported() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
     first, _ = ModbusSettings().check(plant)
     assert first == "unit 1 would be pump (line hall) and mill (line yard)"

@@ -85,7 +85,9 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
 @example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # the offset swallows it
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
-def test_words_are_the_drive_s_own_or_none(case: tuple[NumberFormat, str, float, float, bytes]) -> None:
+def test_computed_words_equal_the_drives_words_or_are_none(
+    case: tuple[NumberFormat, str, float, float, bytes],
+) -> None:
     number_format, order, step, offset, data = case
     register = declared(number_format=number_format, order=order, step=step, offset=offset)
     value = value_of(register, data)
@@ -94,7 +96,7 @@ def test_words_are_the_drive_s_own_or_none(case: tuple[NumberFormat, str, float,
 
 
 @given(st.sampled_from(WHOLE), st.sampled_from(STEPS), st.sampled_from(OFFSETS), st.data())
-def test_whole_counts_always_have_words(
+def test_integer_values_always_have_words(
     number_format: NumberFormat, step: float, offset: float, data: st.DataObject
 ) -> None:
     size = BYTES[number_format]
@@ -107,7 +109,7 @@ def test_whole_counts_always_have_words(
 
 
 @pytest.mark.slow
-def test_every_count_of_a_word_has_words() -> None:
+def test_every_raw_count_of_16_bits_has_its_word() -> None:
     """Every seventh by default."""
     for step in (0.1, 0.01, -0.25):
         register = declared(step=step)
@@ -117,7 +119,7 @@ def test_every_count_of_a_word_has_words() -> None:
 
 
 @given(st.floats(width=32, allow_nan=False).filter(bool), st.sampled_from(ORDERS))
-def test_floats_have_words_but_for_zero(number: float, order: str) -> None:
+def test_floats_other_than_zero_have_words(number: float, order: str) -> None:
     register = declared(number_format=NumberFormat.F32, order=order)
     data = struct.pack(">f", number)
     places = {"ABCD": (0, 1, 2, 3), "CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}[order]
@@ -129,7 +131,7 @@ def test_floats_have_words_but_for_zero(number: float, order: str) -> None:
 
 
 @table("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
-def test_a_value_that_no_count_has_is_not_rounded(value: float) -> None:
+def test_value_without_a_raw_count_has_no_words(value: float) -> None:
     assert exact_data(declared(), value) is None
 
 
@@ -142,11 +144,11 @@ def test_a_value_that_no_count_has_is_not_rounded(value: float) -> None:
         {"invalid": 5},  # the count that means no value
     ],
 )
-def test_a_format_that_leaves_bits_open_has_no_words(details: dict[str, Any]) -> None:
+def test_format_that_leaves_bits_undefined_has_no_words(details: dict[str, Any]) -> None:
     assert exact_data(declared(**details), 5.0) is None
 
 
-def test_a_register_that_another_scales_has_no_words() -> None:
+def test_register_with_a_scale_register_has_no_words() -> None:
     family = type(
         "Scaled",
         (Drive,),
@@ -214,7 +216,7 @@ def read(function: int, start: int, count: int, *, since_ns: int = 0, **changed:
     return cached().read(function, range(start, start + count), rows.get, NOW, since_ns)
 
 
-def test_a_range_is_of_words_as_the_drive_has_them() -> None:
+def test_range_is_answered_with_the_drives_words() -> None:
     assert read(3, 0, 4) == [1450, 0x0002, 0x0001, 3]
     assert read(3, 2, 1) == [0x0001]  # half of a number
     assert read(4, 0, 1) == [12]
@@ -223,7 +225,7 @@ def test_a_range_is_of_words_as_the_drive_has_them() -> None:
     assert read(2, 8, 1) == [0]
 
 
-def test_one_word_that_is_not_known_leaves_the_range_out() -> None:
+def test_range_with_one_unknown_word_is_not_answered() -> None:
     assert read(3, 3, 2) is Lack.UNPOLLED  # a part of a word
     assert read(3, 9, 1) is Lack.UNPOLLED
     assert read(4, 0, 2) is Lack.UNPOLLED
@@ -231,7 +233,7 @@ def test_one_word_that_is_not_known_leaves_the_range_out() -> None:
     assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Lack.UNPOLLED  # +0 and -0
 
 
-def test_a_row_that_is_old_or_a_miss_leaves_the_range_out() -> None:
+def test_range_with_a_stale_row_or_a_miss_is_not_answered() -> None:
     assert read(3, 0, 4, status=FakeRow(NOW, None)) is Lack.STALE
     assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
     assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Lack.STALE
@@ -240,11 +242,11 @@ def test_a_row_that_is_old_or_a_miss_leaves_the_range_out() -> None:
     assert cached().read(3, range(1), lambda name: None, NOW) is Lack.STALE
 
 
-def test_rows_from_before_a_write_do_not_count() -> None:
+def test_rows_from_before_a_write_are_not_used() -> None:
     assert read(3, 1, 1, since_ns=NOW) == [2]
     assert read(3, 1, 1, since_ns=NOW + 1) is Lack.STALE
 
 
-def test_of_two_registers_at_an_address_the_newer_row_counts() -> None:
+def test_newest_row_of_registers_at_the_same_address_is_used() -> None:
     assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
     assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]

@@ -55,7 +55,7 @@ def said(topic: str, text: bytes = b"") -> Publication:
     return Publication(topic, lambda: text)
 
 
-def test_unacknowledged_messages_are_limited_and_the_newest_of_a_topic_is_sent() -> None:
+def test_unacknowledged_messages_are_limited_and_only_the_newest_is_sent() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for round in range(100):
@@ -73,7 +73,7 @@ def test_unacknowledged_messages_are_limited_and_the_newest_of_a_topic_is_sent()
     assert outbox.is_idle
 
 
-def test_pending_message_is_made_when_it_is_sent() -> None:
+def test_payload_of_a_pending_message_is_made_when_it_is_sent() -> None:
     wire, now = BreakableConnection(), [b"old"]
     outbox = Outbox(wire.send)
     wire.is_open = False
@@ -83,7 +83,7 @@ def test_pending_message_is_made_when_it_is_sent() -> None:
     assert wire.sent == [("state", b"new")]
 
 
-def test_a_message_that_cannot_be_made_holds_up_no_other() -> None:
+def test_message_whose_payload_fails_is_dropped_and_others_are_sent() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     outbox.put(Publication("told", "\ud800".encode))
@@ -105,7 +105,7 @@ def test_lost_connection_drops_and_counts_pending_messages() -> None:
     assert wire.sent[-1] == ("next", b"")
 
 
-def test_messages_that_arrive_together_make_room_at_once() -> None:
+def test_acknowledged_messages_make_room_immediately() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for topic in range(3 * MOST_UNDER_WAY):
@@ -164,7 +164,7 @@ class Loop:
         self.calls.pop(0)()
 
 
-def test_the_loop_is_woken_once_for_messages_that_arrive_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_event_loop_is_woken_once_for_a_burst_of_acknowledgements(monkeypatch: pytest.MonkeyPatch) -> None:
     require_module("paho.mqtt.client")
     broker, loop, told = Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()), Loop(), list[int]()
     monkeypatch.setattr(broker, "_loop", loop)
@@ -250,7 +250,7 @@ def watched(slots: Slots) -> dict[str, list[Slot]]:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually("gone", "frozen"))
-def test_polling_is_unchanged_and_dropped_messages_are_counted(tmp_path: Path, kind: str) -> None:
+def test_polling_is_unchanged_while_the_broker_is_frozen_or_gone(tmp_path: Path, kind: str) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, gateway_of(tmp_path, broker) as (gateway, slots):
         until(lambda: figures(gateway)["connected"] == 2.0)

@@ -37,7 +37,7 @@ class HeldCommands:
         return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
 
 
-async def test_a_broker_s_writes_are_bounded_and_no_stop_is() -> None:
+async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
     told: list[tuple[str, str]] = []
     commands: Any = HeldCommands()
     orders = BrokerCommands(

@@ -57,7 +57,9 @@ def now_ms() -> int:
     return time.time_ns() // 1_000_000
 
 
-def test_newest_values_are_retained(broker: Broker, listener: Listener, start: Start) -> None:
+def test_newest_values_are_published_as_retained_messages(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
@@ -85,7 +87,7 @@ def test_stale_value_is_null_and_silent_drive_is_offline(listener: Listener, sta
 
 
 @pytest.mark.slow
-def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Start) -> None:
+def test_broker_publishes_offline_when_the_gateway_disappears(listener: Listener, start: Start) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.cut(0)
@@ -135,7 +137,7 @@ def test_closing_publishes_offline(broker: Broker, listener: Listener, tmp_path:
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
-def test_failing_publisher_is_offline_and_still_stops(
+def test_failing_publisher_is_offline_and_still_carries_out_stops(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     """The values that the broker keeps would pass for the present, for it has a connection."""
@@ -173,7 +175,9 @@ def test_failing_publisher_is_offline_on_a_new_connection_too(listener: Listener
 
 
 @pytest.mark.slow
-def test_frozen_broker_delays_nothing(broker: Broker, listener: Listener, start: Start) -> None:
+def test_publishing_does_not_wait_for_a_frozen_broker(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     known, running = start()
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
     broker.signal(signal.SIGSTOP)
@@ -218,7 +222,9 @@ def write_of(value: object, time_ms: int) -> bytes:
     return json.dumps({"value": value, "time": time_ms}).encode()
 
 
-def test_a_fresh_write_is_carried_out_once(broker: Broker, listener: Listener, start: Start) -> None:
+def test_fresh_write_is_carried_out_and_its_copy_is_not(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     fresh = write_of(25, now_ms())
@@ -274,7 +280,7 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     ],
     ids=range(5),
 )
-def test_no_payload_prevents_a_stop(
+def test_stop_is_carried_out_whatever_its_payload(
     broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
 ) -> None:
     """The payloads are long, truncated, or not text."""
@@ -300,7 +306,7 @@ def test_no_payload_prevents_a_stop(
         STOPS,
     ),
 )
-def test_a_stop_by_a_verb_is_carried_out_whenever_it_was_sent(
+def test_stop_verb_is_carried_out_whatever_its_age(
     broker: Broker, listener: Listener, start: Start, verb: str, more: dict[str, Any]
 ) -> None:
     known, _ = start(commands=True)
@@ -312,9 +318,7 @@ def test_a_stop_by_a_verb_is_carried_out_whenever_it_was_sent(
     assert known.commands.noted == [("act", "pump-1", verb, {})] * 2
 
 
-def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_retained_stop_verb_is_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
     publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "pump-1", "time": 1}', "-r")
     known, _ = start(commands=True)
     assert told(listener)["done"]
@@ -325,7 +329,7 @@ def test_a_stop_by_a_verb_that_the_broker_keeps_is_carried_out(
     ("named", "verb"),
     in_turn([FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"], STOPS),
 )
-def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
+def test_stop_verb_stops_the_drive_of_its_topic_and_the_drive_it_names(
     broker: Broker, listener: Listener, start: Start, verb: str, named: object
 ) -> None:
     known, _ = start(commands=True)
@@ -346,7 +350,7 @@ def test_a_stop_by_a_verb_stops_its_topic_s_drive_and_another_one_that_it_names(
         ("L\u00fcfter", "Lu\u0308fter", ["L\u00fcfter"]),
     ],
 )
-async def test_a_stop_by_a_verb_may_name_its_drives_in_another_spelling(
+async def test_stop_verb_finds_drives_by_another_spelling(
     tmp_path: Path, topic: str, named: str, stopped: list[str]
 ) -> None:
     known = inside(tmp_path, InvtCHE(2, name="L\u00fcfter"))
@@ -404,7 +408,9 @@ def test_command_older_than_a_stop_is_refused(
     assert len(known.commands.noted) == (3 if is_taken else 1)
 
 
-def test_a_verb_names_its_drive_again(broker: Broker, listener: Listener, start: Start) -> None:
+def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
@@ -458,7 +464,7 @@ def test_an_unsendable_answer_does_not_affect_other_messages(
     )
 
 
-def test_an_infinite_number_is_null(listener: Listener, start: Start) -> None:
+def test_infinite_value_is_published_as_null(listener: Listener, start: Start) -> None:
     """JSON has none: who reads the message would lose all other values with it."""
     known, running = start()
     listener.wait_for(has("multidrop/pump-1"))
@@ -478,7 +484,7 @@ def test_commands_are_not_subscribed_unless_enabled(broker: Broker, listener: Li
     assert known.commands.noted == []
 
 
-def test_without_the_key_only_rebirth_is_subscribed(tmp_path: Path) -> None:
+def test_without_commands_only_node_commands_are_subscribed(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [speaker.topics() for speaker in part._speakers] == [
@@ -529,7 +535,9 @@ def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener,
     assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
 
 
-def test_its_command_template_makes_a_fresh_write(broker: Broker, listener: Listener, start: Start) -> None:
+def test_write_by_the_home_assistant_template_is_carried_out(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     jinja2 = require_module("jinja2")
     known, _ = start(home_assistant=True, commands=True)
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
@@ -544,7 +552,7 @@ def test_its_command_template_makes_a_fresh_write(broker: Broker, listener: List
     assert known.commands.noted == [("write", "pump-1", "setpoint", 12.5)]
 
 
-def test_a_name_is_an_id_that_no_other_name_has(listener: Listener, start: Start) -> None:
+def test_object_ids_of_different_drives_differ(listener: Listener, start: Start) -> None:
     start(home_assistant=True)
     ids = {
         listener.wait_for(lambda received: received.topic.startswith("homeassistant/")).topic
@@ -608,7 +616,7 @@ def check_components(found: Any) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_home_assistant_takes_the_components_of_each_family(model: str) -> None:
+def test_components_of_each_family_have_valid_home_assistant_keys(model: str) -> None:
     drive = MODELS[model](1, name="pump-1")
     registers = list(drive.registers)
     polled = [name for name in registers if drive.register(name).readable]
@@ -630,7 +638,7 @@ class Awkward(Drive):
     mode = setting(6, values=IntEnum("Mode", {"SLOW": 1, "FAST": 7}), moves=False)
 
 
-def test_registers_with_the_names_of_components_keep_them_apart() -> None:
+def test_registers_named_like_components_get_their_own_keys() -> None:
     found = configured(Awkward(1, name="a"), [*Awkward.registers], ["level", "mode"], page="http://hall:8750")
     check_components(found)
     assert found["dev"] == {
@@ -648,7 +656,7 @@ def test_registers_with_the_names_of_components_keep_them_apart() -> None:
     assert json.loads(command.render(value="FAST", now=lambda: datetime.now(UTC)))["value"] == 7
 
 
-def test_unpolled_number_has_no_state() -> None:
+def test_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
     drive = InvtCHE(1, name="a")
     assert (
         not {"state_topic", "value_template"}
@@ -666,25 +674,25 @@ def test_unpolled_number_has_no_state() -> None:
         ("silent", "None", "None"),
     ],
 )
-def test_binary_sensors_say_what_is_known(state: str, problem: str, running: str) -> None:
+def test_binary_sensors_follow_the_state_of_the_drive(state: str, problem: str, running: str) -> None:
     parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
     assert [rendered(parts[key], {"state": state}) for key in ("problem", "running")] == [problem, running]
     assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
 
 
-def test_choice_without_a_name_is_unknown() -> None:
+def test_raw_count_without_a_name_is_unknown_in_home_assistant() -> None:
     """Home Assistant ignores a state that is no option, and shows the one before it."""
     part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
     values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
     assert values == ["FORWARD", "None", "None"]
 
 
-def test_a_stop_is_there_while_its_drive_is_silent() -> None:
+def test_stop_button_is_available_while_its_drive_is_silent() -> None:
     parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
     assert parts["stop"]["availability"] == [{"topic": "multidrop/gateway"}]
 
 
-def test_two_gateways_have_no_id_of_one_another() -> None:
+def test_ids_of_two_gateways_differ() -> None:
     names = [("a-b", "c"), ("a", "b-c"), ("a_2d_b", "c"), ("a", "b_c"), ("a", "b c")]
     assert len({discovery_topic(*one) for one in names}) == len(names)
 

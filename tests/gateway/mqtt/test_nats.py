@@ -40,7 +40,7 @@ def now_ms() -> int:
 
 @pytest.mark.slow
 @on_nats
-def test_state_is_retained_and_the_will_reports_a_loss(
+def test_state_is_retained_and_the_will_reports_a_lost_gateway(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     _, running = start()
@@ -58,7 +58,9 @@ def test_state_is_retained_and_the_will_reports_a_loss(
 
 @pytest.mark.slow
 @on_nats
-def test_commands_obey_the_rules(broker: Broker, listener: Listener, start: Start) -> None:
+def test_delayed_and_repeated_commands_are_refused_and_stops_are_not(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     def told() -> Any:
         return json.loads(listener.wait_for(has("multidrop/pump-1/told")).payload)
 

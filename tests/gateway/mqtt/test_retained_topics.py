@@ -37,7 +37,7 @@ def configuration(state_topic: object) -> bytes:
     return json.dumps({"state_topic": state_topic}).encode()
 
 
-def test_removed_drive_is_deleted_in_any_order_of_messages() -> None:
+def test_topics_of_a_removed_drive_are_deleted_in_any_message_order() -> None:
     messages = [
         ("works/old fan/available", b"online"),
         ("homeassistant/device/works-old_20_fan/config", configuration("works/old fan")),
@@ -94,11 +94,11 @@ def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
         ("homeassistant/sensor/works-old/config", configuration("works/old")),
     ],
 )
-def test_no_topic_but_those_of_drives_of_this_prefix_is_taken_back(topic: str, payload: bytes) -> None:
+def test_topics_other_than_those_of_own_removed_drives_are_kept(topic: str, payload: bytes) -> None:
     assert heard(GATEWAY, (topic, payload)) == []
 
 
-def test_a_broker_without_end_is_heard_for_a_while() -> None:
+def test_number_of_examined_retained_messages_is_limited() -> None:
     drives = [(f"works/{number}/available", b"online") for number in range(10 * MOST_KEPT)]
     assert len(heard(GATEWAY, *drives)) == 2 * MOST_KEPT
     left_behind = RetainedTopics("works", home_assistant=True)
@@ -170,7 +170,7 @@ commands = true
 
 
 @pytest.mark.long
-def test_a_start_that_a_broker_held_up_does_not_follow_a_stop(tmp_path: Path) -> None:
+def test_start_delayed_by_a_broker_until_after_a_stop_is_refused(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, served(tmp_path, SERVE.format(broker.address)) as gateway:
         listener = Listener(broker, "multidrop/#")

@@ -67,7 +67,7 @@ def test_a_host_can_decode_all_payloads(time_ms: int, said: list[Metric], seq: i
         ("string_value", "жар"),
     ],
 )
-def test_a_command_of_a_host_is_read(field: str, value: object) -> None:
+def test_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> None:
     messages = sparkplug_messages()
     sent = messages.Payload(timestamp=1234, seq=3)
     sent.metrics.add(name="setpoint", alias=9, datatype=10, timestamp=5, **{field: value})
@@ -79,7 +79,7 @@ def test_a_command_of_a_host_is_read(field: str, value: object) -> None:
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_a_command_or_refused(data: bytes) -> None:
+def test_arbitrary_bytes_are_decoded_or_raise_value_error(data: bytes) -> None:
     try:
         time_ms, found = read_command(data)
     except ValueError:
@@ -89,8 +89,8 @@ def test_any_bytes_are_a_command_or_refused(data: bytes) -> None:
 
 
 @given(st.data())
-def test_a_damaged_command_is_a_command_or_refused(data: st.DataObject) -> None:
+def test_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject) -> None:
     whole = bytearray(payload(5, [Metric(DataType.DOUBLE, 2.5, 5, "setpoint", 3)], 1))
     whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     del whole[data.draw(st.integers(0, len(whole))) :]
-    test_any_bytes_are_a_command_or_refused.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
+    test_arbitrary_bytes_are_decoded_or_raise_value_error.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]

@@ -41,7 +41,7 @@ def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Runn
     running.close()
 
 
-def test_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
+def test_node_sends_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     birth = host.values(host.wait_for("NBIRTH"))
     assert birth == {"bdSeq": 0, "Node Control/Rebirth": False}
@@ -67,7 +67,7 @@ def test_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
     assert (born["state"], born["fault"]) == ("fault", "перегрев")
 
 
-def test_fault_is_published_in_words_without_a_polled_number(tmp_path: Path) -> None:
+def test_fault_text_is_published_without_a_polled_fault_register(tmp_path: Path) -> None:
     """Its register called `fault` is a number without names."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
@@ -77,7 +77,7 @@ def test_fault_is_published_in_words_without_a_polled_number(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("family", [VfdEl, InvtCHE, DelixiModbus])
-def test_a_register_called_fault_leaves_the_fault_in_words(tmp_path: Path, family: type[Drive]) -> None:
+def test_register_named_fault_gets_its_own_metric(tmp_path: Path, family: type[Drive]) -> None:
     """The metric `fault` is a text for every family; the register's own metric has its own type."""
     known = inside(tmp_path, family(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
@@ -93,7 +93,7 @@ def test_a_register_called_fault_leaves_the_fault_in_words(tmp_path: Path, famil
     assert len({metric.alias for metric in birth.metrics}) == 3
 
 
-def test_a_birth_says_units(host: Host, node: tuple[Any, Running]) -> None:
+def test_birth_has_the_units_of_metrics(host: Host, node: tuple[Any, Running]) -> None:
     birth = host.wait_for("DBIRTH", "pump-1")
     units = {
         metric.name: dict(
@@ -123,7 +123,7 @@ def test_unchanged_values_are_not_sent(host: Host, node: tuple[Any, Running]) ->
 
 
 @pytest.mark.long
-def test_sequence_numbers_begin_again_after_255(host: Host, node: tuple[Any, Running]) -> None:
+def test_sequence_numbers_restart_at_0_after_255(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)
     for value in range(300):
@@ -134,7 +134,9 @@ def test_sequence_numbers_begin_again_after_255(host: Host, node: tuple[Any, Run
     assert host.seq < 256
 
 
-def test_rebirth(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+def test_rebirth_command_sends_all_births_again(
+    broker: Broker, host: Host, node: tuple[Any, Running]
+) -> None:
     host.wait_for("DBIRTH", FAN.name)
     command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
     assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 0
@@ -143,7 +145,7 @@ def test_rebirth(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
 
 
 @pytest.mark.slow
-def test_a_lost_connection_is_a_death_and_a_birth_of_the_next_number(
+def test_lost_connection_sends_a_death_and_a_birth_with_the_next_bdseq(
     host: Host, node: tuple[Any, Running]
 ) -> None:
     host.wait_for("DBIRTH", FAN.name)
@@ -153,7 +155,7 @@ def test_a_lost_connection_is_a_death_and_a_birth_of_the_next_number(
     host.wait_for("DBIRTH", "pump-1")
 
 
-def test_a_drive_that_died_again_before_its_messages_were_sent_is_dead(tmp_path: Path) -> None:
+def test_only_the_final_birth_or_death_of_pending_messages_is_sent(tmp_path: Path) -> None:
     known, sent, is_open = inside(tmp_path), [], [True]
 
     def send(message: Publication) -> int | None:
@@ -183,7 +185,7 @@ def test_a_drive_that_died_again_before_its_messages_were_sent_is_dead(tmp_path:
     assert [kind for kind, _ in sent[4:]] == ["DBIRTH", "DDATA"]
 
 
-def test_the_end_is_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
+def test_closing_sends_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     settings = MqttSettings(broker.address, sparkplug="works", node="line")
     running = Running(build(settings, inside(tmp_path)))
@@ -192,7 +194,9 @@ def test_the_end_is_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
 
 
-def test_commands_of_a_host(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+def test_fresh_write_and_any_stop_of_a_host_are_carried_out(
+    broker: Broker, host: Host, node: tuple[Any, Running]
+) -> None:
     known, _ = node
     host.wait_for("DBIRTH", "pump-1")
     alias = {name: number for number, name in host.aliases.items()}["setpoint"]

@@ -37,7 +37,7 @@ def strip(page: Any) -> list[str]:
     return [text.split(":")[0] for text in found]
 
 
-def test_the_gravest_alarm_comes_first(opened: Opener, alarmed: FakeGateway) -> None:
+def test_gravest_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> None:
     page = opened("#/faults")
     wanted = ["conveyor-2", "pump-4", "line hall-4", "labeller", "booster-1"]
     assert strip(page) == wanted
@@ -69,7 +69,7 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 
-def test_many_misses_warn_and_one_does_not(opened: Opener, gateway: FakeGateway) -> None:
+def test_many_misses_show_a_warning_and_one_does_not(opened: Opener, gateway: FakeGateway) -> None:
     gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
     gateway.changes = {"lines": {name: line | {"misses": 1} for name, line in lines().items()}}
     page = opened()
@@ -82,7 +82,7 @@ def test_many_misses_warn_and_one_does_not(opened: Opener, gateway: FakeGateway)
     page.locator(".linehead .warn").first.wait_for()
 
 
-def test_drive_at_rest_with_unknown_state_is_not_a_fault(opened: Opener, gateway: FakeGateway) -> None:
+def test_drive_at_rest_with_unknown_state_is_not_shown_as_fault(opened: Opener, gateway: FakeGateway) -> None:
     why = "the outputs are not programmed"
     gateway.drive_changes = {name: {"state": "unknown", "note": why} for name in ("pump-4", "pump-1")}
     page = opened("#/drives/pump-4")

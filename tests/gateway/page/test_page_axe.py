@@ -75,7 +75,7 @@ def test_axe_finds_no_violation(
 
 
 @pytest.mark.parametrize(("size", "theme"), [("desk", "dark"), ("phone", "light")])
-def test_axe_finds_nothing_in_rare_states(
+def test_axe_finds_no_violation_in_rare_states(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, few_drives: int
 ) -> None:
     """Dialogs that send, what a write became, nothing known of a drive, one drive, no gateway."""

@@ -14,7 +14,7 @@ MARKUP = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|createContextu
 CODE = r"\beval\(|new Function|javascript:|setAttribute\(\s*[\"']style|cssText"
 
 
-def test_no_text_can_become_markup_or_code() -> None:
+def test_page_scripts_use_no_function_that_makes_markup_or_code() -> None:
     for path in SCRIPTS:
         assert re.findall(f"{MARKUP}|{CODE}", path.read_text("utf-8")) == [], path.name
 
@@ -24,7 +24,7 @@ def test_the_page_has_no_inline_style_script_or_handler() -> None:
     assert re.findall(r"\sstyle\s*=|<style|\son\w+\s*=|<script(?![^>]*\ssrc=)|https?://|data:", html) == []
 
 
-def test_a_file_has_one_job_and_short_lines() -> None:
+def test_page_files_are_short_and_start_with_a_comment() -> None:
     for path in OURS:
         lines = path.read_text("utf-8").splitlines()
         assert len(lines) <= 250, path.name
@@ -32,7 +32,7 @@ def test_a_file_has_one_job_and_short_lines() -> None:
         assert path.suffix == ".html" or re.match(r"// [A-Z]|/\* [A-Z]", lines[0]), path.name
 
 
-def test_named_files_and_existing_files_are_the_same() -> None:
+def test_page_refers_to_all_its_files_and_to_no_others() -> None:
     text = "".join(path.read_text("utf-8") for path in OURS)
     named = set(re.findall(r'(?:from "\./|"page/)([\w./-]+)"', text))
     there = {path.relative_to(str(PAGE)).as_posix() for path in Path(str(PAGE)).rglob("*") if path.is_file()}
@@ -40,7 +40,7 @@ def test_named_files_and_existing_files_are_the_same() -> None:
     assert named - there == set()
 
 
-def test_the_vendored_plots_come_with_their_licence() -> None:
+def test_vendored_plot_library_has_its_licence() -> None:
     licence = Path(str(PAGE / "vendor" / "uPlot-LICENSE")).read_text("utf-8")
     script = Path(str(PAGE / "vendor" / "uPlot.iife.min.js")).read_text("utf-8")
     assert "The MIT License" in licence

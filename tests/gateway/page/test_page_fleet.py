@@ -22,7 +22,7 @@ def await_note(page: Any, text: str) -> None:
     until(page, f"document.querySelector('#fleet-age').textContent.includes({text!r})")
 
 
-def test_gateways_lines_and_moves(opened: Opener) -> None:
+def test_fleet_view_shows_gateways_lines_and_moves(opened: Opener) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     first, second, third = cells(page, "gateways")
@@ -44,7 +44,7 @@ def test_gateways_lines_and_moves(opened: Opener) -> None:
 
 
 @pytest.mark.parametrize("width", [768, 390])
-def test_its_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
+def test_fleet_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
     page = opened("#/fleet")
     page.set_viewport_size({"width": width, "height": 844})
     await_note(page, "Updated once a second")
@@ -56,7 +56,7 @@ def test_its_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
     until(page, f"{lag} === '\"Lag \"'")  # beside the value: the table's head is not there
 
 
-def test_old_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
+def test_old_fleet_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     gateway.fleet = {"age_s": 40.0, "trouble": "no connection to nats://a:4222"}
@@ -70,7 +70,9 @@ def test_old_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeG
     until_met(page, lambda: page.evaluate(style) == "normal")
 
 
-def test_fleet_grows_old_when_the_gateway_is_lost(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_values_are_marked_as_old_when_the_gateway_is_lost(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     gateway.kill()
@@ -78,14 +80,14 @@ def test_fleet_grows_old_when_the_gateway_is_lost(opened: Opener, gateway: FakeG
     assert "The gateway cannot be reached" in page.locator("#fleet-age").inner_text()
 
 
-def test_nothing_is_shown_before_the_first_answer(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_is_empty_before_the_first_answer(opened: Opener, gateway: FakeGateway) -> None:
     gateway.fleet = {"age_s": None, "trouble": "no such server", "gateways": {}, "lines": {}, "moves": []}
     page = opened("#/fleet")
     await_note(page, "The fleet has not been seen yet: no such server")
     assert cells(page, "gateways") == []
 
 
-def test_troubles_of_gateways_are_told(opened: Opener, gateway: FakeGateway) -> None:
+def test_problems_of_gateways_are_shown(opened: Opener, gateway: FakeGateway) -> None:
     spool = {"bytes": 5, "lost": 7, "behind": None, "lag_s": None, "trouble": "the disk is full"}
     says = {"state": "working", "margin_s": 2.0, "trouble": "", "spool": spool}
     says["troubles"] = {"hall-1": "cannot be opened"}
@@ -99,7 +101,7 @@ def test_troubles_of_gateways_are_told(opened: Opener, gateway: FakeGateway) -> 
     assert cells(page, "gateways")[0][5:9] == ["5 B", NONE, NONE, "7"]
 
 
-def test_of_very_many_lines_the_first_are_drawn(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_draws_a_limited_number_of_lines(opened: Opener, gateway: FakeGateway) -> None:
     line = {"port": "socket://h:1", "master": "gw-1", "since_ms": 0}
     gateway.fleet = {"lines": {f"l{n}": line | ({"master": None} if n == 999 else {}) for n in range(1000)}}
     page = opened("#/fleet")
@@ -119,14 +121,14 @@ def test_fleet_view_is_hidden_without_a_fleet(opened: Opener, gateway: FakeGatew
     assert page.evaluate("location.hash") == "#/log"
 
 
-def test_it_is_reached_by_its_key(opened: Opener) -> None:
+def test_fleet_view_opens_by_its_key(opened: Opener) -> None:
     page = opened()
     page.keyboard.press("6")
     await_note(page, "Updated once a second")
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
 
 
-def test_stop_all_names_its_drives(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_in_the_fleet_view_names_and_stops_this_plant(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     stopall = page.locator("#stopall")
     assert stopall.inner_text() == "Stop this plant"
@@ -156,7 +158,9 @@ def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway:
     assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
 
 
-def test_the_state_of_each_part_is_reported(opened: Opener, gateway: FakeGateway) -> None:
+def test_failed_stop_of_the_fleet_is_reported_besides_own_drives(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """The fleet's servers are gone: the gateway's own drives were stopped all the same."""
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"the fleet": {"done": False, "text": "the stop was NOT sent"}}

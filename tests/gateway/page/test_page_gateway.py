@@ -19,7 +19,7 @@ from watching import LIVE, STALE, cell, until, until_met
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 
-def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
+def test_page_shows_and_stops_a_polled_plant(page: Any, tmp_path: Path) -> None:
     with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)
@@ -43,7 +43,7 @@ def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
         page.locator("#log-list tbody tr").first.wait_for()
 
 
-def test_a_stop_asks_for_the_token_that_the_gateway_wants(page: Any, tmp_path: Path) -> None:
+def test_stop_asks_for_a_token_if_the_gateway_needs_one(page: Any, tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)
@@ -79,7 +79,7 @@ def test_a_killed_gateway_is_reported(page: Any) -> None:
         process.stdout.close()
 
 
-def test_a_viewer_at_8_kb_a_second_falls_no_further_behind(page: Any, tmp_path: Path) -> None:
+def test_delay_of_a_viewer_with_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
     """`python -m bench.questions.page` measures how old what it sees is."""
     with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")

@@ -21,7 +21,7 @@ OVER = "cell => cell.scrollWidth - cell.clientWidth"
 FRESH = "tr.drive td.frequency .value:not(.old)"
 
 
-def test_all_drives_are_live(opened: Opener, gateway: FakeGateway) -> None:
+def test_page_shows_live_values_of_all_drives(opened: Opener, gateway: FakeGateway) -> None:
     gateway.clocked = "pump-1"  # its frequency is the time
     page = opened()
     assert page.locator("tr.drive").count() == 31
@@ -50,7 +50,7 @@ def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> N
     assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 
-def test_a_hanging_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:
+def test_hanging_gateway_is_reported_and_values_become_old(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.is_silent = True
     until(page, STALE)
@@ -61,7 +61,7 @@ def test_a_hanging_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> 
     page.locator("#notice").wait_for(state="hidden")
 
 
-def test_a_viewer_s_clock_that_is_set_back_makes_no_old_value_live(
+def test_old_values_stay_old_when_the_viewers_clock_is_set_back(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer shows the gateway's clock
@@ -74,7 +74,7 @@ def test_a_viewer_s_clock_that_is_set_back_makes_no_old_value_live(
     until_met(page, lambda: float(age.inner_text().removesuffix(" s")) >= 2)
 
 
-def test_the_page_lives_again_when_the_gateway_does(opened: Opener, gateway: FakeGateway) -> None:
+def test_page_is_live_again_when_the_gateway_is_restarted(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
@@ -86,7 +86,7 @@ def test_the_page_lives_again_when_the_gateway_does(opened: Opener, gateway: Fak
         again.kill()
 
 
-def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -> None:
+def test_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -> None:
     gateway.stuck = {"pump-2": time.time()}
     page = opened("#/drives/pump-2")
     until(
@@ -147,7 +147,7 @@ def test_values_of_a_slow_line_stay_fresh_for_seconds(
     assert page.locator("tr.drive", has_text="pump-2").locator(".value.old").count() == 0
 
 
-def test_troubles_besides_the_lines_are_shown(opened: Opener, gateway: FakeGateway) -> None:
+def test_problems_other_than_lost_lines_are_shown(opened: Opener, gateway: FakeGateway) -> None:
     gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
     page = opened()
     notice = page.locator("#notice")
@@ -167,7 +167,7 @@ def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> Non
     )
 
 
-def test_unknown_values_are_a_dash_and_never_zero(opened: Opener, gateway: FakeGateway) -> None:
+def test_unknown_values_are_shown_as_a_dash_and_never_as_zero(opened: Opener, gateway: FakeGateway) -> None:
     rows = {"output_frequency": [None, 0, "no reply"], "output_current": [None, 0, "not asked yet"]}
     drive = {"state": "unknown", "fault": None, "seen": None, "ages_ms": [0], "values": rows}
     gateway.changes = {"drives": {"pump-1": drive}, "lines": {}}
@@ -200,7 +200,7 @@ def test_viewers_wrong_clock_is_shown_and_ages_stay_right(opened: Opener, off_s:
     until_met(page, lambda: page.locator(FRESH).count() == 30)
 
 
-def test_times_are_of_24_hours_in_utc_or_local_by_a_switch(opened: Opener) -> None:
+def test_times_have_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> None:
     page = opened(timezone_id="Asia/Kolkata", locale="en-US")
     clock = page.locator("#clock")
     assert re.fullmatch(r"\d\d:\d\d:\d\d UTC", clock.inner_text())
@@ -225,7 +225,7 @@ def test_times_are_of_24_hours_in_utc_or_local_by_a_switch(opened: Opener) -> No
 
 @pytest.mark.long
 @pytest.mark.usefixtures("few_drives")
-def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
+def test_nine_tabs_are_live_together(browser: Any, gateway: FakeGateway) -> None:
     """Browsers open six connections to a host for all tabs together."""
     gateway.clocked = "pump-1"
     context = browser.new_context(viewport={"width": 1440, "height": 900})
@@ -250,7 +250,7 @@ FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
   Object.defineProperty(window, name, { get() { throw new DOMException('forbidden', 'SecurityError'); } })"""
 
 
-def test_a_network_that_changes_while_the_page_is_loaded_costs_a_moment(opened: Opener) -> None:
+def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
     """Chromium breaks off all requests then. What a page keeps in its browser may be forbidden, too."""
     page, broken = opened(live=False), []
     page.add_init_script(FORBIDDEN)
@@ -317,7 +317,7 @@ TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) =
         ({"registers": {"output_current": {"unit": "%"}}}, [True, False]),
     ],
 )
-def test_no_value_of_another_drive_or_in_another_unit_goes_on_under_its_name(
+def test_values_are_dropped_if_a_name_means_another_drive_or_unit(
     opened: Opener, change: dict[str, Any], kept: list[bool]
 ) -> None:
     page = opened("#/drives/pump-1")

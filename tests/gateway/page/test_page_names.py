@@ -29,7 +29,7 @@ def elements(page: Any) -> list[int]:
 
 @pytest.mark.usefixtures("hostile")
 @pytest.mark.parametrize("size", SIZES)
-def test_hostile_names_are_text_and_break_no_layout(opened: Opener, size: str) -> None:
+def test_hostile_names_are_shown_as_text_and_break_no_layout(opened: Opener, size: str) -> None:
     page = opened(size=size)
     shown = page.locator("td.name").all_text_contents()
     assert set(HOSTILE.values()) <= set(shown)
@@ -42,7 +42,7 @@ def test_hostile_names_are_text_and_break_no_layout(opened: Opener, size: str) -
         assert page.evaluate(AT_ITS_PLACE)[0], view
 
 
-def test_a_hostile_name_is_stopped_by_its_name(opened: Opener, hostile: FakeGateway) -> None:
+def test_drive_with_a_hostile_name_is_stopped(opened: Opener, hostile: FakeGateway) -> None:
     page = opened()
     for name in HOSTILE.values():
         page.evaluate("name => { location.hash = `#/drives/${encodeURIComponent(name)}` }", name)

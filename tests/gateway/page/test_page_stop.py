@@ -42,7 +42,7 @@ def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener, size: s
     assert 0 <= y <= y + height <= SIZES[size][1]
 
 
-def test_stop_all_with_a_panel_open_on_a_phone(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_works_with_an_open_panel_on_a_phone(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/filler-2", "phone", has_touch=True)
     page.locator("#panel.open h2").wait_for()
     page.locator("#stopall").tap()
@@ -84,7 +84,7 @@ def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeG
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_the_key_is_taken_as_soon_as_the_dialog_is_closed(opened: Opener) -> None:
+def test_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> None:
     """The browser moves the focus out of a closed dialog only some milliseconds later."""
     page = opened()
     page.keyboard.press("Shift+S")
@@ -98,7 +98,7 @@ def test_the_key_is_taken_as_soon_as_the_dialog_is_closed(opened: Opener) -> Non
     }""")
 
 
-def test_stop_all_takes_every_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
     """The same holds for the second click of a double click: it only asks."""
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
@@ -114,7 +114,7 @@ def test_stop_all_takes_every_click_right_after_a_dialog_closed(opened: Opener, 
     assert gateway.posts == []
 
 
-def test_stop_all_is_at_hand_behind_a_dialog(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_works_while_a_dialog_is_open(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
     page.get_by_role("button", name="Change frequency setpoint").click()
@@ -125,7 +125,9 @@ def test_stop_all_is_at_hand_behind_a_dialog(opened: Opener, gateway: FakeGatewa
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_an_outcome_takes_no_question_away(opened: Opener, gateway: FakeGateway) -> None:
+def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """Stop all while the stop of one drive is under way: its outcome comes after the answer."""
     page = opened("#/drives/pump-1")
     gateway.is_held = threading.Event()
@@ -143,7 +145,7 @@ def test_an_outcome_takes_no_question_away(opened: Opener, gateway: FakeGateway)
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
-def test_a_stop_does_not_depend_on_other_parts(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_works_if_other_parts_of_the_page_fail_to_load(opened: Opener, gateway: FakeGateway) -> None:
     """A view that cannot be loaded takes all views with it, and no stop."""
     page = opened(live=False)
     page.route("**/page/table.js", lambda route: route.abort())
@@ -168,7 +170,7 @@ def test_the_page_works_without_its_plot_library(opened: Opener) -> None:
     assert page.locator(".registers tbody tr").count() == 12
 
 
-def test_drives_that_did_not_stop_are_named(opened: Opener, gateway: FakeGateway) -> None:
+def test_result_of_a_stop_names_drives_that_did_not_stop(opened: Opener, gateway: FakeGateway) -> None:
     gateway.outcomes = {"pump-3": {"done": False, "text": "no reply; it may still run"}}
     page = opened()
     page.locator("#stopall").click()
@@ -195,7 +197,7 @@ UNTAKEN = "The gateway has not accepted the stop"
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_frozen_gateway_is_shown_within_two_seconds(
+def test_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
     opened: Opener, gateway: FakeGateway, is_closed: bool
 ) -> None:
     gateway.is_held = threading.Event()
@@ -211,7 +213,7 @@ def test_frozen_gateway_is_shown_within_two_seconds(
     told(page, "All 31 drives are stopped")
 
 
-def test_a_stop_that_was_taken_is_waited_for(opened: Opener, gateway: FakeGateway) -> None:
+def test_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, gateway: FakeGateway) -> None:
     """Its drives may take half a minute."""
     gateway.is_held, gateway.confirms = threading.Event(), True
     page = opened()
@@ -225,7 +227,7 @@ def test_a_stop_that_was_taken_is_waited_for(opened: Opener, gateway: FakeGatewa
     told(page, "All 31 drives are stopped")
 
 
-def test_frozen_gateway_is_shown_after_a_stop_verb(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_verb_at_a_frozen_gateway_shows_a_warning(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     held: list[Any] = []
     page.route("**/api/act", lambda route: held.append(route))
@@ -236,7 +238,7 @@ def test_frozen_gateway_is_shown_after_a_stop_verb(opened: Opener, gateway: Fake
     page.locator("#outcomes li").wait_for()
 
 
-def test_typing_a_token_does_not_look_like_a_frozen_gateway(opened: Opener, gateway: FakeGateway) -> None:
+def test_time_for_typing_a_token_does_not_show_a_frozen_gateway(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -248,7 +250,9 @@ def test_typing_a_token_does_not_look_like_a_frozen_gateway(opened: Opener, gate
     told(page, "All 31 drives are stopped")
 
 
-def test_a_stop_without_the_right_asks_for_a_token_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_without_the_right_asks_for_a_token_and_is_then_sent(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -279,7 +283,7 @@ SECOND_CLICK = """([x, y]) => document.querySelector('#ask form button:not(.calm
         ("#/drives/pump-1", "button:text-is('start')", "start pump-1", []),
     ],
 )
-def test_a_second_click_signs_in_for_a_stop_alone(
+def test_double_click_confirms_a_sign_in_only_for_a_stop(
     opened: Opener, gateway: FakeGateway, view: str, asks: str, confirms: str, sent: list[Any]
 ) -> None:
     """A keeper of passwords fills the token in at once."""
@@ -297,7 +301,7 @@ def test_a_second_click_signs_in_for_a_stop_alone(
     assert gateway.posts == sent
 
 
-def test_a_stop_that_is_refused_was_not_sent(opened: Opener, gateway: FakeGateway) -> None:
+def test_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -308,7 +312,7 @@ def test_a_stop_that_is_refused_was_not_sent(opened: Opener, gateway: FakeGatewa
 
 
 @pytest.mark.long
-def test_a_stop_waits_for_no_other_tab(
+def test_stop_is_sent_although_other_tabs_hold_all_connections(
     browser: Any, gateway: FakeGateway, few_drives: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nine tabs hold all six connections of the browser, because no frame comes."""
@@ -389,7 +393,7 @@ PRESSED = """([key, code, shiftKey]) => {
 }"""
 
 
-def test_the_keys_that_stop_are_the_same_on_every_layout(opened: Opener) -> None:
+def test_stop_keys_work_on_every_keyboard_layout(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     assert {key: page.evaluate(PRESSED, key) for key in KEYS} == {
         key: [asks, False] for key, asks in KEYS.items()
@@ -407,7 +411,7 @@ def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> 
 
 
 @pytest.mark.parametrize("verb", ["stop", "emergency stop"])
-def test_the_page_waits_for_longer_than_a_stop_is_repeated(
+def test_page_waits_longer_than_the_gateway_repeats_a_stop(
     opened: Opener, gateway: FakeGateway, verb: str
 ) -> None:
     """Otherwise, with one dead drive, it would never report which drives have stopped."""

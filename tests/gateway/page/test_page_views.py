@@ -75,7 +75,7 @@ def test_lines_of_a_large_plant_are_folded_except_for_problems(opened: Opener, g
     until_met(page, lambda: shown.count() == 11)
 
 
-def test_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
+def test_frequency_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
     """A drive that may be set to 320 Hz has no shorter bar than another one at the same frequency."""
     gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}
     rows = {"output_frequency": [41.0, 0], "frequency_setpoint": [48.0, 0]}
@@ -157,7 +157,7 @@ def test_a_raw_count_stays_within_its_column(
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (768, 1024), (390, 844)])
-def test_no_word_of_a_state_is_cut(opened: Opener, size: tuple[int, int]) -> None:
+def test_words_of_states_are_not_cut_off(opened: Opener, size: tuple[int, int]) -> None:
     page = opened()
     page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
     words = page.locator("#table .word", has_text="overcurrent in acceleration")
@@ -185,7 +185,7 @@ def test_the_reason_of_a_lost_port_is_shown_completely(
     assert head.evaluate("head => head.scrollWidth - head.clientWidth") <= 0
 
 
-def test_problems_have_shape_and_word_besides_colour(opened: Opener) -> None:
+def test_problems_are_marked_by_shape_and_word_besides_colour(opened: Opener) -> None:
     page = opened()
     state = cell(page, "conveyor-2", "state")
     assert state.inner_text().strip() == "overcurrent in acceleration"
@@ -213,7 +213,7 @@ def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None
     assert page.locator("#plots canvas").count() == 3
 
 
-def test_trends_zoom_by_dragging_and_go_back(opened: Opener) -> None:
+def test_trends_zoom_in_by_dragging_and_back_out(opened: Opener) -> None:
     page = opened("#/lines")
     questions = asked(page)
     page.evaluate("location.hash = '#/trends?drive=pump-2'")
@@ -257,7 +257,7 @@ def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> No
     assert page.locator("#span").inner_text().count(":45:00") == 1
 
 
-def test_markers_and_cursor_show_each_drives_newest_value_while_it_holds(
+def test_markers_and_cursor_show_each_drives_newest_current_value(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     """Zoomed in, each drive was read at instants of its own."""
@@ -316,7 +316,7 @@ def test_dates_are_chosen_and_an_end_before_the_begin_is_refused(opened: Opener)
     until_met(page, lambda: page.locator("#span").inner_text() == span)
 
 
-def test_phone_selects_and_distinguishes_several_drives(opened: Opener) -> None:
+def test_phone_selects_several_drives_and_shows_their_lines_apart(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000", size="phone")
     until(page, DRAWN)
     heads = page.locator("#trend-plots .plothead output")
@@ -337,7 +337,7 @@ def test_phone_selects_and_distinguishes_several_drives(opened: Opener) -> None:
     assert plot.bounding_box() == before  # which the plot does not flee from
 
 
-def test_no_more_drives_are_chosen_than_there_are_lines_to_tell_apart(opened: Opener) -> None:
+def test_selection_is_limited_to_the_number_of_different_line_styles(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-1&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     boxes = page.locator("#picker [aria-label=Drives] input")
@@ -426,7 +426,7 @@ DOTS = """async values => {
 }"""
 
 
-def test_a_value_between_gaps_is_drawn(opened: Opener) -> None:
+def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
     """Three values of a register that is read each second, in a plot with ten points a second."""
     page = opened()
     nothing = [None] * 9
@@ -434,7 +434,7 @@ def test_a_value_between_gaps_is_drawn(opened: Opener) -> None:
     assert page.evaluate(DOTS, [20, *nothing, 21, *nothing, 20]) > 3 * 9  # pixels
 
 
-def test_a_register_that_is_asked_seldom_has_no_gaps_between_its_answers(opened: Opener) -> None:
+def test_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -> None:
     """Answers come each 0.6 s, one is missed, and none is requested for 3 s. Values hold for a second."""
     answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # at ms
     times = list(range(0, 4801, 300))
@@ -455,7 +455,7 @@ def test_a_register_that_is_asked_seldom_has_no_gaps_between_its_answers(opened:
     assert drawn["mean"] == drawn["least"] == [20.0, 21.0, None, 22.0, *(None for _ in gap), 23.0]
 
 
-def test_numbers_of_an_axis_have_a_point_and_no_groups(opened: Opener) -> None:
+def test_axis_numbers_have_a_decimal_point_and_no_digit_groups(opened: Opener) -> None:
     """1,000 is one thousand to some, and one to others."""
     page = opened(locale="de-DE")
     told = page.evaluate("""async () => {
@@ -471,7 +471,7 @@ def test_numbers_of_an_axis_have_a_point_and_no_groups(opened: Opener) -> None:
     assert "0.5" in told[1]
 
 
-def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
+def test_page_without_history_shows_a_message_and_works(opened: Opener, gateway: FakeGateway) -> None:
     gateway.has_history = False
     page = opened("#/trends")
     page.locator("#trend-note").get_by_text("No history is kept").wait_for()
@@ -483,7 +483,7 @@ def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: F
     until(page, "document.querySelector('#past-note').hidden")
 
 
-def test_faults_that_last_and_that_ended(opened: Opener) -> None:
+def test_active_and_ended_faults_are_listed_separately(opened: Opener) -> None:
     page = opened("#/faults")
     page.get_by_text("Active: 3").wait_for()
     lasting = page.locator("#fault-list section").nth(0).locator("tbody tr")
@@ -502,7 +502,7 @@ def test_faults_that_last_and_that_ended(opened: Opener) -> None:
     page.locator("#lane .fault", has_text="overheating").wait_for()
 
 
-def test_lines_show_wire_misses_by_reason_and_delays(opened: Opener) -> None:
+def test_lines_view_shows_utilisation_misses_by_reason_and_delays(opened: Opener) -> None:
     page = opened("#/lines")
     line = page.locator("article", has=page.get_by_role("heading", name="hall-2"))
     line.wait_for()

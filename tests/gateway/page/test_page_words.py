@@ -35,7 +35,7 @@ TELL_NUMBERS = """async numbers => {
 }"""
 
 
-def test_numbers_have_their_digits_and_floats_their_own(opened: Opener) -> None:
+def test_numbers_have_their_registers_digits_and_floats_all_they_need(opened: Opener) -> None:
     single = struct.unpack(">f", struct.pack(">f", 0.1))[0]  # as the core delivers it: 0.10000000149011612
     told = {
         (12.5, 1): "12.5",
@@ -49,7 +49,7 @@ def test_numbers_have_their_digits_and_floats_their_own(opened: Opener) -> None:
     assert opened().evaluate(TELL_NUMBERS, [list(each) for each in told]) == list(told.values())
 
 
-def test_plots_and_markers_tell_floats_too(opened: Opener, gateway: FakeGateway) -> None:
+def test_plots_and_markers_show_floats(opened: Opener, gateway: FakeGateway) -> None:
     line = fake_plant.plant({})["lines"][0]
     floats = [r | {"digits": None, "step": None} for r in line["drives"][0]["registers"]]
     gateway.plant_changes = {
@@ -63,7 +63,7 @@ def test_plots_and_markers_tell_floats_too(opened: Opener, gateway: FakeGateway)
     until_met(page, lambda: re.fullmatch(fraction, cell.inner_text()) is not None)
 
 
-def test_lost_gateway_is_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
+def test_lost_gateway_is_reported_in_one_sentence(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     with page.expect_event("requestfailed", lambda request: request.url.endswith("/api/plant")):
         gateway.kill()
@@ -72,7 +72,7 @@ def test_lost_gateway_is_one_sentence(opened: Opener, gateway: FakeGateway) -> N
     assert re.fullmatch(told, page.locator("#notice").inner_text())
 
 
-def test_figures_of_a_dead_gateway_look_old_and_nothing_is_said_of_misses(
+def test_figures_of_a_dead_gateway_look_old_and_misses_are_hidden(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     page = opened()
@@ -87,7 +87,7 @@ def test_figures_of_a_dead_gateway_look_old_and_nothing_is_said_of_misses(
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
-def test_faults_that_come_before_the_first_frame_last_for_as_long_as_they_do(
+def test_durations_of_faults_fetched_before_the_first_frame_are_right(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.is_silent = True
@@ -111,7 +111,7 @@ def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: Fake
     assert told[0] == told[1]
 
 
-def test_one_drive_is_one(opened: Opener, gateway: FakeGateway) -> None:
+def test_single_drive_is_named_in_the_singular(opened: Opener, gateway: FakeGateway) -> None:
     first = fake_plant.plant({})["lines"][0]
     gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
     gateway.changes = {"alarms": []}
@@ -129,7 +129,7 @@ def test_one_drive_is_one(opened: Opener, gateway: FakeGateway) -> None:
     page.get_by_text(re.compile("· 1 drive$")).wait_for()
 
 
-def test_a_fault_that_finds_no_room_colours_the_strip(opened: Opener, gateway: FakeGateway) -> None:
+def test_fault_that_does_not_fit_still_colours_the_strip(opened: Opener, gateway: FakeGateway) -> None:
     now = fake_plant.ms(time.time())
     silent, fault = ({"text": "no reply", "kind": "silent"}, {"text": "undervoltage", "kind": "fault"})
     kinds = zip(("labeller", "screw", "booster-1"), (silent, silent, fault), strict=True)
@@ -144,7 +144,7 @@ def test_a_fault_that_finds_no_room_colours_the_strip(opened: Opener, gateway: F
     assert page.locator("#strip.bad").count() == 1
 
 
-def test_the_hour_ends_with_its_newest_minute(opened: Opener, gateway: FakeGateway) -> None:
+def test_newest_minute_is_at_the_right_end_of_the_hour(opened: Opener, gateway: FakeGateway) -> None:
     """Two minutes after the start there are two bars at the right of the hour, not at its left."""
     newest = 1_764_115_200_000  # 00:00 UTC
     minutes = [
@@ -179,17 +179,17 @@ def test_names_that_differ_at_their_ends_look_different(
         ]
 
 
-def test_a_time_at_the_end_of_a_plot_is_whole(opened: Opener) -> None:
+def test_time_label_at_the_end_of_a_plot_is_not_cut_off(opened: Opener) -> None:
     assert opened().evaluate(EDGE) is False
 
 
-def test_an_old_register_has_its_age_like_a_new_one(opened: Opener) -> None:
+def test_old_register_shows_its_age(opened: Opener) -> None:
     page = opened()
     row = page.locator("#panel tr", has_text="acceleration time")
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_viewed_registers_grow_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
+def test_values_of_viewed_registers_become_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
     """It may be read once a minute, and stays current only while its drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
@@ -206,7 +206,7 @@ def test_viewed_registers_grow_old_without_answers(opened: Opener, gateway: Fake
     page.locator("#panel .value.old", has_text="4012").wait_for()
 
 
-def test_a_fault_that_is_cut_in_its_lane_shows_that_it_is(opened: Opener) -> None:
+def test_fault_text_that_is_cut_off_in_its_lane_ends_with_an_ellipsis(opened: Opener) -> None:
     page: Any = opened("#/trends?drive=pump-1")
     bar = page.locator(".lane .fault")
     bar.wait_for()

@@ -68,7 +68,7 @@ def test_write_with_a_lost_answer_is_unknown_and_not_repeated(opened: Opener, ga
 CUT_SHORT = '{"done": tr'
 
 
-def test_truncated_answer_does_not_count(opened: Opener, gateway: FakeGateway) -> None:
+def test_write_with_a_truncated_answer_is_unknown(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.fulfill(status=200, body=CUT_SHORT))
     page.route("**/api/audit*", lambda route: route.fulfill(status=200, body=CUT_SHORT))
@@ -80,7 +80,9 @@ def test_truncated_answer_does_not_count(opened: Opener, gateway: FakeGateway) -
     page.locator("#writes").get_by_text("The gateway's answer was cut off.").wait_for()
 
 
-def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: FakeGateway) -> None:
+def test_start_shows_a_warning_and_enter_alone_does_not_confirm_it(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     assert page.locator("#ask-title").inner_text() == "start: pump-1?"
@@ -93,7 +95,7 @@ def test_a_start_warns_and_enter_alone_sends_nothing(opened: Opener, gateway: Fa
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_enter_alone_writes_no_value_that_was_read(opened: Opener, gateway: FakeGateway) -> None:
+def test_enter_alone_does_not_write_the_present_value_back(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     page.keyboard.press("Enter")
@@ -101,7 +103,7 @@ def test_enter_alone_writes_no_value_that_was_read(opened: Opener, gateway: Fake
     assert gateway.posts == []
 
 
-def test_a_key_that_is_held_down_is_one_press(opened: Opener, gateway: FakeGateway) -> None:
+def test_held_key_counts_as_one_press(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     change = page.get_by_role("button", name="Change frequency setpoint")
     change.click()
@@ -188,7 +190,7 @@ def press(page: Any, key: str, made_s: float, text: str = "") -> None:
 
 
 @pytest.mark.parametrize(("key", "text"), [("Enter", "\r"), (" ", " ")], ids=["Enter", "Space"])
-def test_keys_of_before_a_dialog_shows_do_not_confirm_it(
+def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
     opened: Opener, gateway: FakeGateway, key: str, text: str
 ) -> None:
     """On a slow page Tab goes from its Cancel to its other button, before anybody has seen them."""
@@ -210,9 +212,7 @@ def test_keys_of_before_a_dialog_shows_do_not_confirm_it(
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_a_command_names_the_frame_that_was_seen_at_its_confirmation(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_command_names_the_newest_frame_at_its_confirmation(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     newest = "import('/page/store.js').then(m => m.store.frame.n)"
     page.get_by_role("button", name="start").click()
@@ -224,7 +224,7 @@ def test_a_command_names_the_frame_that_was_seen_at_its_confirmation(
     assert before <= gateway.seen[0] <= page.evaluate(newest)
 
 
-def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     gateway.stops = {"pump-1": 1}
@@ -239,7 +239,7 @@ def test_a_stop_that_is_called_behind_the_dialog_ends_a_start(opened: Opener, ga
     until_met(page, lambda: gateway.posts)
 
 
-def test_reload_behind_the_dialog_cancels_a_start(opened: Opener, gateway: FakeGateway) -> None:
+def test_reload_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway: FakeGateway) -> None:
     """Under the name that was confirmed may be another drive now."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
@@ -283,7 +283,7 @@ def test_forbidden_commands_are_not_offered(opened: Opener) -> None:
     assert page.get_by_role("button", name="Stop pump-2").is_visible()
 
 
-def test_set_frequency_shows_value_and_span_and_refuses_before_sending(
+def test_set_frequency_shows_value_and_range_and_checks_the_input(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.maximum_hz = 45.0

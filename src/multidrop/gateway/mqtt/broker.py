@@ -217,7 +217,7 @@ class Broker:
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
-        """Let the speaker publish. If that fails, publish the speaker as offline, but keep receiving commands.
+        """Let the speaker publish. If that fails, publish it as offline, but keep receiving commands.
 
         Without that message, the retained values of its drives would look fresh.
         """
