@@ -1,4 +1,4 @@
-"""When a drive's commands ended, and their outcomes, whichever interface they came through."""
+"""The time when a drive's latest command ended, and outcomes of commands, for all interfaces."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
 
 
 class UnopenedLines:
-    """Two drives of a plant whose line no poller has: each command fails, and ends."""
+    """A plant of two drives whose line is not polled: each command fails, and so ends."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), ("hall", InvtCHE(2, name="fan")), polled=False)
 
@@ -38,7 +38,7 @@ class UnopenedLines:
 
     @property
     def plant_coming(self) -> None:
-        return None  # no reload
+        return None  # no reload is in progress
 
 
 @table(
@@ -89,7 +89,7 @@ def test_result_names_a_drive_that_was_removed_from_its_line(
 )
 @pytest.mark.parametrize("register", ["setpoint", "control"])
 def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """JSON has whole numbers that no float holds."""
+    """JSON allows integers that are too large for a float."""
     line, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
     lines = UnopenedLines()
     lines.plant = plant_of(("hall", mill))
@@ -114,7 +114,7 @@ async def test_refused_command_has_no_end_time() -> None:
 def test_other_unicode_spelling_of_a_drive_works_for_stops_only(
     verb: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A u with two dots is one character (U+00FC) or two (U+0075 U+0308), by the keyboard."""
+    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     line, known, _ = one(monkeypatch, InvtCHE(1, name=fan, maximum_frequency=50))
     lines = UnopenedLines()

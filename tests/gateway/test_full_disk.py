@@ -1,4 +1,4 @@
-"""A full disk, on its own file system: polling and stops continue, and it is reported until there is room."""
+"""A full disk on its own file system: polling and stops continue, and /health reports the disk."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FULL = "No space left on device"
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 1 MB beside the plant file."""
+    """Mount a file system of 1 MB beside the plant file."""
     path = tmp_path / "disk"
     path.mkdir()
     if os.geteuid() != 0 or shutil.which("mount") is None:
@@ -42,7 +42,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(disk: Path) -> Path:
-    """Take all the room that is left, and return the file that has it."""
+    """Fill the remaining space with a file, and return its path."""
     path = disk / "filler"
     with path.open("wb", buffering=0) as file:
         while has_room(file):
@@ -61,7 +61,7 @@ def has_room(file: BinaryIO) -> bool:
 
 
 def health(gateway: Served) -> tuple[str, str, str]:
-    """Return the status in /health, and its entries about history and audit log."""
+    """Return from /health the status and the entries about history and audit log."""
     found = gateway.get("/health").json
     return found["status"], found["parts"]["history"], found["audit"]
 
@@ -91,7 +91,7 @@ def test_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_
         until(lambda: FULL in health(gateway)[1])
         noted = len(gateway.get("/api/audit").json["entries"])
         sent = [sim.counters.requests for sim in gateway.sims.values()]
-        while FULL not in health(gateway)[2]:  # the log's last block has some room
+        while FULL not in health(gateway)[2]:  # the log's last block still has some space
             stop(gateway)
             assert len(gateway.get("/api/audit").json["entries"]) < noted + 40
         status, recorded, audit = health(gateway)

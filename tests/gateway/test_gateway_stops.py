@@ -1,4 +1,4 @@
-"""Stops through the gateway: sent and verified, whatever else is broken or busy."""
+"""Stops through the gateway are sent and verified, even if other functions are broken or busy."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _broken_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def start(gateway: Served, *drives: str) -> None:
-    """Start motors by the gateway's own way."""
+    """Start motors through the gateway's Commands."""
     writer = {"authorization": gateway.bearer(Right.WRITE)}
     for drive in drives:
         value = {"drive": drive, "register": "setpoint", "value": 50.0}
@@ -59,7 +59,7 @@ def start(gateway: Served, *drives: str) -> None:
 
 
 def calling(gateway: Served) -> socket.socket:
-    """A connection to a gateway, to be closed."""
+    """Return an HTTP connection to a gateway; a `with` block closes it."""
     return socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE)
 
 
@@ -77,7 +77,7 @@ def stands(gateway: Served, drive: str) -> bool:
 def test_head_of_the_answer_confirms_an_unfinished_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
-    """A page that gets no head knows that the gateway has taken no stop."""
+    """A page that gets no head can tell that the gateway has not accepted the stop."""
     held = threading.Event()
 
     async def slow(*args: object, **options: object) -> object:
@@ -89,7 +89,7 @@ def test_head_of_the_answer_confirms_an_unfinished_stop(
         monkeypatch.setattr(gateway.gateway.commands, "act" if path == "/api/act" else "stop", slow)
         connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
         connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
-        response = connection.getresponse()  # its head
+        response = connection.getresponse()  # returns after the head
         assert (response.status, held.is_set()) == (200, False)
         assert response.getheader("x-accel-buffering") == "no"
         held.set()
@@ -207,7 +207,7 @@ def test_stop_accepts_a_single_name(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Path) -> None:
-    """Half a character, a terminal's escape, and another drive's name in capitals."""
+    """The unknown names: a lone surrogate, a terminal's escape sequence, a drive's name in capitals."""
     names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")
@@ -220,7 +220,7 @@ def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Pat
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 @pytest.mark.parametrize("options", [None, [], "now", {"direction": "forward"}])
 def test_wrong_options_do_not_prevent_a_stop_verb(tmp_path: Path, verb: str, options: object) -> None:
-    """Programs write null if they have no options."""
+    """Some programs send null instead of an empty object."""
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")
         body = {"drive": "pump-1", "verb": verb, "options": options}
@@ -292,14 +292,14 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
             name, method = broken.split(".")
             monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
         until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
-        gateway.gateway.frames._has_news = True  # or else the frame of the last command is the newest
+        gateway.gateway.frames._has_news = True  # otherwise no new frame would be made
         assert gateway.get("/api/frame").status == 500
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 
 
 @pytest.mark.slow
 def test_stop_does_not_wait_for_hanging_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Writes that hang fill all that is kept for them, and further ones are refused; stops go on."""
+    """MOST_WRITES writes hang, and further writes are refused; stops are still sent."""
     held, entered = threading.Event(), []
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1", "pump-2")
@@ -337,7 +337,7 @@ def test_stop_does_not_wait_for_hanging_writes(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 def test_commands_from_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> None:
-    """A command whose thread starts after the call of the stop notices the stop."""
+    """A command whose thread starts only after a stop was called is refused because of the stop."""
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -402,7 +402,7 @@ def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(tmp_path: Path) 
 
 @pytest.mark.long
 def test_many_stops_of_a_silent_drive_delay_no_other(tmp_path: Path) -> None:
-    """Formerly each was repeated for 30 s, and the stop of another drive waited for them."""
+    """Otherwise each stop is repeated for 30 s, and the stop of another drive waits for all of them."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(40) as callers:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -410,7 +410,7 @@ def test_many_stops_of_a_silent_drive_delay_no_other(tmp_path: Path) -> None:
         until(lambda: gateway.gateway.commands.stops["pump-2"] == 40)
         begun = monotonic()
         assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
-        assert monotonic() - begun < 12.0  # s, of which 3 are its ramp: it was 20
+        assert monotonic() - begun < 12.0  # s, including a ramp of 3 s
         gateway.sims["pump-2"].deaf_until = 0.0
         assert [call.result().json["pump-2"]["done"] for call in calls] == [True] * 40
         assert stands(gateway, "pump-2")
@@ -440,7 +440,7 @@ def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.long
 def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None:
-    """The first stop is still repeated for the silent drive, but has ended for the restarted one."""
+    """The first stop is still repeated to the silent drive, but has ended for the restarted drive."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -448,7 +448,7 @@ def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None
         motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
         bus = gateway.gateway.bus("hall")
         until(lambda: not motor.goal and set(bus.stops_under_way()) == {"pump-2"})
-        motor.run()  # from its own panel
+        motor.run()  # started at the drive's own panel
         until(lambda: motor.goal)
         told = gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]
         assert told["done"]

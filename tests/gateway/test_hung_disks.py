@@ -1,4 +1,4 @@
-"""Hung file systems: polling and stops continue, /health reports them, and the gateway ends."""
+"""Hung file systems: polling and stops continue, /health reports the problem, and the gateway can end."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Fifos:
-    """Files that hang when they are opened, until they are released."""
+    """Named pipes in place of files: opening them hangs until the test releases them."""
 
     def __init__(self) -> None:
         self._made: list[Path] = []
@@ -122,7 +122,7 @@ def test_history_whose_disk_hangs_during_a_reload_starts_later(tmp_path: Path, f
         assert health(gateway)["parts"] == {}
         fifos.let_go()
         until(lambda: health(gateway)["status"] == "ok")
-        assert gateway.gateway.feeds == {}  # it is not needed now
+        assert gateway.gateway.feeds == {}  # the reloaded plant file has no history
 
 
 def test_history_that_fails_after_its_disk_answers_is_reported_as_dead(tmp_path: Path, fifos: Fifos) -> None:
@@ -146,7 +146,7 @@ def test_hanging_history_query_is_answered_with_an_error_and_reported(
         monkeypatch.setattr(historian, "QUERY_S", SHORT_S)
         monkeypatch.setattr(History, "buckets", lambda *given: go_on.wait(PATIENCE))
         until(lambda: health(gateway)["status"] == "ok")
-        for _ in range(3):  # which are more than hang at a time
+        for _ in range(3):  # more than MOST_QUERIES
             answer = gateway.get("/api/history?series=pump-1.status&from=0&to=1")
             assert (answer.status, answer.json["error"][:16]) == (503, "history queries:")
         assert list(health(gateway)["hung"]) == ["history queries"]
@@ -300,7 +300,7 @@ def test_hung_page_files_end_their_requests_and_delay_no_others(
     monkeypatch.setattr(page_files, "READ_S", SHORT_S)
     with served(tmp_path, SERVE) as gateway:
         monkeypatch.setattr(Path, "read_bytes", read_bytes)
-        for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):  # more than hang at a time
+        for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):  # above the limit
             answer = gateway.get(path)
             assert (answer.status, answer.json["error"][:11]) == (503, "page files:")
         assert list(health(gateway)["hung"]) == ["page files"]
@@ -310,7 +310,7 @@ def test_hung_page_files_end_their_requests_and_delay_no_others(
         assert gateway.get("/page/app.js").status == 200
 
 
-# ---- the end ----
+# ---- shutdown ----
 
 
 @pytest.mark.long
@@ -327,7 +327,7 @@ def test_sigterm_ends_a_gateway_whose_disks_hang(tmp_path: Path, fifos: Fifos) -
 
 @pytest.mark.long
 def test_sigterm_ends_a_gateway_that_waits_for_a_thread(tmp_path: Path) -> None:
-    """Whatever keeps the interpreter from its end: here a thread of a library."""
+    """A library's thread would keep the interpreter running."""
     script = tmp_path / "hangs.py"
     script.write_text(HANGING)
     with simulated_plant(tmp_path, SERVE) as path:

@@ -1,4 +1,4 @@
-"""A gateway interrupted at its start or end ends, and sends no frame afterwards."""
+"""A gateway that is interrupted during its start or shutdown ends, and sends no Modbus frame afterwards."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
-# Garbage collection finalizes objects of an earlier interruption, and may be interrupted too.
+# Garbage collection of objects from an earlier interruption may also be interrupted.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
 class CtrlC(KeyboardInterrupt):
-    """Raised by the test."""
+    """A KeyboardInterrupt that the test raises."""
 
 
 class Counting(EncodedDrive):
-    """A drive that counts the requests that came."""
+    """A simulated drive that counts the requests it receives."""
 
     requests = 0
 
@@ -45,7 +45,7 @@ class Counting(EncodedDrive):
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Iterator[Counting]:
-    """A simulated drive, and a plant.toml with its line."""
+    """Yield a simulated drive, and write a plant.toml with its line."""
     drive = Counting(InvtCHE(1, baudrate=38400))
     with Simulator([Wire([drive], unpaced=True)]) as simulator:
         (tmp_path / "plant.toml").write_text(
@@ -58,7 +58,7 @@ def drive(tmp_path: Path) -> Iterator[Counting]:
 def falls_silent(drive: Counting) -> None:
     def has_ended() -> bool:
         before = drive.requests
-        sleep(0.02)  # a poll takes a millisecond
+        sleep(0.02)  # much longer than a poll, which takes a millisecond
         return drive.requests == before
 
     until(has_ended, 10.0)
@@ -66,7 +66,7 @@ def falls_silent(drive: Counting) -> None:
 
 @pytest.mark.parametrize("step", [1009, pytest.param(53, marks=pytest.mark.slow)])
 def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
-    """KeyboardInterrupt before every so many bytecodes of the main thread, from its making to its end."""
+    """Raise KeyboardInterrupt before every n-th bytecode of the main thread, from start to end."""
     plant = Plant.load(tmp_path / "plant.toml")
 
     def live() -> None:
@@ -78,7 +78,7 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
             live()
         falls_silent(drive)
         gc.collect()
-        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # the port is free
+        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # possible only if the port is free
             bus.attach(InvtCHE, 1).read(InvtCHE.registers["output_current"])
         return bool(found)
 
@@ -87,7 +87,7 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
 
 # ---- signals ----
 
-# Python reports an interruption of its import system's own callbacks, and continues.
+# If an interruption hits a callback of its import system, Python only prints it and continues.
 IN_AN_IMPORT = re.compile(
     r"Exception ignored in: .*\nTraceback \(most recent call last\):\n  File \"<frozen importlib.*\n"
     r"KeyboardInterrupt: *\n"
@@ -107,7 +107,7 @@ sys.exit(main(["serve", {path!r}]))
 
 
 def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
-    """`multidrop serve`, which gets a signal after each of these delays (s), counted from the one before."""
+    """Run `multidrop serve`, and send it a signal after each of these delays in s, one after the other."""
     code = SIGNALLED.format(delays=list(delays), number=int(number), path=str(path))
     return BoundProcess(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -118,7 +118,7 @@ def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("again", [None, 0.0, 0.02, 0.2], ids=repr)
 def test_a_signal_at_any_moment_ends_the_command(tmp_path: Path, number: int, again: float | None) -> None:
-    """Send it at the start, while serving and at the end; a second one ends it at once. No motor is moved."""
+    """Signals are sent during start, service and shutdown; a second signal ends the command immediately."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\naudit = "audit.jsonl"\n[serve.may]\nstop = "anyone"\n'
     with simulated_plant(tmp_path, serve) as path:
         with started(path, number) as process:
@@ -128,7 +128,7 @@ def test_a_signal_at_any_moment_ends_the_command(tmp_path: Path, number: int, ag
             usual_s = monotonic() - begun
             process.send_signal(number)
             process.communicate(timeout=PATIENCE)
-        for moment in range(1, 21):  # at 0 this script itself would be interrupted
+        for moment in range(1, 21):  # a delay of 0 would interrupt the script before the command
             delays = [usual_s * moment / 15] + ([] if again is None else [again])
             with started(path, number, *delays) as process:
                 _, errors = process.communicate(timeout=PATIENCE)

@@ -1,4 +1,4 @@
-"""A port that is absent when the gateway starts: its line is lost, and the others are polled."""
+"""If a port is missing when the gateway starts, its line is lost, and the other lines are polled."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_reason_of_a_port_lost_later_is_reported(tmp_path: Path) -> None:
 
 def test_an_invalid_port_leaves_no_socket_open(tmp_path: Path) -> None:
     plant = written(tmp_path, SERVE)
-    plant = replace(plant, lines=(plant.lines[0].at("nosuch://port"),))  # no plant file may name it
+    plant = replace(plant, lines=(plant.lines[0].at("nosuch://port"),))  # not allowed in a plant file
     gateway = Gateway(plant, read_settings(plant, {}))
     with pytest.raises(ValueError, match="nosuch"), running(gateway):
         pass

@@ -1,4 +1,4 @@
-"""OpenMetrics, judged by prometheus_client's own parser."""
+"""Metrics in the OpenMetrics format, checked by prometheus_client's parser and by Prometheus."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def states(gateway: Served) -> dict[str, str]:
 
 @pytest.mark.long
 def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
-    odd = 'fan, the \\"old\\" one'  # as TOML has it
+    odd = 'fan, the \\"old\\" one'  # escaped as in TOML
     with served(tmp_path, "", "pump-1", odd) as gateway:
         until(lambda: len(values(gateway)) == 8)
         found = families(gateway)
@@ -60,7 +60,7 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         until(lambda: families(gateway)["multidrop_line_samples"].samples[0].value > 8)
         assert found["multidrop_line_samples"].type == "counter"
         assert found["multidrop_build"].samples[0].labels == {"version": gateway.gateway.version}
-        delays = {  # those of drives that have replied, counted once a second
+        delays = {  # of drives that have replied; updated once a second
             (one.name.removeprefix("multidrop_response_delay_seconds"), one.labels.get("quantile"))
             for one in families(gateway)["multidrop_response_delay_seconds"].samples
         }
@@ -80,7 +80,7 @@ def test_metrics_of_a_silent_drive_disappear_and_return(tmp_path: Path) -> None:
         gateway.sims["pump-2"].deaf_until = float("inf")
         until(lambda: states(gateway)["pump-2"] == "silent")
         assert {drive for drive, _ in values(gateway)} == {"pump-1"}
-        until(lambda: unanswered(gateway) > 0)  # they are counted once a second
+        until(lambda: unanswered(gateway) > 0)  # updated once a second
         gateway.sims["pump-2"].deaf_until = 0.0
         until(lambda: len(values(gateway)) == 8)
         assert states(gateway)["pump-2"] == "stands"
@@ -121,7 +121,7 @@ SAMPLES = 'multidrop_value{job="known"}'
 
 
 class Prometheus:
-    """Questions to a Prometheus, over its HTTP API."""
+    """A client of the HTTP API of a Prometheus server."""
 
     def __init__(self, port: int) -> None:
         self._url = f"http://127.0.0.1:{port}/api/v1/"
@@ -138,7 +138,7 @@ class Prometheus:
             return False
 
     def query(self, text: str) -> dict[tuple[str, ...], float]:
-        """Return the samples of this moment, by their labels' values."""
+        """Return the present samples of a query, by the values of their labels."""
         found = self.ask("query", query=text)["result"]
         return {tuple(sorted(one["metric"].values())): float(one["value"][1]) for one in found}
 
@@ -146,7 +146,7 @@ class Prometheus:
         return {name for (name,) in self.query(f"count by (drive) ({SAMPLES})")}
 
     def targets(self) -> dict[str, tuple[str, str]]:
-        """Return health and error of each job."""
+        """Return health and last error of the target of each job."""
         found = self.ask("targets")["activeTargets"]
         return {one["labels"]["job"]: (one["health"], one["lastError"]) for one in found}
 
@@ -177,16 +177,16 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
             until(lambda: prometheus.drives() == {"pump-1", "pump-2"})
-            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # not scraped yet
+            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # until the first scrape
             assert prometheus.targets() == {
                 "known": ("up", ""),
                 "stranger": ("down", "server returned HTTP status 401 Unauthorized"),
             }
             read_as = prometheus.ask("targets/metadata", metric="multidrop_drive_state", limit="1")
-            assert [one["type"] for one in read_as] == ["stateset"]  # by the parser of OpenMetrics
+            assert [one["type"] for one in read_as] == ["stateset"]  # only OpenMetrics has this type
 
             gateway.sims["pump-2"].deaf_until = float("inf")
-            # Without a mark that they ended, its values would be given for five minutes.
+            # Without staleness markers, Prometheus would return the last values for five minutes.
             until(lambda: prometheus.drives() == {"pump-1"})
             states = prometheus.query('multidrop_drive_state{job="known", drive="pump-2"} == 1')
             assert [1 for labels in states if "silent" in labels] == [1]

@@ -1,4 +1,4 @@
-"""Reload of the plant file: a file with mistakes changes no line; another one is polled."""
+"""Reload of the plant file: a file with mistakes changes no line; a valid file is polled."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump
 def reload(gateway: Served) -> Any:
     answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
     assert answer.status == 200
-    until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)  # a frame is made every 0.1 s
+    until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)  # the next frame follows soon
     return answer.json
 
 
 def edit(gateway: Served, old: str, new: str) -> None:
-    """Replace a text of the plant file, which is there once."""
+    """Replace a text that occurs once in the plant file."""
     path = gateway.gateway.plant.path
     text = path.read_text()
     assert text.count(old) == 1
@@ -45,7 +45,7 @@ def edit(gateway: Served, old: str, new: str) -> None:
 
 
 class Rows:
-    """A part that keeps the rows of a line's drives."""
+    """A part that records the rows it receives."""
 
     def __init__(self) -> None:
         self.found: list[tuple[str, str, int]] = []  # drive, status, time of the request
@@ -66,7 +66,7 @@ class Rows:
 def two_lines(
     folder: Path, serve: str = MAY, fans: Sequence[str] = ("fan-1",)
 ) -> Iterator[tuple[Served, Rows]]:
-    """A gateway of hall with pump-1 and of roof with fan-1, and its rows; other fans do not answer."""
+    """Yield a gateway with the lines hall (pump-1) and roof (fan-1), and its rows. Other fans are silent."""
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
     path = folder / "plant.toml"
@@ -153,13 +153,13 @@ def test_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path
         frame = gateway.frame()
         assert (frame["revision"], frame["drives"].keys()) == (revision + 1, {"pump-1", "fan-2"})
         ended = [one["ended"] for one in frame["alarms"] if one["drive"] == "fan-1"]
-        assert ended  # one, or more on a busy machine
+        assert ended  # on a busy machine there may be several
         assert None not in ended
         names = [line["drives"][0]["name"] for line in gateway.get("/api/plant").json["lines"]]
         assert names == ["pump-1", "fan-2"]
         assert rows.adopted == [gateway.gateway.plant]
         assert gateway.gateway.plant.lines[0].drives[0].drive is pump.drive
-        adopted_ns = time.monotonic_ns()  # rows of before may still come
+        adopted_ns = time.monotonic_ns()  # rows requested before may still arrive
 
         def later() -> list[str]:
             return [drive for drive, _, at_ns in rows.found if at_ns > adopted_ns]
@@ -182,7 +182,7 @@ def test_a_missing_port_is_reported(tmp_path: Path) -> None:
         edit(gateway, roof, str(tmp_path / "nosuch"))
         assert reload(gateway)["done"] is True
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
-        assert reload(gateway)["done"] is True  # the reason stays
+        assert reload(gateway)["done"] is True  # a second reload keeps the reason
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
         edit(gateway, str(tmp_path / "nosuch"), roof)
         assert reload(gateway)["done"] is True
@@ -223,7 +223,7 @@ def test_local_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
 
 
 def test_renewed_certificate_is_reported_to_need_a_restart(tmp_path: Path) -> None:
-    """Without that report, browsers would be the first to show the expired one, a month later."""
+    """Otherwise users would notice only when the old certificate expires."""
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
     with served(tmp_path, serve, tls=None) as gateway:
@@ -257,13 +257,13 @@ def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
 
             assert answers() == [200, 200, 200, 401]
             file.write_text(f"{known[-1].line}\n{newcomer.line}\n")
-            assert answers() == [200, 200, 200, 401]  # not before it is read
+            assert answers() == [200, 200, 200, 401]  # the removed token is valid until the reload
             assert gateway.commands.plant_ns is None
             begun_ns = boottime_ns()
             writer = {"authorization": client.bearer(Right.WRITE)}
             assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
             assert answers() == [401, 401, 200, 200]
-            read_ns = gateway.commands.plant_ns  # by which brokers' commands are judged
+            read_ns = gateway.commands.plant_ns  # time of the reload, which commands from brokers must follow
             assert read_ns is not None
             assert begun_ns <= read_ns <= boottime_ns()
 
@@ -271,7 +271,7 @@ def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
 def test_reads_before_a_reload_are_not_shown_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The name may belong to another drive now, and the old drive may be silent."""
+    """The name may now mean another drive, which may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
@@ -290,7 +290,7 @@ def test_reads_before_a_reload_are_not_shown_after_it(
 
 
 def test_look_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
-    """Those who reach the address of before are others than those who will reach the new one."""
+    """Until the restart the gateway listens on the old address, which other clients can reach."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
     with served(tmp_path, serve) as gateway:
         edit(gateway, "127.0.0.1:0", "127.0.0.2:0")
@@ -366,7 +366,7 @@ def test_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
         threads = [threading.Thread(target=lambda: told.append(reload(gateway)))]
         threads[0].start()
         assert changed.wait(PATIENCE)
-        assert old.bus is None  # no frame can be sent through it now
+        assert old.bus is None  # the old drive is detached
         threads += [
             threading.Thread(target=lambda drives=drives: told.append(gateway.post("/api/stop", drives).json))
             for drives in ({"drives": None}, {"drives": ["fan-1"]})
@@ -385,7 +385,7 @@ def test_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
 
 
 def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
-    """Hold up each bus that is opened from now on; return the events that one is, and that it may go on."""
+    """Delay the opening of each bus; return the events "opening has started" and "opening may continue"."""
     opening, go_on = threading.Event(), threading.Event()
     open_bus = Bus.__init__
 
@@ -403,7 +403,7 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
 def test_stop_does_not_wait_for_ports_that_a_reload_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    """The drive has been exchanged already, and another line takes its time."""
+    """The drive has been replaced already, while the port of another line is still being opened."""
     verbs = '"fan-1.start", "fan-1.coast"'
     may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
     with two_lines(tmp_path, may, ("fan-1", "fan-2")) as (gateway, _):
@@ -414,7 +414,7 @@ def test_stop_does_not_wait_for_ports_that_a_reload_opens(
         assert fan.goal
         opening, go_on = held_up(monkeypatch)
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
-        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # opened again
+        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # a change that reopens the line
         told: list[Any] = []
         reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
         reloading.start()
@@ -444,7 +444,7 @@ formats = ["8N1"]
 counts_from = 0
 [reading]
 dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
-"""  # of a register that INVT CHE has as a raw count
+"""  # for INVT CHE this register is a raw count
 
 
 @pytest.mark.long
@@ -452,7 +452,7 @@ dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
 def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The drive is of another family already, and polled, while another line takes its time."""
+    """The new drive, of another family, is polled already while another line is still being opened."""
     (tmp_path / "other.toml").write_text(OTHER)
     with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):
         path, poller, hub = gateway.gateway.plant.path, gateway.gateway.poller, gateway.gateway.hub
@@ -461,7 +461,7 @@ def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
         assert reload(gateway)["done"]
         until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
         opening, go_on = held_up(monkeypatch)
-        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # opened again
+        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # reopens the line
         before, _, roof = text.rpartition('model = "invt-che"')
         path.write_text(f'{before}model = "other.toml"\nformat = "8N1"{roof}')
         told: list[Any] = []
@@ -495,7 +495,7 @@ def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
 
 @pytest.mark.slow
 def test_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
-    """The reload waits for it, and exchanges the drive only then."""
+    """The reload waits for the stop, and replaces the drive only afterwards."""
     with two_lines(tmp_path) as (gateway, _):
         revision = gateway.gateway.revision
         gateway.await_state("fan-1", "stands")

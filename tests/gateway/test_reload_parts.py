@@ -30,7 +30,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 
 
 def reload(gateway: Served, serve: str) -> Any:
-    """Read the plant file again, with these tables."""
+    """Reload the plant file with these tables of [serve]; return the gateway's answer."""
     path = gateway.gateway.plant.path
     path.write_text(path.read_text().partition("[serve")[0] + serve)
     answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
@@ -62,9 +62,7 @@ def test_reload_starts_changes_and_ends_the_modbus_server(gateway: Served) -> No
     until(lambda: status_of(first, 21) == [3])
     server = gateway.gateway.feeds["modbus"]
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
-    assert (
-        gateway.gateway.feeds["modbus"] is server
-    )  # its table is the same: its clients keep their connections
+    assert gateway.gateway.feeds["modbus"] is server  # the table is unchanged, so clients stay connected
     assert reload(gateway, MODBUS.format(second, 22)) == IN_EFFECT
     until(lambda: status_of(second, 22) == [3])
     assert not is_open(first)
@@ -113,7 +111,7 @@ def test_reload_with_an_unexpected_failure_of_a_part_changes_nothing(
 def test_part_that_loses_its_port_during_a_reload_is_reported(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The new plant is not taken up, and another program has the old port by then."""
+    """The reload fails, and meanwhile another program has opened the part's previous port."""
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     others = []

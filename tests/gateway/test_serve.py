@@ -1,4 +1,4 @@
-"""The command `serve` as users and the service manager run it, in its own process."""
+"""The command `serve` in its own process, as users and the service manager run it."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
-    """A user pressed Ctrl-S in the terminal, or the journal hangs."""
+    """The log is unread if a user pressed Ctrl-S in the terminal, or if the journal hangs."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()
         words = [*MULTIDROP, "serve", str(path)]
@@ -132,7 +132,7 @@ def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
             try:
                 assert process.stdout is not None
                 port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
-                os.set_blocking(log, False)  # also for a moment after the gateway's end
+                os.set_blocking(log, False)  # to fill the pipe without blocking
                 with suppress(BlockingIOError):
                     while True:
                         os.write(log, bytes(1))
@@ -157,7 +157,7 @@ def test_serve_with_tls_answers_over_https(tmp_path: Path) -> None:
         assert url.startswith("https://127.0.0.1:")
         port = int(url.rstrip("/").rpartition(":")[2])
         context = ssl.create_default_context(cafile=str(tmp_path / "own.pem"))
-        silent = socket.create_connection(("127.0.0.1", port))  # it is silent, and delays no other work
+        silent = socket.create_connection(("127.0.0.1", port))  # no handshake; others do not wait
         connection = http.client.HTTPSConnection("localhost", port, context=context, timeout=PATIENCE)
         connection.request("POST", "/api/token", '{"token": "secret"}', {"content-type": "application/json"})
         response = connection.getresponse()

@@ -1,4 +1,4 @@
-"""The table `[serve]`: its keys, and all mistakes at once."""
+"""The table `[serve]`: its keys, and the report of all mistakes together."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_other_machines_need_tokens_and_tls(
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two pairs."""
+    """A folder with two pairs of certificate and key."""
     folder = tmp_path_factory.mktemp("certificates")
     certificate(folder, "own")
     certificate(folder, "other")

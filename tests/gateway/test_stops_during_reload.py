@@ -1,4 +1,4 @@
-"""Stops during a reload, of drives whose names move from one line to another."""
+"""Stops during a reload that moves drives' names from one line to another."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Names = dict[str, Drive]
 
 @dataclass
 class End:
-    """The end of a stop, of this drive."""
+    """The result of a stop, with the drive that was stopped."""
 
     drive: Drive | None
     ok: bool = True
@@ -25,16 +25,16 @@ class End:
 
 @dataclass
 class Lines:
-    """The lines of a poller, which the test changes; stops are held up as it says."""
+    """Lines of a poller that a test changes, and whose stops it can delay."""
 
     plant_now: Plant
     plant_coming: Plant | None = None
-    held: dict[int, asyncio.Event] = field(default_factory=dict)  # by address
+    held: dict[int, asyncio.Event] = field(default_factory=dict)  # by drive address: a stop waits for it
     failing: set[int] = field(default_factory=set)
     begun: list[Drive | None] = field(default_factory=list)
 
     async def stop(self, now: Plant, names: list[str]) -> dict[str, End]:
-        """Stop these, each as long as it is held up."""
+        """Stop these drives; the stop of a held drive waits for the drive's event."""
         there = {polled.drive.name: polled.drive for line in now.lines for polled in line.drives}
         found = {name: there.get(name) for name in names}
         self.begun += found.values()
@@ -75,7 +75,7 @@ NEW_FAN = InvtCHE(2, name="fan")
 def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
     names: list[str] | None,
 ) -> None:
-    """Such as of a drive that is silent: that one takes half a minute."""
+    """For example, the stop of a silent drive takes half a minute."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
 
@@ -92,7 +92,7 @@ def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
     ends = asyncio.run(main())
     assert (
         ends["fan"].drive is NEW_FAN
-    )  # the old drive's result, which came last, is not reported for the new one
+    )  # the result is the new drive's, although the old drive's result came later
     assert lines.begun.count(NEW_FAN) == 1
 
 
@@ -112,7 +112,7 @@ def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
 
 
 async def test_stop_by_a_name_of_the_new_plant_is_sent_once_the_drive_is_attached() -> None:
-    """The name may have another spelling. Present drives of other names go on."""
+    """The name may have another spelling. Other drives of the present plant are not stopped."""
     new = InvtCHE(2, name="L\u00fcfter")
     lines = Lines(plant_of(PUMP, FAN), plant_of(new, FAN))
     stopping = asyncio.create_task(stop_meant(lines, ["Lu\u0308fter"], lines.stop))

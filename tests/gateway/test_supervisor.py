@@ -1,4 +1,4 @@
-"""The supervisor, and all tasks and threads of a gateway: each that ends makes /health fail."""
+"""The supervisor, and a gateway's permanent tasks and threads: if one ends, /health fails."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_no_other_module_of_the_gateway_starts_a_task_or_a_thread() -> None:
     assert found == set()
 
 
-# ---- all that a gateway has ----
+# ---- tasks and threads of a gateway ----
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]
 
 
 def in_loop(loop: asyncio.AbstractEventLoop, work: Callable[[Supervisor], Any]) -> Any:
-    """Return what a function returns that the loop of a gateway calls with its supervisor."""
+    """Call a function with the supervisor in a gateway's event loop; return the result."""
     ends: list[Any] = []
     loop.call_soon_threadsafe(lambda: ends.append(work(supervisor())))
     until(lambda: ends)
@@ -72,7 +72,7 @@ def in_loop(loop: asyncio.AbstractEventLoop, work: Callable[[Supervisor], Any]) 
 
 
 def dead(gateway: Served) -> Any:
-    """Return `dead` of /health if its status is failed."""
+    """Return the entry `dead` of /health if the status is "failed"."""
     answer = gateway.get("/health")
     assert (answer.status == 503) == (answer.json["status"] == "failed") == bool(answer.json["dead"])
     return answer.json["dead"]
@@ -106,7 +106,7 @@ def test_failing_poller_makes_health_fail_but_stops_work(
     monkeypatch.setattr(gateway.gateway.poller, "take", fail)
     until(lambda: dead(gateway) == {"polling": "ZeroDivisionError: a bug in a user's class"})
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
-    monkeypatch.undo()  # it was a want of memory, say
+    monkeypatch.undo()  # the failure was temporary
     until(lambda: dead(gateway) == {})
 
 
@@ -137,7 +137,7 @@ def test_a_thread_of_the_history_that_ends_makes_health_fail(
 
 def test_a_thread_of_the_broker_s_connection_that_ends_makes_health_fail(gateway: Served) -> None:
     part: Any = gateway.gateway.feeds["mqtt"]
-    part._brokers[0]._client.disconnect()  # the gateway did not ask for that
+    part._brokers[0]._client.disconnect()  # without a request by the gateway
     until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of its connection has ended"})
 
 

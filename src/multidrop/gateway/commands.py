@@ -100,9 +100,7 @@ class Commands:
         self.may = may
         self.withheld = ""  # why all commands but stops are refused; "" if they are not
         self._on_reset = on_reset
-        self._halts: Counter[str] = (
-            Counter()
-        )  # by drive: number of other commands than stops that can end a run
+        self._halts: Counter[str] = Counter()  # by drive: other commands that can end a run
         self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
         self._lines = lines
         self.called = 0  # number of commands so far whose callers had all rights

@@ -1,4 +1,4 @@
-"""Rights checked by Commands, for every way of sending commands."""
+"""Rights checked by Commands, for every interface that sends commands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WAYS = ("page", "http", "mqtt", "modbus")
 
 
 class GuardedLines:
-    """One drive; a command that reaches its line had no right to."""
+    """A plant with one drive, whose bus must never be requested: all commands here must be refused."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), polled=False)
 
@@ -36,7 +36,7 @@ class GuardedLines:
 
 
 def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
-    """Return the rule by which each command is refused; None if it passed all rights."""
+    """Return, for each command, the rule by which it is refused; None if its caller had all rights."""
     caller = Caller("anna", way, "10.0.0.7", role)
 
     async def carried_out() -> dict[str, Any]:
@@ -78,13 +78,13 @@ def test_unlisted_writes_are_refused_to_writers(way: str) -> None:
 
 
 def test_verbs_over_modbus_are_refused_even_if_listed() -> None:
-    """Modbus has no dialog in which a person confirms."""
+    """Modbus has no dialog in which a person could confirm a verb."""
     rules = rules_of(ALL, "modbus", Right.WRITE)
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
 def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each write has a thread, and a blocked line would otherwise have any number of threads."""
+    """Each write uses a thread, so a blocked line could otherwise use any number of threads."""
     go_on = threading.Event()
 
     def slow(drive: Drive, **command: object) -> CommandResult:
@@ -95,7 +95,7 @@ def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: p
         control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
         writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
         some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
-        await asyncio.sleep(0)  # each is in progress
+        await asyncio.sleep(0)  # all writes are in progress now
         for further in (
             control.write("mill", "setpoint", 9.0, writer),
             control.act("mill", "start", {}, writer),
@@ -107,7 +107,7 @@ def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: p
         assert not isinstance(stopped["mill"].error, WriteForbidden)
         go_on.set()
         await asyncio.gather(*some)
-        assert (await control.write("mill", "setpoint", 9.0, writer)).ok  # there is room again
+        assert (await control.write("mill", "setpoint", 9.0, writer)).ok  # one of the writes has ended
 
     for work in ("write_register", "carry_out_verb"):
         monkeypatch.setattr(commands, work, slow)

@@ -40,12 +40,12 @@ from multidrop.gateway.http.rights import digest
 
 HEAD = b"POST /api/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
 SLOW = [b"", b"POST /api/act HTTP/1.1\r\nhost: loc", HEAD + b"content-length: 100\r\n\r\n{"]
-DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # fewer than the slow clients and the rest would take
+DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # too few for all slow clients and the gateway's own files
 
 
 @contextmanager
 def slow_clients(port: int, sent: bytes) -> Iterator[list[socket.socket]]:
-    """Open 500 connections that send only this."""
+    """Open 500 connections, each of which sends `sent` and then nothing."""
     with ExitStack() as stack:
         found = []
         for _ in range(500):
@@ -126,7 +126,7 @@ def test_headers_in_pieces_are_accepted_up_to_the_limit(tmp_path: Path) -> None:
         head = b"GET /api/plant HTTP/1.1\r\nhost: localhost:%d\r\ncookie: " % address[1]
         with socket.create_connection(address, PATIENCE) as client:
             client.sendall(head + b"b" * (MOST_HEAD // 2))
-            assert gateway.get("/page/icon.svg").status == 200  # it read that piece before
+            assert gateway.get("/page/icon.svg").status == 200  # answered after the first piece was read
             client.sendall(b"\r\n\r\n")
             assert client.recv(1000).startswith(b"HTTP/1.1 200 ")
         with socket.create_connection(address, PATIENCE) as client:
@@ -187,9 +187,9 @@ def test_longest_idle_connection_is_closed_for_a_new_one(
     connections = Connections(clock)
     for n in range(MOST_OPEN):
         connections.add(pairs[n][1], ("10.0.0.1", n))
-    connections.begin(("10.0.0.1", 0))  # a request is under way
+    connections.begin(("10.0.0.1", 0))  # this request is in progress
     connections.begin(("10.0.0.1", 1))
-    connections.finish(("10.0.0.1", 1))  # idle since now
+    connections.finish(("10.0.0.1", 1))  # this connection becomes idle now
     connections.add(pairs[MOST_OPEN][1], ("10.0.0.2", 1))
     assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [2]
     for n in range(MOST_OPEN):
@@ -197,13 +197,13 @@ def test_longest_idle_connection_is_closed_for_a_new_one(
     connections.begin(("10.0.0.2", 1))
     connections.add(pairs[MOST_OPEN + 1][1], ("10.0.0.2", 2))
     assert len(connections) == MOST_OPEN
-    assert not is_ended(pairs[MOST_OPEN + 1])  # the newest one is never the one that goes
+    assert not is_ended(pairs[MOST_OPEN + 1])  # the newest connection is never closed
 
 
 def test_new_connection_is_not_closed_before_its_first_request(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
-    """It may bring a stop: the next one that comes must not end it."""
+    """Its request may be a stop, so a later connection must not displace it."""
     connections = Connections(clock)
     for n in range(MOST_OPEN):
         connections.add(pairs[n][1], ("10.0.0.1", n))
@@ -262,7 +262,7 @@ async def test_one_request_starts_per_loop_round_and_stops_start_first() -> None
     stop = asyncio.create_task(take(turns, "stop", turns.stops))
     reads[1].cancel()
     await asyncio.gather(stop, *reads, return_exceptions=True)
-    assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn when it came
+    assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 started on arrival
     await take(turns, "later", turns.others)  # no other request waits
     assert order[-1] == "later"
 
@@ -270,7 +270,7 @@ async def test_one_request_starts_per_loop_round_and_stops_start_first() -> None
 def test_stop_is_answered_before_reads_that_arrived_earlier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """100 clients send 20 requests each, all together, and read no answers."""
+    """100 clients send 20 requests each at the same time, and read no answers."""
     order: list[str] = []
     come, go_on = threading.Event(), threading.Event()
     described = web.describe

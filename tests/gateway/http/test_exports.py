@@ -20,7 +20,7 @@ EXPORT = "/api/export?from=0&to=1&format={}"
 
 
 class SlowHistory:
-    """A history whose files come when the test lets them."""
+    """A history whose exports wait until the test releases them."""
 
     def __init__(self) -> None:
         self.begun = 0
@@ -49,7 +49,7 @@ def test_concurrent_exports_are_limited_and_delay_no_stop(tmp_path: Path) -> Non
         part: Any = SlowHistory()
         gateway.gateway.feeds["history"] = part
         try:
-            for wrong in ("xlsx", "csv&series=pump"):  # takes no place
+            for wrong in ("xlsx", "csv&series=pump"):  # invalid exports do not count towards the limit
                 for _ in range(2 * MOST_EXPORTS):
                     assert gateway.get(EXPORT.format(wrong)).status == 400
             paths = [EXPORT.format(("csv", "parquet")[at % 2]) for at in range(MOST_EXPORTS)]

@@ -1,4 +1,4 @@
-"""The page's files over HTTP: types, ETags and paths that lead outside."""
+"""The page's files over HTTP: types, ETags, and paths outside the page's folder."""
 
 from __future__ import annotations
 

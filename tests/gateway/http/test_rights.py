@@ -1,4 +1,4 @@
-"""The right of every caller for every route, from one table, over HTTP; requests from foreign pages."""
+"""The rights of callers over HTTP, for every route and from one table; requests from foreign pages."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ UNLISTED_VERB = ("/api/act", {"drive": "pump-1", "verb": "jog", "options": {}})
 STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
 ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
 
-LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # as a proxy reports them
-# By the settings, and where the caller is: the answers to looks, and to ACTS in their order, for each right.
+LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # client addresses as a proxy reports them
+# By settings and caller's address: for each right of a token, the status of LOOKS and of each of ACTS.
 TABLE = {
     (MAY, LOCAL): [
         (None, 200, (401, 401, 401, 401, 401, 401)),
@@ -77,11 +77,11 @@ def test_each_caller_has_the_rights_of_the_table(tmp_path: Path, serve: str, add
         for right, look, acts in TABLE[serve, address]:
             headers = {} if right is None else {"authorization": gateway.bearer(right)}
             if address is OTHER:
-                headers["x_forwarded_for"] = f"127.0.0.1, {address}"  # the first is what it says of itself
+                headers["x_forwarded_for"] = f"127.0.0.1, {address}"  # the client made the first one up
             looks = {path: gateway.get(path, **headers).status for path in LOOKS}
             assert looks == dict.fromkeys(LOOKS, look), right
             assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right
-            assert gateway.get("/", **headers).status in (200, 404)  # the page itself is not secret
+            assert gateway.get("/", **headers).status in (200, 404)  # the page itself needs no right
 
 
 @pytest.mark.parametrize("way", ["authorization", "cookie"])
@@ -97,12 +97,12 @@ def test_wrong_token_is_refused_even_if_none_is_needed(tmp_path: Path, way: str)
         for path, body in (WRITE, RESET, UNLISTED_VERB):
             assert gateway.post(path, {**body, "seen": 1}, **wrong).status == 401
         assert gateway.gateway.commands.called == 0
-        for path, body in (STOP, STOP_VERB):  # which anybody may send
+        for path, body in (STOP, STOP_VERB):  # anyone may send these
             assert gateway.post(path, body, **wrong).status == 200
         assert gateway.gateway.commands.called == 2
         for at in range(MOST_WRONG):
             gateway.get("/health", authorization=f"Bearer wrong-{at}")
-        for path in LOOKS:  # no token is checked now, and an empty one is not accepted
+        for path in LOOKS:  # after so many wrong tokens, this address is refused with any token
             assert gateway.get(path, **wrong).status == 429
             assert gateway.get(path, authorization=gateway.bearer(Right.WRITE)).status == 429
             assert gateway.get(path).status == 200
@@ -125,7 +125,7 @@ def test_repeated_wrong_token_is_logged_once(tmp_path: Path, caplog: pytest.LogC
 
 @pytest.fixture(scope="module")
 def open_gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A gateway at which every user of this machine may stop drives."""
+    """A gateway whose drives every user of this machine may stop."""
     with served(tmp_path_factory.mktemp("open"), LOOPBACK_STOPS, names=("plant.example",)) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         yield gateway
@@ -155,13 +155,13 @@ def test_stop_from_a_foreign_page_is_refused(open_gateway: Served, case: str) ->
     assert open_gateway.gateway.commands.called == before
 
 
-ORIGINS = {  # with the host that was asked, and how: is it a page of ours?
+ORIGINS = {  # (Origin header, Host header, allowed schemes): True if it is a page of this gateway
     ("https://plant.example", "plant.example", ("https",)): True,
     ("https://plant.example:443", "plant.example", ("https",)): True,
     ("https://plant.example:8443", "plant.example:8443", ("https",)): True,
-    ("http://plant.example", "plant.example", ("https",)): False,  # port 80, and we have 443
+    ("http://plant.example", "plant.example", ("https",)): False,  # its port is 80, ours is 443
     ("https://plant.example", "plant.example", ("http",)): False,
-    ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy that has TLS
+    ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy with TLS
     ("http://plant.example", "plant.example:443", SCHEMES): False,
     ("https://plant.example.evil.test", "plant.example", ("https",)): False,
     ("https://evil.test", "evil.test", ("https",)): False,
@@ -255,7 +255,7 @@ def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Serv
     assert told.json == {"name": "writer", "role": "write"}
     cookie = told.headers["set-cookie"]
     assert {"HttpOnly", "SameSite=strict", "Path=/"} <= {part.strip() for part in cookie.split(";")}
-    assert "Secure" not in cookie  # no TLS here
+    assert "Secure" not in cookie  # this gateway has no TLS
     kept = cookie.partition(";")[0]
     assert open_gateway.get("/api/plant", cookie=kept).json["may"]["role"] == "write"
     assert open_gateway.command(*WRITE, cookie=kept).status == 200
@@ -265,10 +265,10 @@ def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Serv
 
 
 def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Path) -> None:
-    """Neither a right token on another address nor any stop is held up by them."""
+    """Right tokens from other addresses still work, and so do stops from this address with a right token."""
     now = [1000.0]
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
-        gateway.gateway.tokens.find("")  # the table is there
+        gateway.gateway.tokens.find("")  # one look-up before the clock is replaced
         guard_clock(gateway, now)
         anna = {"x_forwarded_for": "10.0.0.1"}
         wrong = {**anna, "authorization": "Bearer wrong"}
@@ -276,11 +276,11 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
         for at in range(MOST_WRONG):
             assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
-        assert gateway.get("/api/plant", **right).status == 429  # not even checked
+        assert gateway.get("/api/plant", **right).status == 429  # refused without a check of the token
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401
-        signed = {"token": gateway.secrets[Right.STOP], "to": "stop"}  # which a stop from the page needs
+        signed = {"token": gateway.secrets[Right.STOP], "to": "stop"}  # sign-in before a stop
         assert gateway.post("/api/token", signed, **anna).status == 200
         assert gateway.post("/api/token", {**signed, "token": "wrong"}, **anna).status == 401
         elsewhere = {"x_forwarded_for": "10.0.0.2", "authorization": gateway.bearer(Right.STOP)}
@@ -291,7 +291,7 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
 
 @pytest.mark.parametrize("told", [{}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}])
 def test_callers_behind_a_proxy_are_not_local(tmp_path: Path, told: dict[str, str]) -> None:
-    """It is on this machine itself, and may be wrong about its clients."""
+    """The proxy is on this machine itself, but its clients need not be."""
     with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
         assert gateway.post(*STOP, **told).status == 401
         assert gateway.get("/api/plant", **told).json["may"]["role"] == "look"
@@ -299,7 +299,7 @@ def test_callers_behind_a_proxy_are_not_local(tmp_path: Path, told: dict[str, st
 
 
 def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) -> None:
-    """A proxy such as HAProxy adds a header of its own behind the one that its client sent."""
+    """A proxy such as HAProxy appends its own X-Forwarded-For header to the client's."""
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
         for at in range(MOST_WRONG):
             connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
@@ -316,7 +316,7 @@ def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) ->
 
 
 def test_new_token_is_accepted_after_many_requests_with_a_revoked_one(tmp_path: Path) -> None:
-    """A browser goes on sending its cookie with every frame."""
+    """A browser keeps sending its cookie with every request for a frame."""
     with served(tmp_path, CLOSED) as gateway:
         old = {"cookie": "multidrop=taken-away"}
         for _ in range(2 * MOST_WRONG):
@@ -329,7 +329,7 @@ def test_new_token_is_accepted_after_many_requests_with_a_revoked_one(tmp_path: 
 
 
 def guard_clock(gateway: Served, now: list[float]) -> None:
-    """Let the guard see this time."""
+    """Replace the guard's clock by the time `now[0]`."""
     gateway.gateway.guard_clock = lambda: now[0]
 
 
@@ -341,7 +341,7 @@ def test_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
         assert gateway.command(*WRITE, **writer).json["done"] is True
         assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
         records = gateway.get("/api/audit").json["entries"]
-        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]  # called, done
+        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]  # call, result
         assert written == [("pump-1", "writer", "http from 127.0.0.1")] * 2
         assert {(one["by"], one["way"]) for one in records[:-2]} == {("anyone", "page from 127.0.0.1")}
         oldest = records[-1]["time"]

@@ -36,7 +36,7 @@ from multidrop.polling.batch import Batch
 ERMAN = '["status", "output_frequency", "last_fault"]'
 REGISTERS = ("status", "output_frequency", "last_fault", "fault_record_1")
 NOT_AT_REST = "at rest its state takes two readings one after the other, which polled values are not"
-RUNNING, STOPPED = 1, 0  # of an ERMAN
+RUNNING, STOPPED = 1, 0  # values of an ERMAN's status register
 
 
 def hub_of(folder: Path, model: str, poll: str) -> Hub:
@@ -48,11 +48,11 @@ def hub_of(folder: Path, model: str, poll: str) -> Hub:
     return Hub(Plant.load(path), lambda: (now_ns[0], 0))
 
 
-now_ns = [0]  # by the clock of rows
+now_ns = [0]  # present time by CLOCK_MONOTONIC
 
 
 def take(hub: Hub, at_s: float, **values: int) -> None:
-    """Take good rows of the drive, and let it be that time."""
+    """Set the time to `at_s`, and give the hub good rows with these values."""
     columns = Columns(len(values))
     for name, value in values.items():
         layout = RowLayout(0, [Field(0, NumberFormat.U16, REGISTERS.index(name), 1.0, 1.0)])
@@ -66,7 +66,7 @@ def test_changed_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
     take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
     assert hub.seen("pump-1").state == "runs"
     take(hub, 11, last_fault=ErmanFault.OVERHEAT | 1 << 8)
-    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")  # while its older rows say that it runs
+    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")  # although older rows say "runs"
     take(hub, 12, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT | 1 << 8)
     assert hub.seen("pump-1")[:2] == ("fault", "overheat, bit 8")
     for at_s in (20, 20 + RAN_NS / SECOND):
@@ -150,7 +150,7 @@ def test_motor_that_stops_without_a_command_is_an_alarm(standing: Shown) -> None
     events = Alarms()
     for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
         events.look(time, "pump-1", shown, 0)
-    assert seen(events) == []  # it may reverse
+    assert seen(events) == []  # the motor may be reversing
     events.look(5000, "pump-1", standing, 0)
     assert seen(events) == [("pump-1", "stopped", 3000, None)]
     events.look(6000, "pump-1", RUNS, 0)
@@ -160,9 +160,9 @@ def test_motor_that_stops_without_a_command_is_an_alarm(standing: Shown) -> None
         (7000, standing, 1),
         (9000, standing, 1),
         (10000, RUNS, 1),
-    ):  # a stop was called
+    ):  # stops = 1: a stop was called
         events.look(time, "pump-1", shown, stops)
-    for time, stops in ((11000, None), (13000, 1)):  # it jogged, or its setpoint is 0
+    for time, stops in ((11000, None), (13000, 1)):  # None: a jog or setpoint 0; 1: a stop
         events.look(time, "pump-1", standing, stops)
     assert seen(events) == told
 
@@ -182,13 +182,13 @@ def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     events.look(2003, "pump-2", STANDS, 0)
     events.look_at_line(4, "hall", "there is no such port")
     events.look(5, "pump-3", Shown("silent", "no reply"))
-    events.look(6, "pump-4", Shown("silent", "port lost"))  # that is its line's
+    events.look(6, "pump-4", Shown("silent", "port lost"))  # the line has the alarm of a lost port
     assert [one.kind for one in events.shown()] == ["fault", "stopped", "port", "silent"]
     first = events.acknowledge(events.shown()[0].id, 7, "anna by page", "fan is dirty")
     assert (first.acknowledged, first.by, first.note) == (7, "anna by page", "fan is dirty")
     assert [one.kind for one in events.shown()] == ["stopped", "port", "silent", "fault"]
     stopped = events.acknowledge(events.shown()[0].id, 8, "anna by page")
-    assert ("pump-2", "stopped", 3, 8) in seen(events)  # an acknowledged alarm is not needed any longer
+    assert ("pump-2", "stopped", 3, 8) in seen(events)  # acknowledging this kind ends it
     with pytest.raises(KeyError):
         events.acknowledge("1 fault pump-9", 9, "anna")
     events.acknowledge(stopped.id, 10, "boris", "the switch")
@@ -238,7 +238,7 @@ def test_alarms_of_an_earlier_run_continue_or_end() -> None:
 
 
 def test_alarms_read_late_are_merged_with_present_alarms() -> None:
-    """A slow disk: the drives were observed before."""
+    """With a slow disk, the drives are observed before the alarms of earlier runs are read."""
     events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
     events.look(101, "pump-2", STANDS)
@@ -254,7 +254,7 @@ ALARM = Alarm(1, "pump-1", "overheat", None, "fault", "", False, 2, "anna", "a n
 
 
 def started(path: Path) -> AlarmFile:
-    """Return an alarm file whose thread runs."""
+    """Return an alarm file with its thread started."""
     kept = AlarmFile(path)
     threading.Thread(target=kept.run, daemon=True).start()
     return kept
@@ -277,7 +277,7 @@ def test_newest_line_of_each_alarm_in_the_file_is_valid(tmp_path: Path) -> None:
         file.write(b'{"id": "trunc')
     assert past_of(path) == [ALARM._replace(ended=5), ALARM._replace(time=9)]
     kept = started(path)
-    kept.note(ALARM._replace(time=10))  # beside what is truncated
+    kept.note(ALARM._replace(time=10))  # written after the truncated line
     kept.close()
     assert len(past_of(path)) == 3
 
@@ -321,7 +321,7 @@ def test_failing_disk_is_reported_and_the_alarm_file_rewritten_later(tmp_path: P
 
 
 def faults(gateway: Served) -> list[Any]:
-    """Return alarms of faults: on a busy machine a drive may be silent for a moment too."""
+    """Return the alarms of faults only: on a busy machine, drives may also be silent for a moment."""
     return [one for one in gateway.frame()["alarms"] if one["kind"] == "fault"]
 
 
@@ -348,7 +348,7 @@ def test_alarms_are_logged_acknowledged_and_kept_over_a_restart(
     assert any(
         text.startswith(f"alarm of pump-1, {words}, acknowledged by stopper") for text in caplog.messages
     )
-    with served(tmp_path) as gateway:  # the drive works again
+    with served(tmp_path) as gateway:  # after a restart the drive has no fault
         until(lambda: [one for one in faults(gateway) if one["ended"]])
         [again] = faults(gateway)
         kept = ("id", "time", "text", "by", "note", "acknowledged")

@@ -1,4 +1,4 @@
-"""Identities are checked before the first stop is called, so that a stop is sent at once."""
+"""Identities are checked before the first stop is called, so that the stop is sent immediately."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAY = '[serve.may]\nstop = "anyone"\n'
 
 @pytest.mark.long
 def test_first_stop_reads_no_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No identity is read between the call of a stop and its frame."""
+    """No identity is read between the call of a stop and its Modbus frame."""
     asked: list[str] = []
     with served(tmp_path, MAY) as gateway:
         bus = gateway.gateway.bus("hall")
@@ -36,7 +36,7 @@ def test_first_stop_reads_no_identity(tmp_path: Any, monkeypatch: pytest.MonkeyP
 
 
 class Asked:
-    """A bus that records its requests, and fails as the test says."""
+    """A bus that records the checked drives, and raises the exceptions in `failures`."""
 
     def __init__(self, failures: dict[str, Exception]) -> None:
         self.names: list[str] = []
@@ -53,7 +53,7 @@ class Asked:
 
 
 def ask_all(bus: Asked, is_there: Callable[[str], bool], *names: str) -> list[str]:
-    """Go twice through these drives, and return what failed."""
+    """Check these drives in two rounds; return "failed" for each unexpected exception."""
     drives = [SimpleNamespace(drive=SimpleNamespace(name=name)) for name in names]
     plant = SimpleNamespace(lines=[SimpleNamespace(name="hall", drives=drives)])
     failed: list[str] = []
@@ -86,7 +86,7 @@ def test_identity_of_a_silent_drive_is_not_read() -> None:
 
 
 def test_known_identity_is_not_read_again() -> None:
-    """Nor is a thread started for a known identity."""
+    """No thread is started for a known identity either."""
     bus = Asked({})
     bus.known.add("pump-1")
     assert ask_all(bus, lambda name: True, "pump-1", "pump-2") == []

@@ -1,4 +1,4 @@
-"""Frames: made once for all viewers, at most five a second, complete or as changes; none is queued."""
+"""Frames: made once for all viewers, at most five a second, sent whole or as changes, never queued."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ async def test_changes_are_computed_once_per_known_frame(
 
 async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
     seen = -1
-    for _ in range(1000):  # 10 s of news every 10 ms
+    for _ in range(1000):  # 10 s with a change every 10 ms
         clock.now += 0.01
         viewer = asyncio.create_task(frames.after(seen))
         await asyncio.sleep(0)
@@ -94,7 +94,7 @@ async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: 
 
 
 async def test_news_within_the_frame_interval_get_a_later_frame(frames: Frames, clock: Clock) -> None:
-    """Viewers see them without any other event."""
+    """Viewers get that frame without any further event."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()
@@ -117,7 +117,7 @@ def test_no_frame_is_made_without_viewers(frames: Frames, clock: Clock, made: li
 async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -> None:
     first = await frames.after(-1)
     assert first is not None
-    for _ in range(50):  # it sends no request during this time
+    for _ in range(50):  # the viewer sends no request during this time
         clock.now += 0.25
         frames.note_news()
         await frames.after(-1)
@@ -125,7 +125,7 @@ async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -
     assert late is not None
     assert late.n == 51
     assert told(late) == {"n": 51, "revision": 1}
-    other = await frames.after(900)  # seen of an earlier process
+    other = await frames.after(900)  # a frame number of an earlier process
     assert other is late
 
 
@@ -136,7 +136,7 @@ def told(frame: Encoded | None) -> dict[str, Any]:
 
 
 def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return an object with the values of another one in place of its own, and so on in the objects in it."""
+    """Return `before` with the values of `now` in place of its own; nested objects are merged too."""
     both = {key: merged(before[key], value) for key, value in now.items() if isinstance(value, dict)}
     return {**before, **now, **both}
 
@@ -162,7 +162,7 @@ def test_changes_turn_the_old_frame_into_the_new_one(before: dict[str, Any], now
 
 
 async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
-    """Let viewers skip frames; each picture has the number that one viewer skips."""
+    """Check viewers that skip frames. A picture is a plant's data, and a number of frames to skip."""
     clock, whole = Clock(), dict[int, dict[str, Any]]()
 
     def make(n: int) -> dict[str, Any]:
@@ -171,7 +171,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
         return whole[n]
 
     frames = Frames(make, clock, begin)
-    has: dict[int, dict[str, Any]] = {}  # of each viewer: it comes again after so many frames
+    has: dict[int, dict[str, Any]] = {}  # data of each viewer; key: it fetches every n-th frame
     for turn, _ in enumerate(pictures):
         clock.now += 0.25
         frames.note_news()
@@ -195,7 +195,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 def test_viewer_that_skips_frames_ends_with_the_newest_one(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
-    """There is another plant in the middle."""
+    """The plant changes halfway."""
     asyncio.run(view(pictures, begin))
 
 
@@ -234,7 +234,7 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
 
 
 def test_frame_follows_the_check_for_alarms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The drives are gone through once in 0.2 s, for alarms and for the frame: of rows from just before."""
+    """Alarms and frame are made from the same rows, so the drives are examined only once in 0.2 s."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()
     done: list[str] = []

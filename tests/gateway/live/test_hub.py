@@ -1,4 +1,4 @@
-"""Newest rows and drives' states, from rows of the core; alarms from states."""
+"""The hub: newest rows and drives' states, from rows of the core. Alarms from these states."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DRIVES = ("pump-1", "pump-2", "pump-9")
 
 
 class HubClock:
-    """The present time, by the clock that rows have, and for how long the machine slept; both in ns."""
+    """A clock that a test sets: the monotonic time, and the machine's total time asleep, both in ns."""
 
     def __init__(self) -> None:
         self.now_ns = 10 * PERIOD
@@ -50,7 +50,7 @@ def hub(tmp_path: Path, clock: HubClock) -> Hub:
 
 
 def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1") -> Batch:
-    """Rows of a drive: time in periods, register, and its raw count or a status."""
+    """Return rows of a drive, each given as its time in periods, a register, and a raw count or a status."""
     columns = Columns(len(found))
     for at, register, said in found:
         layout = RowLayout(DRIVES.index(drive), [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
@@ -153,7 +153,7 @@ def test_line_is_lost_if_all_its_newest_rows_have_that_status(hub: Hub, clock: H
 
 
 def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None:
-    """Without rows and without a turn of the gateway's loop, as after a suspended process."""
+    """The time passes without rows and without the event loop, as in a suspended process."""
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns += SECOND
     assert is_fresh(hub)
@@ -164,14 +164,14 @@ def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None
 
 
 def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None:
-    """The monotonic clock, and so each row's age, stopped during the sleep."""
+    """The monotonic clock stopped during the sleep, so the ages of rows do not include it."""
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
-    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # no row, and no look, in between
+    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # no row and no check in between
     assert not is_fresh(hub)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
     assert not any(fresh for *_, fresh in hub.known("pump-1"))
-    hub.take(all_of(11, FORWARD, 25))  # just before it slept, and not taken until now
+    hub.take(all_of(11, FORWARD, 25))  # polled before the sleep, received after it
     assert not is_fresh(hub)
     clock.now_ns = 12 * PERIOD
     hub.take(all_of(12, FORWARD, 25))
@@ -211,7 +211,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
     hub = Hub(Plant.load(path), clock)
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
-    assert cycle_s > 1  # although 0.1 s are requested
+    assert cycle_s > 1  # the plant file requests 0.1 s
     hub.take(all_of(10, FORWARD, 25))
     row = hub.newest("pump-1", "output_frequency")
     assert row is not None
@@ -223,7 +223,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
 
 def test_last_minute_has_one_point_a_second_and_null_for_a_miss(hub: Hub) -> None:
     assert hub.last_minute() == {}
-    for at in range(0, 1000, 5):  # periods of 100 ms
+    for at in range(0, 1000, 5):  # in periods of 100 ms
         hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
         hub.note_minute()
     points = hub.last_minute()["pump-1"]["output_frequency"]
@@ -248,7 +248,7 @@ def test_late_row_of_a_previous_drive_is_ignored(tmp_path: Path) -> None:
     now = [0]
     hub = Hub(written(tmp_path, "", "pump-1", "pump-2"), lambda: (now[0], 0))
     now[0] = 20 * PERIOD
-    hub.adopt(written(tmp_path, "", "pump-2", "pump-1"))  # each at the other's address
+    hub.adopt(written(tmp_path, "", "pump-2", "pump-1"))  # the two drives swap their addresses
     hub.take(all_of(19, FORWARD, 25))
     assert hub.newest("pump-1", "output_frequency") is None
     hub.take(all_of(21, STANDBY))
@@ -271,7 +271,7 @@ SHOWN = st.sampled_from(
 
 @given(st.lists(SHOWN, max_size=30))
 def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
-    """Compared with a plain reading of the rules, one state after another."""
+    """Alarms for random states equal those of a simple reference implementation."""
     events = Alarms()
     fault: str | None = None
     silent = False
@@ -295,7 +295,7 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
 def test_fault_stays_while_some_values_of_its_drive_are_unknown(
     hub: Hub, clock: HubClock, status: int, is_over: bool
 ) -> None:
-    """A busy line misses its status for a second, and reads its current: the fault may last."""
+    """A busy line misses the status for a second but reads other registers: the fault may still be active."""
     events = Alarms()
 
     def look() -> list[tuple[int, int | None]]:
@@ -327,7 +327,7 @@ def test_ended_alarms_are_bounded() -> None:
         assert time > 100 or events.since == 7
     assert len(events.between(0, 9999)) <= 1001
     oldest = events.between(0, 9999)[-1]
-    assert events.since == oldest.time - 1  # when the one before it, which is forgotten, ended
+    assert events.since == oldest.time - 1  # end of the newest forgotten alarm
     assert events.begun == 2000
     assert len(events.shown()) <= 21
 
@@ -351,7 +351,7 @@ def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, cloc
 
 
 def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, clock: HubClock) -> None:
-    """One that is too short would make the last value of a silent drive a new one."""
+    """If it were too short, the last value of a silent drive would look new."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD
     hour_ns = 3600 * SECOND

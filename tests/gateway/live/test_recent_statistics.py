@@ -23,7 +23,7 @@ MINUTE_MS = 60_000
 
 
 def reading(seconds: int, *, per_s: int = 10) -> LineStatistics:
-    """A line's statistics after so many seconds of samples, with a miss each 30 s."""
+    """Return a line's statistics after `seconds` of samples, with a miss every 30 s."""
     missed = Counter({int(Status.NO_REPLY): seconds // 30})
     counters = Counters()._replace(values=seconds * per_s, sent=seconds * per_s, missed=missed)
     return line_statistics(float(seconds), {"pump-1": counters}, None)
@@ -64,7 +64,7 @@ def test_line_figures_cover_the_last_seconds(recent: RecentStatistics) -> None:
 def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp_path: Path) -> None:
     assert recent.line("hall")["misses"] is None
     for second in range(100):
-        recent.tick(float(second), second * 1000, {"hall": reading(second)})  # no reply has a delay
+        recent.tick(float(second), second * 1000, {"hall": reading(second)})  # without any reply
     assert recent.line("hall")["p99"] is None
     plant = written(tmp_path)
     gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), recent=recent)

@@ -42,7 +42,7 @@ WRITE = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
 
 
 class Times:
-    """A clock that a test sets, and the stops that were called."""
+    """SeenFrames with a clock and times of stops that a test sets."""
 
     def __init__(self) -> None:
         self.now_ns = 10**12
@@ -51,7 +51,7 @@ class Times:
         self.frames = SeenFrames(lambda: self.now_ns, self.commands)
 
     def rule(self, seen: int, drive: str = "pump-1", command: object = "start") -> str:
-        """Return the rule that a command breaks; "" for one that may be sent."""
+        """Return the rule that a command violates; "" if it may be sent."""
         try:
             self.frames.admit(drive, f"{drive}.{command}", command, seen)
         except WriteForbidden as refused:
@@ -80,7 +80,7 @@ def test_command_that_names_an_unknown_frame_is_refused(times: Times) -> None:
 
 def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
     times.frames.note(7)
-    times.stopped["pump-1"] = times.now_ns  # the frame may be older: in doubt the command is not sent
+    times.stopped["pump-1"] = times.now_ns  # equal times: the stop may be later than the frame
     assert times.rule(7) == OVERTAKEN
     assert times.rule(7, "pump-2") == ""
     times.now_ns += 1
@@ -118,7 +118,7 @@ def test_old_frames_are_forgotten(times: Times) -> None:
 
 @contextmanager
 def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]:
-    """Send a request without its last byte, which follows later."""
+    """Send a request except its last byte, which `answer` sends."""
     data = json.dumps(body).encode()
     head = (
         f"POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
@@ -130,7 +130,7 @@ def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]
 
 
 def answer(client: socket.socket, last: bytes = b"}") -> str:
-    """Send the last byte, and return the gateway's answer to the command."""
+    """Send the last byte of a request, and return the gateway's answer."""
     client.sendall(last)
     with client.makefile("rb") as received:
         assert received.readline().startswith(b"HTTP/1.1 200 ")
@@ -144,7 +144,7 @@ def answer(client: socket.socket, last: bytes = b"}") -> str:
 
 
 def pass_time(gateway: Served, ns: int) -> None:
-    """Let the gateway be so much later, for frames and commands."""
+    """Advance the gateway's clocks for frames and commands."""
     gateway.gateway.seen_frames.clock = lambda: boottime_ns() + ns
 
 
@@ -178,7 +178,7 @@ def test_stop_delayed_as_long_is_sent(tmp_path: Path) -> None:
 
 
 def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
-    """A proxy that repeats a start, or lets a stop overtake it, starts no motor."""
+    """So a proxy that repeats or delays a start cannot start a motor after a stop."""
     writer = {}
     with served(tmp_path, MAY) as gateway:
         writer["authorization"] = gateway.bearer(Right.WRITE)
@@ -208,7 +208,7 @@ def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -
     with served(tmp_path, MAY) as gateway:
         gateway.gateway.seen_frames.clock = lambda: boottime_ns() - MOST_AGE_NS + 50_000_000
         start = {**START, "seen": gateway.frame_number()}
-        gateway.gateway.seen_frames.clock = lambda: 0  # it came at once
+        gateway.gateway.seen_frames.clock = lambda: 0  # on arrival the command is recent
         with pytest.MonkeyPatch.context() as patch, held_up(gateway, "/api/act", start) as client:
             patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
             client.sendall(b"}")

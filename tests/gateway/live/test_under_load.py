@@ -1,4 +1,4 @@
-"""A gateway with all kinds of users at once: answers are right and all drives are stopped."""
+"""A gateway with all kinds of users together: answers are right and all drives are stopped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lines import PATIENCE, until
 from peers import require_module
 from simulated_pumps import free_ports, simulated_pumps, write_plant
 
-LINES = (8, 8, 8, 7)  # drives on each
+LINES = (8, 8, 8, 7)  # number of drives on each line
 LEAST = {"frames": 100, "scrapes": 5, "queries": 5, "messages": 200, "reads": 100, "reads of others": 100}
 
 

@@ -20,7 +20,7 @@ from multidrop.gateway.mqtt.home_assistant import discovery
 
 
 class FullHub(Hub):
-    """A hub to which each polled register said 25 just now."""
+    """A hub in which every polled register has a fresh value of 25."""
 
     def newest(self, drive: str, register: str) -> Newest | None:
         return Newest(1, 1, 25.0, "ok", 1)
@@ -31,7 +31,7 @@ class FullHub(Hub):
 
 
 class Fan(Drive):
-    """A user's own, whose manual gives a unit and no scale."""
+    """A user's own drive, whose manual states a unit but no scale."""
 
     pressure = setting(1, "Pa", step=None, moves=False)
 
@@ -51,7 +51,7 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
     for register in described(polled(drive, drive.readings()))["drives"][0]["registers"]:
         known = drive.registers[register["name"]]
         assert register["unit"] == ("raw count" if known.step is None else known.unit)
-        if known.writable and known.values is None:  # a dialog has a span for each
+        if known.writable and known.values is None:  # the page's dialog needs a range
             assert register["least"] < register["most"], known.name
             known.encode(register["least"])
             known.encode(register["most"])
@@ -84,7 +84,7 @@ def test_home_assistant_number_of_raw_counts_has_that_unit() -> None:
 
 
 class Transmitter(Drive):
-    """A user's own device; each number has its own digits."""
+    """A user's own device, whose registers have different numbers of digits."""
 
     pressure = setting(1, "Pa", number_format=NumberFormat.F32, moves=False)
     level = setting(3, "m", step=0.01, moves=False)

@@ -82,7 +82,7 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     assert frame["lines"]["hall"]["lost"] is None
     following = gateway.get(f"/api/frame?after={frame['n']}").json
     assert following["n"] > frame["n"] == following["since"]
-    assert "revision" not in following  # it is as before
+    assert "revision" not in following  # a frame of changes omits equal values
 
 
 def test_new_page_gets_the_samples_of_the_last_minute(gateway: Served) -> None:
@@ -117,7 +117,7 @@ def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
     def lasting() -> list[dict[str, Any]]:
         return [one for one in alarms() if one["ended"] is None]
 
-    until(lasting)  # on a busy machine there may have been others before
+    until(lasting)  # on a busy machine there may have been other alarms before
     begun = lasting()[0]
     assert begun["kind"] == "silent"
     gateway.sims["pump-2"].deaf_until = 0.0
@@ -184,7 +184,7 @@ def test_lines_show_the_delays_of_each_drive(gateway: Served) -> None:
 
 @pytest.mark.long
 def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: Served) -> None:
-    """They were set against its requests, of which each brings several values, and a silent drive has few."""
+    """Misses count values, of which one request has several, so they must not be divided by requests."""
     recent = gateway.gateway.recent
 
     def came() -> int:
@@ -206,7 +206,7 @@ def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: 
 
 
 def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: Served) -> None:
-    """Another drive may have its address on another port, and may have had it on this one."""
+    """Another drive may have the same address on another port, or may have had it on this port before."""
     drive = gateway.gateway.plant.find_drive("pump-1")[1]
     assert gateway.gateway.poller
     port = gateway.gateway.poller.bus("hall").line.identity
@@ -223,7 +223,7 @@ def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: 
 
 @pytest.mark.slow
 def test_ask_reads_words_outside_the_register_table(gateway: Served) -> None:
-    """Words as they lie in the drive, for masters that get in through the gateway."""
+    """Modbus masters get words as the drive stores them."""
     gateway.sims["pump-1"]["output_current"] = 12.3
 
     def ask(drive: str, expiry_s: float) -> list[int]:
@@ -232,7 +232,7 @@ def test_ask_reads_words_outside_the_register_table(gateway: Served) -> None:
     sent = gateway.sims["pump-1"].drive.register("output_current")
 
     def current() -> list[int] | None:
-        with suppress(NoReply):  # of a simulator that has to wait for a busy machine
+        with suppress(NoReply):  # on a busy machine the simulator may answer too late
             return asyncio.run(gateway.gateway.ask("pump-1", 3, sent.address, 1, 5.0))
         return None
 

@@ -19,7 +19,7 @@ from multidrop.gateway.modbus_server.line_share import (
 
 
 class PacedLine:
-    """Requests that take so long each; how many were under way at a time, and when each began."""
+    """A line whose requests take `seconds` each; records their start times and how many overlapped."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -38,7 +38,7 @@ class PacedLine:
 
 
 async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int = 3) -> int:
-    """Ask again as soon as an answer or a refusal comes; return how many were answered."""
+    """Send requests without pause for `seconds`; return how many were answered."""
     loop = asyncio.get_running_loop()
     until = loop.time() + seconds
     answered = 0
@@ -83,7 +83,7 @@ async def test_line_time_used_in_any_second_is_at_most_share_plus_burst() -> Non
 
 async def test_ninth_waiting_request_is_refused_immediately() -> None:
     share, line = LineShare(), PacedLine(0.5)
-    asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is under way
+    asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is in progress
     await asyncio.sleep(0)
     with pytest.raises(PassingBusy, match="8 requests wait"):
         share.ask("one", line.ask)

@@ -32,7 +32,7 @@ from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 SOURCE = Path(__file__).parents[2] / "support" / "programs" / "libmodbus_tcp_client.c"
-TYPES = {1: "0", 2: "1", 3: "4", 4: "3"}  # of mbpoll
+TYPES = {1: "0", 2: "1", 3: "4", 4: "3"}  # by function code: mbpoll's option -t
 WRITTEN = {5: "0", 6: "4"}
 MBPOLL_CODES = {  # libmodbus's texts for exceptions
     "Illegal function": 1,
@@ -47,13 +47,13 @@ MBPOLL_CODES = {  # libmodbus's texts for exceptions
 
 
 class Master(Protocol):
-    """A connected master."""
+    """A Modbus master connected to the gateway."""
 
     def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
-        """Return words or bits, or an exception code."""
+        """Return the words or bits read, or an exception code."""
 
     def write(self, unit: int, function: int, start: int, value: int) -> int:
-        """Return an exception code, or 0."""
+        """Write a value; return an exception code, or 0."""
 
 
 class Mbpoll:
@@ -149,7 +149,7 @@ class PyModbusTcp:
 
 @contextmanager
 def master_of(name: str, port: int, built: Path) -> Iterator[Master]:
-    """Give "mbpoll", "libmodbus" or "pyModbusTCP", connected to this port; skip if it is not installed."""
+    """Yield the master of this name, connected to this port; skip the test if it is not installed."""
     if name == "mbpoll":
         yield Mbpoll(port)
         return
@@ -163,13 +163,13 @@ def master_of(name: str, port: int, built: Path) -> Iterator[Master]:
 MASTERS = ["pyModbusTCP", "mbpoll", "libmodbus"]
 METER = Path(__file__).parents[2] / "data" / "families" / "sdm630.toml"
 MODELS = ["innovert-ibd", "invt-che", "delixi-modbus", "yd1000", "erman-er-g-220", str(METER)]
-COMMANDED = 7  # the unit that is written
-SETPOINT, CONTROL, STOP = 0x2000, 0x1000, 5  # of a CHE: CHE100 manual v1.4, p. 117
+COMMANDED = 7  # id of the unit that the tests write to
+SETPOINT, CONTROL, STOP = 0x2000, 0x1000, 5  # two addresses and a value: CHE100 manual v1.4, p. 117
 PATIENCE = 60.0  # s
 
 
 class Lines(NamedTuple):
-    """A poller with the interface that commands use."""
+    """Adapts a poller to the protocol PolledLines of Commands."""
 
     plant: Plant
     poller: Poller
@@ -183,7 +183,7 @@ class Lines(NamedTuple):
 
     @property
     def plant_coming(self) -> None:
-        return None  # no reload here
+        return None  # there are no reloads
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         _, known = self.plant.find_drive(drive)
@@ -245,7 +245,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iter
                 loop = asyncio.get_running_loop()
 
                 def feed(batch: Batch) -> None:
-                    with suppress(RuntimeError):  # at the end, after the loop closed
+                    with suppress(RuntimeError):  # raised at the end of the tests, after the loop was closed
                         loop.call_soon_threadsafe(hub.take, batch)
 
                 poller.on_batch(feed, every=0.02)
@@ -303,7 +303,7 @@ def chunks(rig: Rig) -> list[Chunk]:
 
 
 def patiently(ask: Any, *numbers: int) -> Any:
-    """Call again if the line's share is used up or a busy machine lost a reply."""
+    """Repeat a call if the clients' share of line time is used up or a busy machine lost a reply."""
     end = monotonic() + PATIENCE
     while (found := ask(*numbers)) in (6, 11) and monotonic() < end:
         sleep(0.1)
@@ -346,7 +346,7 @@ def test_cached_words_equal_the_words_of_the_line(rig: Rig, master: Master) -> N
             found = patiently(master.read, unit, register.table.read, register.address, register.words)
             assert found == direct, (unit, register.name)
             asked += 1
-    frequency = rig.drives[2].drive.register("output_frequency").address  # complete and polled: in the cache
+    frequency = rig.drives[2].drive.register("output_frequency").address  # polled, so answered from the cache
     until(
         lambda: (
             patiently(master.read, 2, 3, frequency, 1) and rig.server.answered["cached"] - before > asked / 2
@@ -355,7 +355,7 @@ def test_cached_words_equal_the_words_of_the_line(rig: Rig, master: Master) -> N
 
 
 def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
-    """Return the line's own words; retry if a busy machine lost the reply."""
+    """Return the words read directly over the line; retry if a busy machine lost the reply."""
     end = monotonic() + PATIENCE
     data = b""
     while not data:
@@ -393,7 +393,7 @@ def test_master_stops_a_motor_by_control_register_and_common_block(rig: Rig, mas
     drive = rig.drives[COMMANDED]
     for address, value in ((CONTROL, STOP), (0xF00A, 1)):
         drive.counters.writes.clear()
-        assert master.write(COMMANDED, 6, address, value) in (0, 5)  # done, or still running
+        assert master.write(COMMANDED, 6, address, value) in (0, 5)  # 0: done, 5: still in progress
         until(lambda: drive.counters.writes)
         assert [(one.name, one.raw) for one in drive.counters.writes][-1] == ("control", STOP)
 

@@ -1,4 +1,4 @@
-"""Modbus clients: each gets only its own answers; its stops wait for no other request and no answer."""
+"""Modbus clients: each gets only its own answers, and a stop waits for no other request or answer."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server.protocol import MbapRequest, take_request
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
-UNREAD = 150_000  # requests whose answers are more than the sockets of both sides hold
+UNREAD = 150_000  # number of requests whose answers exceed the socket buffers of both sides
 
 # ---- connections ----
 
 
 class FakeTransport(asyncio.Transport):
-    """A connection that stores all written bytes."""
+    """A transport that stores all written bytes."""
 
     def __init__(self, address: str = "127.0.0.1") -> None:
         super().__init__({"peername": (address, 40000)})
         self.written = bytearray()
-        self.taken = 0  # bytes of it that left
+        self.taken = 0  # number of written bytes that the client has read
         self.is_reading = True  # type: ignore[assignment, method-assign]
         self.ended = ""
 
@@ -119,13 +119,13 @@ async def test_a_flooding_client_does_not_delay_others() -> None:
 
 
 def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
-    """Answer after half a millisecond of the loop's clock."""
+    """Answer after the event loop's clock has advanced by 0.5 ms."""
     cast(ControlledLoop, asyncio.get_running_loop()).passing.now += 0.0005
     return found.reply(b"")
 
 
 async def test_busy_clients_share_the_time_of_one_round() -> None:
-    """A stop through any interface waits until each client had its turn."""
+    """A stop through any interface may have to wait for one round in which every client has a turn."""
     share = modbus_clients.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
     ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
@@ -134,7 +134,7 @@ async def test_busy_clients_share_the_time_of_one_round() -> None:
     for client, _ in clients:
         client.data_received(block)
     begun = clock.now
-    for client, _ in clients:  # a round
+    for client, _ in clients:  # one round
         client._drain()
     assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
     for client, transport in clients:
@@ -246,7 +246,7 @@ def test_requests_of_a_client_that_reads_no_answers_are_read_within_limits(
         client.resume_writing()
         await asyncio.sleep(1)
         answered = transactions(transport.written[kept:])
-        assert answered == [*range(500), *range(1000, 1500)]  # as many as wait for their turn
+        assert answered == [*range(500), *range(1000, 1500)]  # as many reads as fit into the queue
         client.data_received(reads(7, 8))
         assert transactions(transport.written)[-1] == 7
 
@@ -284,7 +284,7 @@ async def test_a_client_beyond_the_limit_replaces_the_longest_idle_one() -> None
         found.append(connected(port)[1])
         await asyncio.sleep(0.1)
     refused = connected(port)[1]
-    assert refused.ended == "aborted"  # nobody is idle for 10 s
+    assert refused.ended == "aborted"  # no client has been idle for 10 s
     await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
     assert not connected(port)[1].ended
     assert [transport.ended for transport in found[:2]] == ["aborted", ""]
@@ -394,13 +394,13 @@ def test_a_stop_waits_neither_for_earlier_requests_nor_for_a_client_that_reads()
             assert stopped.wait(PATIENCE)
 
 
-POLLED, PASSED = 500, 40  # addresses of each drive
+POLLED, PASSED = 500, 40  # number of polled and of unpolled addresses of each drive
 CLIENTS = 3
-WINDOW = 200  # requests of a client that are sent before their answers are read
+WINDOW = 200  # requests that a client sends before it reads their answers
 
 
 class Ramp(Drive):
-    """A device whose every register holds a number of its own."""
+    """A device whose registers hold different numbers."""
 
 
 Wide = type(
@@ -411,12 +411,12 @@ Wide = type(
 
 
 def value(unit: int, address: int) -> int:
-    """The number in a register: two units differ everywhere."""
+    """Return the number in a register, which differs for every unit and address."""
     return (7919 * address + 20011 * unit) % 0x10000
 
 
 class SlowLine(FakeLine):
-    """A line that answers with the registers' numbers, some of them later than those to later requests."""
+    """A line that answers with the registers' numbers; some answers come after those to later requests."""
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         await asyncio.sleep(0.001 * (start % 5))
@@ -440,14 +440,14 @@ def expected(unit: int, start: int, count: int) -> list[int]:
 
 
 def drawn(chance: random.Random) -> tuple[int, int]:
-    """A range that is in the cache, or one in fifty that is not."""
+    """Return a random range of addresses; one range in fifty is not in the cache."""
     if chance.random() < 0.02:
         return POLLED + chance.randrange(PASSED - 4), chance.randint(1, 4)
     return chance.randrange(POLLED - 4), chance.randint(1, 4)
 
 
 def pipeline(client: RawClient, unit: int, requests: int) -> int:
-    """Send windows of requests and match each reply with its own; return how many were passed on."""
+    """Send windows of requests, and check that each reply is right; return how many were passed on."""
     chance = random.Random(unit)
     passed = 0
     for first in range(0, requests, WINDOW):
@@ -459,7 +459,7 @@ def pipeline(client: RawClient, unit: int, requests: int) -> int:
             start, count = asked.pop(reply.transaction)
             assert reply.unit == unit
             if start >= POLLED and reply.code == 6:
-                continue  # the line's share is used up
+                continue  # the clients' share of line time is used up
             assert (reply.function, reply.words) == (3, expected(unit, start, count))
             passed += start >= POLLED
         assert asked == {}
@@ -467,7 +467,7 @@ def pipeline(client: RawClient, unit: int, requests: int) -> int:
 
 
 def all_clients(gateway: Gateway, requests: int) -> None:
-    """Let clients pipeline beside each other, each to a unit of its own, and under the same ids."""
+    """Run concurrent clients that pipeline requests, each to its own unit, with the same transaction ids."""
     failures: list[BaseException] = []
     passed: list[int] = []
 
@@ -485,7 +485,7 @@ def all_clients(gateway: Gateway, requests: int) -> None:
         thread.join()
     if failures:
         raise failures[0]
-    assert sum(passed) > 10  # answers came out of order too
+    assert sum(passed) > 10  # so some answers were out of order
 
 
 @pytest.mark.long
@@ -500,13 +500,13 @@ def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -
 
 @pytest.mark.long
 def test_client_that_reads_late_gets_all_answers(gateway: Gateway) -> None:
-    """The client sends all requests before it reads; requests wait while earlier answers are unread."""
+    """The client sends all requests before it reads; meanwhile the server holds back unread answers."""
     requests = 20_000
     with gateway.client() as client:
         frames = b"".join(request(number, 1, 3, 0, 120) for number in range(requests))
         sender = threading.Thread(target=client.send, args=(frames,))
         sender.start()
-        with gateway.client() as other:  # meanwhile
+        with gateway.client() as other:  # served while the first client's answers are unread
             for _ in range(50):
                 assert other.ask(2, 3, 1, 1).words == expected(2, 1, 1)
         for number in range(requests):

@@ -1,4 +1,4 @@
-"""The pages about the Modbus server: plant files load, and tables match the code."""
+"""The documentation of the Modbus server: its plant files load, and its tables match the code."""
 
 from __future__ import annotations
 

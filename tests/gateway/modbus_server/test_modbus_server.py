@@ -46,7 +46,7 @@ BLOCK = 0xF000
 
 
 class Meter(Drive):
-    """A device of a user's own."""
+    """A user's own device."""
 
     level = reading(0, "m", step=0.1)
     energy = setting(2, "kWh", number_format=NumberFormat.U32, order="CDAB", span=(0, 4e9), kept=Kept.RAM)
@@ -109,13 +109,13 @@ def test_passed_bits_are_packed_from_the_lowest_bit_on() -> None:
         serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway,
         gateway.client() as client,
     ):
-        assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])  # odd addresses are 1
+        assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])  # inputs at odd addresses are 1
 
 
 def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
-    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # another table
-    assert code(gateway, 4, 3, 0, 1) == 2  # no Modbus behind this one
+    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # declared in the other table only
+    assert code(gateway, 4, 3, 0, 1) == 2  # this unit's drive speaks no Modbus
     assert gateway.line.asked == []
 
 
@@ -153,7 +153,7 @@ def test_value_from_before_a_write_is_not_used_after_the_write(gateway: Gateway)
 
 
 def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway) -> None:
-    """Nor is one from before a command that came by another way."""
+    """The command came through another interface."""
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
@@ -207,7 +207,7 @@ def test_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway, 
     assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
 
 
-# ---- what becomes of reads that are passed ----
+# ---- failures of reads passed to the drive ----
 
 FAILURES = [
     (NoReply("mill"), 0x0B),
@@ -237,13 +237,13 @@ def test_error_of_a_passed_read_has_its_exception_code(
 @pytest.mark.slow
 def test_passed_reads_beyond_the_queue_are_answered_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
-    gateway.line.seconds = 0.6  # three times what may be used at once
+    gateway.line.seconds = 0.6  # three times BURST_S
     with gateway.client() as client:
         client.send(b"".join(request(number, 1, 3, CHE_OUTPUT_VOLTAGE, 1) for number in range(12)))
         replies = [client.receive() for _ in range(12)]
     codes = {reply.transaction: reply.code for reply in replies if reply is not None}
     assert codes == {0: None, **dict.fromkeys(range(1, 12), 6)}
-    assert len(gateway.line.asked) == 1  # the share is used up for 2 s, and the others expire
+    assert len(gateway.line.asked) == 1  # no line time is left for 2 s, so the others expire
 
 
 # ---- writes ----
@@ -271,13 +271,13 @@ def test_write_is_carried_out_by_commands_and_echoed(gateway: Gateway) -> None:
 @pytest.mark.parametrize(
     ("function", "words", "data", "expected"),
     [
-        (6, (0x7000, 1), b"", 2),  # nothing is there
-        (6, (0, 1), b"", 2),  # it is a reading
-        (6, (2, 1), b"", 3),  # half a register
-        (6, (3, 1), b"", 2),  # its other half
+        (6, (0x7000, 1), b"", 2),  # no register at this address
+        (6, (0, 1), b"", 2),  # a read-only register
+        (6, (2, 1), b"", 3),  # the first half of a register
+        (6, (3, 1), b"", 2),  # the second half of a register
         (16, (2, 1), b"\2\0\1", 3),
         (16, (2, 3), b"\6" + bytes(6), 3),  # more than one register
-        (16, (2, 2), b"\4\0\0\0", 3),  # not as many bytes as it says
+        (16, (2, 2), b"\4\0\0\0", 3),  # fewer bytes than announced
         (16, (2, 2), b"\2\0\0\0\0", 3),
         (16, (2, 0), b"\0", 3),
         (16, (2, 124), b"\xf8" + bytes(247), 3),
@@ -358,9 +358,9 @@ def test_every_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
         assert client.ask(1, 6, CHE_CONTROL, 6).code is None  # coast
         assert client.ask(1, 6, CHE_CONTROL, 8).code is None  # jog stop
         assert client.ask(3, 6, IBD_CONTROL, IBD_STOP).code is None
-        assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # "no command" stops nothing
-        for yes in (1, 2, 0xFF00, 0xFFFF):  # as masters say it
-            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # Delixi's own protocol, all the same
+        assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # 0 means "no command" and stops no motor
+        for yes in (1, 2, 0xFF00, 0xFFFF):  # values that masters use for "true"
+            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # works for Delixi's own protocol too
     stopped = [drives for drives, _ in gateway.commands.stopped]
     assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
 
@@ -382,7 +382,7 @@ def test_other_writes_to_the_common_block_are_refused_and_do_not_stop(
     assert gateway.commands.stopped == []
 
 
-MIXED = {  # addresses, and words as the manuals and the common block have them
+MIXED = {  # unit, address and words of writes that contain a stop
     "the stop first": (1, CHE_CONTROL, (5, 0)),
     "amid others": (1, CHE_CONTROL - 1, (7, 5, 7)),
     "a coast": (1, CHE_CONTROL, (6, 1)),
@@ -411,7 +411,7 @@ def test_stop_in_a_write_of_several_coils_is_sent_alone() -> None:
     """Start off, stop on, emergency stop off: the ER-G-220's coils 0 to 2 (section 10)."""
     drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
     with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
-        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # start alone
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # the write has a start but no stop
         assert gateway.commands.stopped == []
         assert code(gateway, 1, 15, 0, 3, data=b"\1\2") == 3
         until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
@@ -437,7 +437,7 @@ def test_read_only_gateway_ignores_a_stop_in_a_write_of_several_words() -> None:
 
 
 def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:
-    """Have stops take so long; return what is set when one has ended."""
+    """Make stops take this many seconds; return an event that is set when a stop has ended."""
     ended = threading.Event()
 
     async def slowly() -> CommandResult:
@@ -461,13 +461,13 @@ def test_stop_continues_after_its_client_is_disconnected(gateway: Gateway) -> No
     ended = stop_slowly(gateway, 0.2)
     with gateway.client() as client:
         client.send(request(1, 1, 6, CHE_CONTROL, 5))
-        client.send(b"\xff" * 20)  # and is closed for it
+        client.send(b"\xff" * 20)  # garbage: the server closes the connection
         client.receive()
     assert ended.wait(30)
 
 
 def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gateway) -> None:
-    """Sixteen writes hang; the stop behind them is called at once."""
+    """Sixteen writes hang; the stop that follows them is called immediately."""
     stopped = threading.Event()
     hang = threading.Event()
 
@@ -566,7 +566,7 @@ def test_common_block_of_a_running_drive_has_its_values(gateway: Gateway) -> Non
         found = block(gateway, function=function)
         assert found[:8] == [2, 0, 0, 4999, 0, 1230, 0xFFFF, 0xFFFF - 499]
         assert found[8] == 0
-        assert 250 <= found[9] < 5000  # ms; the hub looks at the clock a little after the server
+        assert 250 <= found[9] < 5000  # age in ms; the hub and the server read the clock one after the other
         assert found[10] == 0
     assert gateway.line.asked == []
 
@@ -592,7 +592,7 @@ def test_values_from_before_a_sleep_read_as_unknown(gateway: Gateway) -> None:
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
     assert found[2:4] == UNKNOWN
-    assert found[8:10] == [0xFFFF, 0xFFFE]  # ms, at least
+    assert found[8:10] == [0xFFFF, 0xFFFE]  # the longest age
 
 
 @pytest.mark.parametrize(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])

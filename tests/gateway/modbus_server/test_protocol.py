@@ -37,13 +37,13 @@ def test_request_that_arrives_byte_by_byte_is_parsed() -> None:
 @table(
     "header",
     [
-        "00 01 00 01",  # of another protocol
+        "00 01 00 01",  # another protocol id
         "00 01 FF FF 00 06 01 03",
         "47 45 54 20",  # GET
         "16 03 01 02",  # TLS
         "00 01 00 00 00 00",
         "00 01 00 00 00 01",
-        "00 01 00 00 00 FF",  # one more than a frame has
+        "00 01 00 00 00 FF",  # one byte longer than the longest frame
         "00 01 00 00 FF FF",
     ],
 )

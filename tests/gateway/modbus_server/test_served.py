@@ -51,7 +51,7 @@ SETPOINT, CONTROL, OUTPUT_VOLTAGE, OUTPUT_CURRENT = (
 
 @contextmanager
 def gateway_of(path: Path) -> Iterator[Any]:
-    """Run the gateway of a plant file in a thread until the block is left."""
+    """Run the gateway of a plant file in a thread until the `with` block is left."""
     require_module("uvicorn")
     from multidrop.gateway.gateway import Gateway
 
@@ -98,7 +98,7 @@ def simulated_plant(folder: Path) -> Iterator[tuple[SimulatedDrive, Path]]:
 
 
 def reply_to(client: RawClient, *words: int) -> RawReply:
-    """The reply, asked for again where the line is busy or a reply was lost."""
+    """Return the reply to a request, which is repeated if the line is busy or a reply was lost."""
     found: list[RawReply] = []
 
     def ask() -> bool:
@@ -116,7 +116,7 @@ def test_drives_of_a_plant_file_are_read_written_and_stopped(tmp_path: Path) -> 
         server = gateway.feeds["modbus"]
         with RawClient(server.ports[""]) as client:
             until(lambda: reply_to(client, 3, OUTPUT_VOLTAGE, 1).words == [231] and server.answered["cached"])
-            assert reply_to(client, 3, OUTPUT_CURRENT, 1).words == [0]  # not polled: asked of the drive
+            assert reply_to(client, 3, OUTPUT_CURRENT, 1).words == [0]  # not polled, so read from the drive
             assert server.answered["passed"] > 0
             assert reply_to(client, 6, SETPOINT, 5000).code is None
             assert reply_to(client, 3, SETPOINT, 1).words == [5000]

@@ -119,7 +119,7 @@ class Stop:
 
 @table(
     "stop",
-    [  # as the manuals print them
+    [  # stop commands as the manuals print them
         Stop("erman-er-g-220", "stop_coil", 1),
         Stop("invt-che", "control", 5),
         Stop("invt-che", "control", 6),  # coast
@@ -127,7 +127,7 @@ class Stop:
         Stop("delixi-modbus", "control", 1),
         Stop("invt-che", "control", 8),  # jog stop
         Stop("yd1000", "control", 0xC000),
-        Stop("yd1000", "control", 0x8000),  # section 8.1, where FNOD says the frequency
+        Stop("yd1000", "control", 0x8000),  # manual section 8.1
         Stop("optidrive-e3", "control", 0),
         Stop("delta-ms300", "control", 1),
     ],

@@ -1,6 +1,6 @@
-"""Words that are computed from rows equal those that the drive sent, bit for bit, or are unknown.
+"""Words computed from rows are the drive's words bit for bit, or unknown.
 
-The core makes the rows from random bytes, which are compared with the words. No encoder is involved.
+The core decodes random bytes into rows, and the words computed from these rows must equal the bytes.
 """
 
 from __future__ import annotations
@@ -74,16 +74,16 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 
 
 @given(sent())
-@example((NumberFormat.F32, "ABCD", 1, 0, b"\x80\0\0\0"))  # -0.0: a row says 0.0
+@example((NumberFormat.F32, "ABCD", 1, 0, b"\x80\0\0\0"))  # -0.0, whose row has 0.0
 @example((NumberFormat.F32, "ABCD", 1, 0, bytes(4)))
 @example((NumberFormat.F32, "ABCD", 1, 0, b"\x7f\x80\0\0"))  # infinity
-@example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the least that there is
-@example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # no float64 is this number
+@example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the smallest positive float
+@example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # not representable as float64
 @example((NumberFormat.U64, "ABCD", 0.1, 0, (2**53 + 1).to_bytes(8)))
-@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # nor is its count the core's
+@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # the raw count has no float64 either
 @example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
-@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # the offset swallows it
+@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # lost when the offset is added
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
 def test_computed_words_equal_the_drives_words_or_are_none(
     case: tuple[NumberFormat, str, float, float, bytes],
@@ -110,7 +110,7 @@ def test_integer_values_always_have_words(
 
 @pytest.mark.slow
 def test_every_raw_count_of_16_bits_has_its_word() -> None:
-    """Every seventh by default."""
+    """By default every seventh count is tested."""
     for step in (0.1, 0.01, -0.25):
         register = declared(step=step)
         for raw in range(0, 0x10000, 2 * PART - 1):
@@ -141,7 +141,7 @@ def test_value_without_a_raw_count_has_no_words(value: float) -> None:
         {"part": (0, 3)},
         {"number_format": NumberFormat.I8},
         {"number_format": NumberFormat.U32_EITHER},
-        {"invalid": 5},  # the count that means no value
+        {"invalid": 5},  # the raw count that means "no value"
     ],
 )
 def test_format_that_leaves_bits_undefined_has_no_words(details: dict[str, Any]) -> None:
@@ -169,7 +169,7 @@ class Status(IntEnum):
 
 
 class Meter(Drive):
-    """A device with all kinds of registers that may be neighbours."""
+    """A device with adjacent registers of all kinds."""
 
     speed = reading(0, "rpm")
     energy = reading(1, "kWh", number_format=NumberFormat.U32, order="CDAB", step=0.1)
@@ -218,7 +218,7 @@ def read(function: int, start: int, count: int, *, since_ns: int = 0, **changed:
 
 def test_range_is_answered_with_the_drives_words() -> None:
     assert read(3, 0, 4) == [1450, 0x0002, 0x0001, 3]
-    assert read(3, 2, 1) == [0x0001]  # half of a number
+    assert read(3, 2, 1) == [0x0001]  # half of a 32-bit number
     assert read(4, 0, 1) == [12]
     assert read(3, 5, 2) == [0x3FC0, 0]
     assert read(1, 7, 1) == [1]
@@ -226,11 +226,11 @@ def test_range_is_answered_with_the_drives_words() -> None:
 
 
 def test_range_with_one_unknown_word_is_not_answered() -> None:
-    assert read(3, 3, 2) is Lack.UNPOLLED  # a part of a word
+    assert read(3, 3, 2) is Lack.UNPOLLED  # includes a register that is part of a word
     assert read(3, 9, 1) is Lack.UNPOLLED
     assert read(4, 0, 2) is Lack.UNPOLLED
     assert read(1, 0, 1) is Lack.UNPOLLED
-    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Lack.UNPOLLED  # +0 and -0
+    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Lack.UNPOLLED  # a float zero may be +0 or -0
 
 
 def test_range_with_a_stale_row_or_a_miss_is_not_answered() -> None:

@@ -1,4 +1,4 @@
-"""Fixtures: a broker, who listens to it, and parts of a gateway that are connected to it."""
+"""Fixtures: an MQTT broker, its listeners, and parts of a gateway that are connected to it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from multidrop.gateway.mqtt.settings import MqttSettings
 
 @pytest.fixture
 def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Broker]:
-    """A broker: mosquitto, or as the test's parameter makes it."""
+    """A running broker: mosquitto, unless the test's parameter makes another one."""
     require_module("paho.mqtt.client")
     with getattr(request, "param", mosquitto)(tmp_path) as broker:
         yield broker
@@ -31,7 +31,7 @@ def listener(broker: Broker) -> Iterator[Listener]:
 
 @pytest.fixture
 def host(broker: Broker) -> Iterator[Host]:
-    """A host of Sparkplug."""
+    """A Sparkplug host application."""
     host = Host(broker)
     yield host
     host.close()
@@ -41,7 +41,7 @@ def host(broker: Broker) -> Iterator[Host]:
 def start(
     request: pytest.FixtureRequest, broker: Broker, tmp_path: Path
 ) -> Iterator[Callable[..., tuple[Any, Running]]]:
-    """Start a part with these settings; return its context, and the part."""
+    """Return a function that starts a part with settings and returns the part's context and the part."""
     running: list[Running] = []
     fan = FAN if request.node.path.stem == "test_mqtt" else PLAIN_FAN
 

@@ -38,7 +38,7 @@ from multidrop.sim import Simulator, Wire, simulated
 
 
 class BreakableConnection:
-    """A connection that can be broken."""
+    """A connection that a test can break."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, bytes]] = []
@@ -112,19 +112,19 @@ def test_acknowledged_messages_make_room_immediately() -> None:
         outbox.put(said(f"{topic}"))
     outbox.acknowledge(range(1, MOST_UNDER_WAY + 1))
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
-    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # of a connection before
+    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # numbers of an earlier connection
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
 
 
 def test_messages_beyond_the_limit_are_dropped_and_counted() -> None:
-    """The senders of commands name the topics of the answers."""
+    """The limit is needed because senders of commands can choose the topics of answers."""
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     wire.is_open = False
     for at in range(MOST_WAITING + 10):
         outbox.put(said(f"{at}"))
     assert outbox.dropped == 10
-    outbox.put(said("0", b"newer"))  # a topic that waits already has its place
+    outbox.put(said("0", b"newer"))  # replaces the pending message of this topic
     assert outbox.dropped == 11
     wire.is_open = True
     outbox.flush()
@@ -149,7 +149,7 @@ class Silent:
 
 
 class Loop:
-    """An event loop that runs its scheduled calls when the test says so."""
+    """An event loop that runs its scheduled calls when the test requests it."""
 
     def __init__(self) -> None:
         self.calls: list[Callable[[], None]] = []
@@ -180,20 +180,20 @@ def test_event_loop_is_woken_once_for_a_burst_of_acknowledgements(monkeypatch: p
 
 
 OUT_S = float(os.environ.get("BROKER_OUT_S", "1.5"))
-PERIOD_S = 0.25  # of each drive
+PERIOD_S = 0.25  # polling period of each drive
 DRIVES = ("pump-1", "pump-2", "fan-1")
 SECOND_NS = 1_000_000_000
 SERVE = '[serve.may]\nstop = "anyone"\n[serve.mqtt]\nbroker = "{}"\nevery = "0.1 s"\nsparkplug = "works"\n'
 
 
 class Slot(NamedTuple):
-    at_ns: int  # by the monotonic clock
+    at_ns: int  # time of the request (CLOCK_MONOTONIC)
     status: str
-    late_s: float  # until it was handed out
+    late_s: float  # delay from the request until the part received the row
 
 
 class Slots:
-    """A part that records every slot of each drive, and how late it is called for it."""
+    """A part that records every polling slot of each drive, and how late the part receives the row."""
 
     def __init__(self) -> None:
         self._found: dict[str, list[Slot]] = defaultdict(list)
@@ -240,7 +240,7 @@ def figures(gateway: Served) -> dict[str, float]:
 
 
 def watched(slots: Slots) -> dict[str, list[Slot]]:
-    """Return the slots of so many seconds from now on."""
+    """Wait for OUT_S seconds, and return the slots of that time."""
     begin = time.monotonic_ns()
     end = begin + int(OUT_S * SECOND_NS)
     until(lambda: slots.seen_until() > end, patience=OUT_S + 120)
@@ -267,7 +267,7 @@ def test_polling_is_unchanged_while_the_broker_is_frozen_or_gone(tmp_path: Path,
             told = gateway.get("/health").json["parts"]["mqtt"]
             assert told.startswith(f"no connection to 127.0.0.1:{broker.port}")
             lost = figures(gateway)["dropped_total"]
-            until(lambda: figures(gateway)["dropped_total"] >= lost + 2 * len(DRIVES))  # each turn
+            until(lambda: figures(gateway)["dropped_total"] >= lost + 2 * len(DRIVES))  # in each period
         stopped = gateway.post("/api/stop").json
         assert {name: one["done"] for name, one in stopped.items()} == dict.fromkeys(DRIVES, True)
 

@@ -1,4 +1,4 @@
-"""BrokerCommands: how many commands of a broker may be in progress, and what they delay."""
+"""BrokerCommands: the limit of concurrent commands from a broker, which does not apply to stops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NOW_MS = 1_000_000
 
 
 class HeldCommands:
-    """Commands that end when the test lets them; stops at once."""
+    """Commands that end when the test releases them; stops end immediately."""
 
     plant_ns = None
 
@@ -45,7 +45,7 @@ async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
     )
     for value in range(MOST_UNDER_WAY + 2):
         orders.write("pump-1", "setpoint", value, NOW_MS)
-    await asyncio.sleep(0)  # they begin
+    await asyncio.sleep(0)  # the commands start
     assert commands.begun == [*range(MOST_UNDER_WAY)]
     refused = f"not sent: {MOST_UNDER_WAY} others are under way"
     assert told == [(f"setpoint = {MOST_UNDER_WAY + at}", refused) for at in range(2)]

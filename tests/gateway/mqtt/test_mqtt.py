@@ -1,4 +1,4 @@
-"""MQTT through a real broker, heard and commanded by mosquitto's own clients."""
+"""MQTT through a real broker; mosquitto's own clients receive values and send commands."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_messages_without_a_connection_are_counted(tmp_path: Path) -> None:
         of_json, of_sparkplug = (broker.outbox for broker in part._brokers)
         assert (of_json.dropped, of_sparkplug.dropped) == (0, 0)
         running.step()
-        assert (of_json.dropped, of_sparkplug.dropped) == (2, 0)  # of two drives, without changes
+        assert (of_json.dropped, of_sparkplug.dropped) == (2, 0)  # two drives; Sparkplug sends only changes
         for frequency in (1.0, 2.0):
             part._speakers[0]._hub.values["pump-1", "output_frequency"] = frequency
             running.step()
@@ -133,21 +133,21 @@ def test_closing_publishes_offline(broker: Broker, listener: Listener, tmp_path:
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.close()
     listener.wait_for(has("multidrop/gateway", b"offline"))
-    for drive in ("pump-1", FAN.name):  # the next plant file may lack it
+    for drive in ("pump-1", FAN.name):  # each drive, because the next plant file may lack it
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
 def test_failing_publisher_is_offline_and_still_carries_out_stops(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
-    """The values that the broker keeps would pass for the present, for it has a connection."""
+    """Otherwise the broker's retained values would look current, because the connection is up."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
     running.step()
     listener.wait_for(has("multidrop/gateway", b"offline"))
     assert running._part.health() == "publishing fails: KeyError: 'pump-1'"
-    running.step()  # once is enough
+    running.step()  # publishes "offline" only once
     publish(broker, "multidrop/pump-1/stop", b"now")
     listener.wait_for(has("multidrop/pump-1/told"))
     assert known.commands.noted == [("stop", ["pump-1"])]
@@ -166,7 +166,7 @@ def test_failing_publisher_is_offline_on_a_new_connection_too(listener: Listener
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
     running.cut(0)
-    for said in (b"offline", b"online", b"offline"):  # by the will, by the new connection, and at once
+    for said in (b"offline", b"online", b"offline"):  # the will, the new connection, its failure
         listener.wait_for(has("multidrop/gateway", said))
     known.hub.states["pump-1"] = state
     running.step()
@@ -283,7 +283,7 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
 def test_stop_is_carried_out_whatever_its_payload(
     broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
 ) -> None:
-    """The payloads are long, truncated, or not text."""
+    """The payloads are too long, truncated, or not text."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, f"multidrop/{topic}", payload)
@@ -346,7 +346,7 @@ def test_stop_verb_stops_the_drive_of_its_topic_and_the_drive_it_names(
     ("topic", "named", "stopped"),
     [
         ("pump-1", "Lu\u0308fter", ["pump-1", "L\u00fcfter"]),
-        ("Lu\u0308fter", "L\u00fcfter", ["Lu\u0308fter"]),  # one drive: Commands finds it
+        ("Lu\u0308fter", "L\u00fcfter", ["Lu\u0308fter"]),  # one drive in two spellings
         ("L\u00fcfter", "Lu\u0308fter", ["L\u00fcfter"]),
     ],
 )
@@ -375,7 +375,7 @@ def test_unknown_verb_or_ambiguous_drive_is_refused(broker: Broker, listener: Li
 
 
 def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listener, start: Start) -> None:
-    """Its drive's name may be that of another one now."""
+    """After a reload, the name may mean another drive."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     sent_ms = now_ms()
@@ -389,7 +389,7 @@ def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listen
 def test_command_older_than_a_stop_is_refused(
     broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool
 ) -> None:
-    """A broker that held it up gives it after the stop; its sender's clock may be fast by 2 s."""
+    """A broker may deliver a delayed command after the stop; the sender's clock may be fast by 2 s."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     sent_ms = now_ms()
@@ -449,7 +449,7 @@ def test_invalid_commands_are_reported(
 def test_an_unsendable_answer_does_not_affect_other_messages(
     broker: Broker, listener: Listener, start: Start, drive: str, verb: str
 ) -> None:
-    """A verb that is no UTF-8, and a topic whose answer's would be too long: 65,536 bytes."""
+    """A verb is not UTF-8, and the topic of another answer would be too long (65,536 bytes)."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     outbox = running._part._brokers[0].outbox
@@ -465,7 +465,7 @@ def test_an_unsendable_answer_does_not_affect_other_messages(
 
 
 def test_infinite_value_is_published_as_null(listener: Listener, start: Start) -> None:
-    """JSON has none: who reads the message would lose all other values with it."""
+    """JSON has no infinity: a reader would have to reject the whole message."""
     known, running = start()
     listener.wait_for(has("multidrop/pump-1"))
     known.hub.values[("pump-1", "output_frequency")] = float("inf")
@@ -495,7 +495,7 @@ def test_without_commands_only_node_commands_are_subscribed(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("is_retained", [False, True])
 async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
-    """A broker may send messages without a subscription."""
+    """A broker may send messages on topics without a subscription."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
     part: Any = build(MqttSettings(sparkplug="works", node="line"), known)
@@ -574,8 +574,8 @@ def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
     return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
 
 
-# Keys of Home Assistant 2026.11's documentation of MQTT (device discovery, sensor, binary sensor, number,
-# select, button): those of each platform that are used here, and those without which it refuses a component.
+# By platform: the keys used here, and the keys that Home Assistant requires. Source: its documentation of
+# MQTT, version 2026.11 (device discovery, sensor, binary sensor, number, select, button).
 HA_KEYS = {
     "sensor": (
         {"state_topic"},
@@ -584,7 +584,7 @@ HA_KEYS = {
     ),
     "binary_sensor": ({"state_topic"}, {"value_template", "expire_after", "device_class"}),
     "number": (
-        {"command_topic", "min", "max"},  # without a span it is 1 to 100
+        {"command_topic", "min", "max"},  # without min and max, the range is 1 to 100
         {"state_topic", "value_template", "command_template", "retain", "step", "mode", "entity_category"}
         | {"unit_of_measurement"},
     ),
@@ -597,7 +597,7 @@ HA_KEYS = {
 
 
 def check_components(found: Any) -> None:
-    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # all components have those
+    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # each component has its own
     assert found["dev"]["ids"]
     for part in found["cmps"].values():
         needed, known = HA_KEYS[part["p"]]
@@ -627,7 +627,7 @@ def test_components_of_each_family_have_valid_home_assistant_keys(model: str) ->
 
 
 class Awkward(Drive):
-    """A user's own, whose registers have the names of our components."""
+    """A user's own drive, whose registers have the names of our components."""
 
     title = "ACME A-1"
     running = reading(1, "Hz")
@@ -681,7 +681,7 @@ def test_binary_sensors_follow_the_state_of_the_drive(state: str, problem: str, 
 
 
 def test_raw_count_without_a_name_is_unknown_in_home_assistant() -> None:
-    """Home Assistant ignores a state that is no option, and shows the one before it."""
+    """Home Assistant ignores a state that is not in its options, and keeps showing the previous one."""
     part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
     values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
     assert values == ["FORWARD", "None", "None"]
@@ -814,7 +814,7 @@ class PutMessages:
 
 
 def test_topics_of_a_drive_removed_without_a_connection_are_deleted_on_the_next(tmp_path: Path) -> None:
-    """Messages that wait are dropped when a connection breaks; the topics would say old values for ever."""
+    """Pending deletions are dropped when a connection breaks, so they must be repeated on the next one."""
     known = inside(tmp_path)
     whole = known.plant
     topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)

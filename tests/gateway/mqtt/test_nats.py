@@ -1,4 +1,4 @@
-"""MQTT through the listener of nats-server: state that is kept, the last will, commands, and Sparkplug."""
+"""MQTT through the listener of nats-server: retained state, the last will, commands, and Sparkplug."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Start = Callable[..., tuple[Any, Running]]
 
 
 def nats_of(program: Callable[[], str]) -> Any:
-    """Return the parameter of a test whose broker is a nats-server."""
+    """Return a test parameter that makes the broker a nats-server."""
     return pytest.mark.parametrize("broker", [lambda folder: nats(folder, program())], indirect=True)
 
 
@@ -96,7 +96,7 @@ def test_retained_command_is_refused(broker: Broker, listener: Listener, start: 
 @pytest.mark.slow
 @nats_of(old_server_program)
 def test_rejected_topics_do_not_delay_others(broker: Broker, listener: Listener, start: Start) -> None:
-    """The namespace of Sparkplug has a dot, with which nats-server closes the connection before 2.10."""
+    """Sparkplug's namespace has a dot, for which nats-server before 2.10 closes the connection."""
     known, running = start(sparkplug="works", node="line")
     listener.wait_for(has("multidrop/pump-1"))
     until(lambda: running._part.health().startswith(f"no connection to 127.0.0.1:{broker.port}"))

@@ -28,7 +28,7 @@ THERE = {"pump-1"}
 
 
 def heard(*messages: tuple[str, bytes], prefix: str = "works") -> list[str]:
-    """Return the retained topics that a gateway with one pump deletes if the broker has these."""
+    """Return the topics that a gateway with one pump deletes if the broker has these retained messages."""
     left_behind = RetainedTopics(prefix, home_assistant=True)
     return [topic for message in messages for topic in left_behind.hear(*message, THERE)]
 
@@ -55,7 +55,7 @@ def test_retained_messages_of_present_drives_stay() -> None:
     assert heard(GATEWAY, *mine) == []
     back = RetainedTopics("works", home_assistant=True)
     assert back.hear("works/old/available", b"offline", THERE) == []
-    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # it was adopted since
+    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # a reload has added the drive since
 
 
 def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
@@ -75,7 +75,7 @@ def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
         (
             "works/old/available",
             b'{"state": "runs"}',
-        ),  # of prefix works/old and its drive "available"
+        ),  # values of the drive "available" of a gateway with the prefix works/old
         ("works/old/available", b""),
         ("works/old", b"online"),
         ("available", b"online"),
@@ -85,7 +85,7 @@ def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
         (
             "homeassistant/device/works-hall-fan/config",
             configuration("works-hall/fan"),
-        ),  # its prefix
+        ),  # a gateway with the prefix works-hall
         ("homeassistant/device/works-old/config", configuration("works/new")),
         ("homeassistant/device/works-old/config", configuration(["works/old"])),
         ("homeassistant/device/works-old/config", b"[" * 100_000),
@@ -122,7 +122,7 @@ def kept_at(broker: Broker) -> set[str]:
 
 
 def live_and_die(broker: Broker, folder: Path, listener: Listener) -> None:
-    """Let a gateway with pump and fan publish everything, and cut its connection for good."""
+    """Let a gateway with pump and fan publish all messages, then cut its connection permanently."""
     part: Any = build(MqttSettings(broker.address, home_assistant=True), inside(folder))
     with closing(Running(part)) as running:
         listener.wait_for(lambda one: one.topic == "multidrop/pump-1/available")

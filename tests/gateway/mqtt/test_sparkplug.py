@@ -32,7 +32,7 @@ metrics = st.sampled_from(DataType).flatmap(
 
 
 def value_of(metric: Any) -> object:
-    """The value as Sparkplug's host takes it."""
+    """Return a metric's value as a Sparkplug host reads it."""
     if metric.is_null:
         return None
     value = getattr(metric, metric.WhichOneof("value"))
@@ -79,7 +79,7 @@ def test_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> No
 
 
 @given(st.binary(max_size=300))
-def test_arbitrary_bytes_are_decoded_or_raise_value_error(data: bytes) -> None:
+def test_any_bytes_are_decoded_or_raise_value_error(data: bytes) -> None:
     try:
         time_ms, found = read_command(data)
     except ValueError:
@@ -93,4 +93,4 @@ def test_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject) -
     whole = bytearray(payload(5, [Metric(DataType.DOUBLE, 2.5, 5, "setpoint", 3)], 1))
     whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     del whole[data.draw(st.integers(0, len(whole))) :]
-    test_arbitrary_bytes_are_decoded_or_raise_value_error.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
+    test_any_bytes_are_decoded_or_raise_value_error.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]

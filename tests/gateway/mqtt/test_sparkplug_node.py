@@ -68,7 +68,7 @@ def test_node_sends_births_data_and_deaths(host: Host, node: tuple[Any, Running]
 
 
 def test_fault_text_is_published_without_a_polled_fault_register(tmp_path: Path) -> None:
-    """Its register called `fault` is a number without names."""
+    """This drive's register `fault` is a number without names, and is not polled."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
@@ -165,7 +165,7 @@ def test_only_the_final_birth_or_death_of_pending_messages_is_sent(tmp_path: Pat
         return len(sent)
 
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
-    node.outbox = outbox = Outbox(send)  # fewer than may be under way
+    node.outbox = outbox = Outbox(send)  # the test sends fewer messages than MOST_UNDER_WAY
     node.will()
     node.connected()
     assert [kind for kind, _ in sent] == ["NBIRTH", "DBIRTH", "DBIRTH"]
@@ -220,7 +220,7 @@ def test_fresh_write_and_any_stop_of_a_host_are_carried_out(
 async def test_stop_in_an_invalid_payload_is_sent(
     tmp_path: Path, damage: bytes, name: bytes, noted: list[object]
 ) -> None:
-    """A group, a name that is no UTF-8, and a metric that was cut off, behind a boolean metric."""
+    """A boolean metric is followed by an invalid field, a name that is not UTF-8, or a truncated metric."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 7)
     metric = b"\x0a" + bytes([len(name)]) + name + b"\x70\x01"
@@ -234,7 +234,7 @@ async def test_stop_in_an_invalid_payload_is_sent(
 async def test_retained_write_is_refused_and_retained_stop_is_sent(
     tmp_path: Path, *, is_retained: bool
 ) -> None:
-    """It comes at every connection, and it may be fresh when it comes first."""
+    """A retained write is delivered on every connection, and may be recent on the first."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
     given = [Metric(DataType.DOUBLE, 25.0, 1_000, "setpoint"), Metric(DataType.BOOLEAN, 1, 1_000, STOP)]

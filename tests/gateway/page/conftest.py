@@ -12,12 +12,12 @@ from fake_gateway import FakeGateway
 from namespaces import steady_network
 from watching import LIVE, PATIENCE_S, SIZES, Opener, missing, until
 
-# The first is the same engine without windows: a test takes a third of the processor time.
+# The first program is Chromium's engine without windows, which needs a third of the processor time.
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # a rebound name
+OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # for DNS rebinding
 
 
-# Not for the session: playwright keeps a loop running in this thread, which other files' tests may not have.
+# Scope "module": playwright keeps an event loop running in this thread, which would break other tests.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     try:
@@ -48,14 +48,14 @@ def gateway() -> Iterator[FakeGateway]:
 
 @pytest.fixture
 def few_drives(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Have few drives in the plant, some of each state, and return their number: each takes time to draw."""
+    """Reduce the plant to a few drives of every state, to save drawing time; return their number."""
     monkeypatch.setattr(fake_plant, "NAMES", fake_plant.FEW_NAMES)
     return len(" ".join(fake_plant.FEW_NAMES).split())
 
 
 @pytest.fixture
 def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
-    """Open a view of the page; fail at the end if the page had an error or violated its CSP."""
+    """Return a function that opens a view; the test fails if the page had an error or violated its CSP."""
     contexts, problems = [], []
 
     def open_page(view: str = "#/drives", size: str = "desk", live: bool = True, **options: Any) -> Any:
@@ -80,7 +80,7 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """A page without a gateway; fail at the end if it had an error or violated its CSP."""
+    """A page without a gateway; the test fails if the page had an error or violated its CSP."""
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_S * 1000)
     page, problems = context.new_page(), []
@@ -92,5 +92,5 @@ def page(browser: Any) -> Iterator[Any]:
 
 
 def is_problem(said: Any) -> bool:
-    """Return True for errors but those of requests, which tests let fail."""
+    """Return True for errors other than failed requests, which some tests cause."""
     return said.type in ("error", "warning") and "Failed to load resource" not in said.text

@@ -1,4 +1,4 @@
-"""A small gateway for tests of the page: its routes, with answers that a test may set, and a death."""
+"""A small gateway for tests of the page: its routes, with answers that a test may set. It can be killed."""
 
 from __future__ import annotations
 
@@ -29,47 +29,47 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-FRAMES_A_SECOND = 5  # as the gateway itself gives at most
-REMEMBERED = 5  # frames
-HOLD_S = 20  # before a request for a frame is answered with 304
+FRAMES_A_SECOND = 5  # the real gateway's limit
+REMEMBERED = 5  # number of newest frames kept
+HOLD_S = 20  # time after which a request for a frame is answered with 304
 
 
 class FakeGateway:
-    """A server on a free port of 127.0.0.1. What tests set is read at each request."""
+    """A server on a free port of 127.0.0.1. Tests may change its attributes at any time."""
 
     def __init__(self, port: int = 0) -> None:
         self.renamed: dict[str, str] = {}
-        self.stuck: dict[str, float] = {}  # drives whose values stay as at this time
-        self.clocked: str | None = None  # a drive whose frequency is the time
-        self.plant_changes: dict[str, Any] = {}  # keys of the plant with other values
-        self.changes: dict[str, Any] = {}  # keys of the frame with other values
-        self.drive_changes: dict[str, dict[str, Any]] = {}  # keys of a drive in it, by its name
-        self.posts: list[tuple[str, Any]] = []  # without their earlier values
-        self.seen: list[int] = []  # the frames that commands named
-        self.stops: dict[str, int] = {}  # that were called, by drive
-        self.is_held: threading.Event | None = None  # for which answers to stops wait
-        self.confirms = False  # the head of such an answer is sent immediately
-        self.token: str | None = None  # POST requires it if it is set
+        self.stuck: dict[str, float] = {}  # by drive: time (s) since which its values are constant
+        self.clocked: str | None = None  # name of a drive whose frequency shows the time
+        self.plant_changes: dict[str, Any] = {}  # replaced keys of the plant description
+        self.changes: dict[str, Any] = {}  # replaced keys of the frame
+        self.drive_changes: dict[str, dict[str, Any]] = {}  # by drive: replaced keys in the frame
+        self.posts: list[tuple[str, Any]] = []  # path and body of each POST request
+        self.seen: list[int] = []  # numbers of the frames that commands named
+        self.stops: dict[str, int] = {}  # by drive: number of stops called
+        self.is_held: threading.Event | None = None  # answers to stops wait for this event
+        self.confirms = False  # True: the head of a waiting answer is sent immediately
+        self.token: str | None = None  # token that POST requests need; None: no token
         self.has_history = True
-        self.recorded: dict[str, dict[str, object]] = {}  # by series, what else its history says of it
-        self.knows_since = 0  # UTC, ms: it has no alarms of before
-        self.maximum_hz = 50.0  # that the drive holds
-        self.has_changed = False  # it knows no alarm that is acknowledged
-        self.parameters: list[dict[str, Any]] = []  # answers for parameters, the last one again and again
-        self.fleet: dict[str, Any] = {}  # keys of /api/fleet with other values
-        self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # of a stop of the fleet
+        self.recorded: dict[str, dict[str, object]] = {}  # by series: additional keys of its history
+        self.knows_since = 0  # time from which alarms are known, UTC in ms
+        self.maximum_hz = 50.0  # value of the maximum frequency of drives
+        self.has_changed = False  # True: acknowledging any alarm fails with "unknown"
+        self.parameters: list[dict[str, Any]] = []  # successive answers; the last one is repeated
+        self.fleet: dict[str, Any] = {}  # replaced keys of /api/fleet
+        self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # outcomes of a stop of the fleet
         self.reloaded: dict[str, Any] = {
             "done": True,
             "text": "plant.toml is in effect",
             "mistakes": [],
             "restart": [],
         }
-        self.is_silent = False  # requests for frames are not answered
-        self.stands_still = False  # no newer frame comes
+        self.is_silent = False  # True: requests for frames are not answered
+        self.stands_still = False  # True: no newer frames are made
         self.began = time.time()
         self.outcomes: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
-        self._made: dict[int, dict[str, Any]] = {}  # the newest frames
+        self._made: dict[int, dict[str, Any]] = {}  # by number: the newest frames
         self._sockets: set[socket.socket] = set()
         self._server = _Server(("127.0.0.1", port), _handler(self))
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
@@ -78,7 +78,7 @@ class FakeGateway:
         self.url = f"http://127.0.0.1:{self.port}/"
 
     def kill(self) -> None:
-        """Close the listener and every connection, as a kernel does for a killed process."""
+        """Close the listener and all connections, as the kernel does for a killed process."""
         self._server.shutdown()
         self._server.server_close()
         for connection in list(self._sockets):
@@ -90,7 +90,7 @@ class FakeGateway:
         return 1 if self.stands_still else int((time.time() - self.began) * FRAMES_A_SECOND) + 1
 
     def encoded(self, after: int) -> bytes:
-        """Return the newest frame, or what changed in it since another one that is remembered."""
+        """Return the newest frame, or its changes since frame `after` if that is still remembered."""
         with self._lock:
             number = self.number()
             if number not in self._made:

@@ -1,4 +1,4 @@
-"""A plant of three lines and 31 drives with values that move, shaped as the gateway's answers."""
+"""A plant of three lines and 31 drives with changing values, in the format of the gateway's answers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ NAMES = (
     "tower-fan-1 tower-fan-2 tower-fan-3 chilled-1 chilled-2 booster-1 booster-2 exhaust-1 exhaust-2 "
     "compressor",
 )
-FEW_NAMES = ("pump-1 pump-2 pump-4 conveyor-2", "filler-2 labeller", "booster-1")  # one or two of each state
+FEW_NAMES = ("pump-1 pump-2 pump-4 conveyor-2", "filler-2 labeller", "booster-1")  # by line
 FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-220")
 STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
 FAULTS = {"conveyor-2": ("overcurrent in acceleration", 240), "booster-1": ("undervoltage", 5220)}
 SILENT = {"labeller": 42}
-KINDS = ("fault", "stopped", "port", "silent")  # the gravest first
+KINDS = ("fault", "stopped", "port", "silent")  # kinds of alarms, the gravest first
 SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
 
 
@@ -70,7 +70,7 @@ KEY = {"frequency": "output_frequency", "current": "output_current", "setpoint":
 
 
 def plant(renamed: dict[str, str]) -> dict[str, Any]:
-    """Return `GET /api/plant`; drives of `renamed` have other names."""
+    """Return the answer to `GET /api/plant`; `renamed` has new names for drives."""
     lines = [
         {
             "name": f"hall-{n + 1}", "port": f"/dev/ttyUSB{n}", "speed": SPEEDS[n],
@@ -105,7 +105,7 @@ def state(name: str) -> str:
 
 
 def values(name: str, number: int, now: float) -> dict[str, float]:
-    """Return all registers of a drive at this time (s)."""
+    """Return the values of all registers of a drive at this time (s)."""
     runs = state(name) == "runs"
     set_to = 20 + number * 7 % 28
     swing = math.sin(now / 9 + number * 1.7)
@@ -128,7 +128,7 @@ def values(name: str, number: int, now: float) -> dict[str, float]:
 
 
 def alarms(renamed: dict[str, str], now: float) -> list[dict[str, Any]]:
-    """Return those that last and two that ended, newest first."""
+    """Return the active alarms and two ended ones, newest first."""
     since = {**{name: (text, age, "fault") for name, (text, age) in FAULTS.items()}}
     since |= {name: ("no reply", age, "silent") for name, age in SILENT.items()}
     lasting = [
@@ -161,7 +161,7 @@ def ms(seconds: float) -> int:
 
 
 def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]) -> dict[str, Any]:
-    """Return a frame. A drive of `stuck` has not had a new value since that time (s), and no miss."""
+    """Return a frame. A drive in `stuck` has its newest values from that time (s), without later misses."""
     now = time.time()
     drives = {}
     for number, name in enumerate(" ".join(NAMES).split()):
@@ -205,7 +205,7 @@ def lines() -> dict[str, Any]:
 
 
 def fleet(began: float) -> dict[str, Any]:
-    """Return `GET /api/fleet`: three gateways, of which one has died just now, and twelve lines."""
+    """Return the answer to `GET /api/fleet`: twelve lines and three gateways, one of which has just died."""
     at = int(began * 1000)
     spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}
     says = {"state": "working", "margin_s": 2.14, "troubles": {}, "trouble": "", "spool": spool}
@@ -221,7 +221,7 @@ def fleet(began: float) -> dict[str, Any]:
             "port": f"socket://10.0.0.{n}:4001", "revision": n, "session": 5,
             "master": f"gw-{n % 3 + 1}" if n > 1 else None, "since_ms": at - 60_000 * n if n > 1 else None,
         }
-        for n in sorted(range(1, 13), key=str)  # as the gateway sorts names
+        for n in sorted(range(1, 13), key=str)  # in the gateway's order
     }  # fmt: skip
     moves = [
         {"line": f"hall-{n}", "revision": n, "at_ms": at - 60_000 * n, "from": before, "to": "gw-1"}

@@ -1,4 +1,4 @@
-"""Alarms on the page: the most serious first, one for each lost port, and who acknowledged them."""
+"""Alarms on the page: order, one alarm per lost port, and acknowledgements with their senders."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_gravest_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> 
     assert rows.locator(".who").all_inner_texts() == wanted
     kinds = ["fault", "stopped by itself", "port lost", "silent", "fault"]
     assert [kind.strip() for kind in rows.locator(".kind").all_inner_texts()] == kinds
-    assert page.locator("#count").inner_text() == "4"  # these are not acknowledged
+    assert page.locator("#count").inner_text() == "4"  # number of unacknowledged alarms
     assert "acknowledged" in rows.last.inner_text()
     assert "by anna: fuse" in rows.last.inner_text()
     assert rows.last.get_by_role("button").count() == 0

@@ -26,7 +26,7 @@ VIEWS = (
 )
 LOOKS = [("desk", "light"), ("tablet", "light"), ("phone", "dark")]
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
-# Results other than violations would be a long list of all elements of the page.
+# Report violations only: other results would list all elements of the page.
 RUN = """tags => axe.run(document, { runOnly: tags, resultTypes: ["violations"] })
   .then(found => found.violations)"""
 
@@ -48,13 +48,13 @@ def violations(page: Any) -> list[str]:
 def test_axe_finds_no_violation(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, request: pytest.FixtureRequest
 ) -> None:
-    if size == "tablet":  # the long list of all drives is checked on a larger and on a smaller screen
+    if size == "tablet":  # other sizes check the long list of drives
         request.getfixturevalue("few_drives")
     gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)
     page.evaluate(axe)
     found = {}
-    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # long lists scroll if there is little room
+    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # long lists scroll on a small screen
         if view == "settings":
             page.get_by_role("button", name="Settings").click()
         elif view == "stop":
@@ -78,7 +78,7 @@ def test_axe_finds_no_violation(
 def test_axe_finds_no_violation_in_rare_states(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, few_drives: int
 ) -> None:
-    """Dialogs that send, what a write became, nothing known of a drive, one drive, no gateway."""
+    """Dialogs of commands, results of writes, a drive without values, a single drive, no gateway."""
     gateway.token = "right"
     page = opened("#/drives/pump-1", size=size, color_scheme=theme)
     page.evaluate(axe)
@@ -114,7 +114,7 @@ def test_axe_finds_no_violation_in_rare_states(
         "alarms": [],
         "troubles": ["history: the disk is full"],
     }
-    page.goto(f"{gateway.url}?again#/drives/pump-2")  # a page that has seen no value
+    page.goto(f"{gateway.url}?again#/drives/pump-2")  # a page that has received no values
     page.evaluate(axe)
     page.get_by_text(f"{few_drives} in unknown state").wait_for()
     look("nothing known")

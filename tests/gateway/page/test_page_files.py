@@ -1,4 +1,4 @@
-"""The page's files: no markup from texts, no violation of the CSP, no file missing."""
+"""The page's files: no markup made from texts, no violation of the CSP, no missing file."""
 
 from __future__ import annotations
 

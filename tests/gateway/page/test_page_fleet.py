@@ -53,7 +53,7 @@ def test_fleet_tables_fit_a_small_screen(opened: Opener, width: int) -> None:
     wide = "tables => tables.map(table => table.scrollWidth - table.clientWidth)"
     until_met(page, lambda: max(tables.evaluate_all(wide)) <= 0)
     lag = "getComputedStyle(document.querySelectorAll('#fleet-gateways td')[6], '::before').content"
-    until(page, f"{lag} === '\"Lag \"'")  # beside the value: the table's head is not there
+    until(page, f"{lag} === '\"Lag \"'")  # each cell shows its column's head
 
 
 def test_old_fleet_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
@@ -161,7 +161,7 @@ def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway:
 def test_failed_stop_of_the_fleet_is_reported_besides_own_drives(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """The fleet's servers are gone: the gateway's own drives were stopped all the same."""
+    """The fleet's servers do not answer, but the gateway's own drives are stopped."""
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"the fleet": {"done": False, "text": "the stop was NOT sent"}}
     page = opened("#/fleet")

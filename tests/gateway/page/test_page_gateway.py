@@ -1,4 +1,4 @@
-"""The page with the gateway itself: a simulated plant, polled and stopped through it."""
+"""The page with a real gateway, which polls and stops a simulated plant."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_killed_gateway_is_reported(page: Any) -> None:
 
 
 def test_delay_of_a_viewer_with_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
-    """`python -m bench.questions.page` measures how old what it sees is."""
+    """`python -m bench.questions.page` measures the age of the shown values."""
     with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)

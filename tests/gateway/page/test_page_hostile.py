@@ -1,4 +1,4 @@
-"""Hostile pages in Chromium read no data, and no write of theirs reaches the simulated wire."""
+"""Hostile pages in Chromium can read no data, and no write from them reaches the simulated wire."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from watching import LIVE, until
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
-# All ways by which a page can send or read data without permission. Each is [way, outcome].
+# Try all ways in which a page could send or read data without permission; return [way, outcome] for each.
 ATTACK = """async gateway => {
   const stop = '{"drives": null}', found = [];
   const note = (what, came) => found.push([what, came]);
@@ -46,8 +46,8 @@ ATTACK = """async gateway => {
   note('image', await loads('img', 'page/icon.svg'));
   return found;
 }"""
-# A form that sends JSON as text, as no form of ours does. Sent by a timer: the script itself has returned
-# before the browser leaves the page, else its result is lost.
+# A form that sends JSON as text, unlike our own forms. A timer submits it, so that the script returns its
+# result before the browser leaves the page.
 FORM = """gateway => {
   const form = document.createElement('form'), field = document.createElement('input');
   Object.assign(form, { method: 'POST', action: gateway + 'api/stop', enctype: 'text/plain' });
@@ -60,7 +60,7 @@ FORM = """gateway => {
 
 @pytest.fixture
 def elsewhere() -> Iterator[int]:
-    """A server on another port of this machine, with an empty page; its port."""
+    """Run a server with an empty page on another port of this machine; yield its port."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -82,7 +82,7 @@ def elsewhere() -> Iterator[int]:
 
 @pytest.fixture
 def strange(browser: Any) -> Iterator[Any]:
-    """A page whose errors are expected."""
+    """A browser page whose errors do not fail the test."""
     context = browser.new_context()
     yield context.new_page()
     context.close()
@@ -93,7 +93,7 @@ def written(gateway: Served) -> list[Any]:
 
 
 def sent_by_form(page: Any, gateway: str) -> int:
-    """Submit the form, and return the status of the answer."""
+    """Submit the form, and return the HTTP status of the answer."""
     with page.expect_response("**/api/stop") as answer:
         page.evaluate(FORM, gateway)
     page.wait_for_url("**/api/stop")
@@ -106,13 +106,13 @@ def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, t
         port = gateway.gateway.port
         refused = dict.fromkeys(("read", "read blindly", "post", "post a text", "start"), "TypeError")
         refused |= {"post a text blindly": "TypeError", "script": "error", "image": "error"}
-        # A page of another site, and one of another port of the very host that the gateway has.
+        # A page of another site, and a page of another port of the gateway's own host.
         for host, ours in (("evil.example", "127.0.0.1"), ("localhost", "localhost")):
             strange.goto(f"http://{host}:{elsewhere}/")
             own = f"http://{ours}:{port}/"
             assert dict(strange.evaluate(ATTACK, own)) == refused, host
             assert sent_by_form(strange, own) == 403
-        # A name of another site that leads to this machine: to the browser it is the gateway's own page.
+        # DNS rebinding: another site's name leads to this machine; to the browser it is the gateway's page.
         rebound = f"http://evil.example:{port}/"
         assert strange.goto(rebound).status == 421
         came = dict(strange.evaluate(ATTACK, rebound))
@@ -127,10 +127,10 @@ def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, t
         setpoint = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
         start = {"drive": "pump-1", "verb": "start"}
         assert strange.evaluate(send, ["api/write", setpoint]) == 401
-        assert strange.evaluate(send, ["api/act", start]) == 403  # the token has the right to stop only
+        assert strange.evaluate(send, ["api/act", start]) == 403  # the token has only the right to stop
         assert strange.evaluate(send, ["api/reload", {"confirm": True}]) == 401
         assert written(gateway) == []
         assert (
             strange.evaluate(send, ["api/stop", {"drives": None}]) == 200
-        )  # the same request, from our own page
+        )  # the same request from our own page is accepted
         until_here(lambda: written(gateway))

@@ -16,13 +16,13 @@ from watching import LIVE, STALE, Opener, cell, link, until, until_met
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 DASH = "\u2013"
-BUSY_S = 20.0  # far beyond the promised 0.5 s: that is measured on a quiet machine
+BUSY_S = 20.0  # for busy machines; a benchmark checks the promised 0.5 s
 OVER = "cell => cell.scrollWidth - cell.clientWidth"
 FRESH = "tr.drive td.frequency .value:not(.old)"
 
 
 def test_page_shows_live_values_of_all_drives(opened: Opener, gateway: FakeGateway) -> None:
-    gateway.clocked = "pump-1"  # its frequency is the time
+    gateway.clocked = "pump-1"  # this drive's frequency shows the time
     page = opened()
     assert page.locator("tr.drive").count() == 31
     ages = []
@@ -32,7 +32,7 @@ def test_page_shows_live_values_of_all_drives(opened: Opener, gateway: FakeGatew
         page.wait_for_timeout(70)
     assert max(ages) < BUSY_S
     old = page.locator("tr.drive .old")
-    until_met(page, lambda: old.count() == 2)  # frequency and current of the silent drive
+    until_met(page, lambda: old.count() == 2)  # the silent drive's frequency and current
 
 
 def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:
@@ -64,7 +64,7 @@ def test_hanging_gateway_is_reported_and_values_become_old(opened: Opener, gatew
 def test_old_values_stay_old_when_the_viewers_clock_is_set_back(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer shows the gateway's clock
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # so that no answer shows the gateway's clock
     page = opened()
     gateway.is_silent = True
     page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
@@ -78,7 +78,7 @@ def test_page_is_live_again_when_the_gateway_is_restarted(opened: Opener, gatewa
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
-    again = FakeGateway(gateway.port)  # its frames are numbered from 1 again
+    again = FakeGateway(gateway.port)  # frame numbers restart at 1
     try:
         until(page, LIVE)
         until_met(page, lambda: page.locator(FRESH).count() == 30)
@@ -125,7 +125,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
     assert 42_000 <= age < 3_000_000
     assert is_old
     until(page, LIVE)
-    value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", False])  # started again
+    value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", False])  # after a restart
     assert value is None
     assert is_old
     until(page, LIVE)
@@ -137,7 +137,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
 def test_values_of_a_slow_line_stay_fresh_for_seconds(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The period comes from the plant file; the gateway knows how long a value is current."""
+    """The polling period comes from the plant file; the gateway knows how long a value is current."""
     held = [one | {"holds_s": one["holds_s"] and 600.0} for one in fake_plant.REGISTERS]
     monkeypatch.setattr(fake_plant, "REGISTERS", held)
     gateway.stuck = {"pump-2": time.time() - 20}
@@ -177,7 +177,7 @@ def test_unknown_values_are_shown_as_a_dash_and_never_as_zero(opened: Opener, ga
     assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
     shown = page.locator(".registers .number")
-    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # three readings
+    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # 3 known
     assert page.locator("tr.head .wire").first.inner_text().split() == [
         "wire",
         DASH,
@@ -220,7 +220,7 @@ def test_times_have_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> N
     assert not re.search(r"\b[ap]m\b", page.locator("body").inner_text(), re.IGNORECASE)
     page.keyboard.press("u")
     page.reload()
-    until(page, "document.querySelector('#clock').textContent.endsWith('local')")  # it is kept
+    until(page, "document.querySelector('#clock').textContent.endsWith('local')")  # the choice is kept
 
 
 @pytest.mark.long
@@ -237,13 +237,13 @@ def test_nine_tabs_are_live_together(browser: Any, gateway: FakeGateway) -> None
     shown = "Number([...document.querySelectorAll('tr.drive .number')][0].textContent)"
     first = [page.evaluate(shown) for page in pages]
     for page, before in zip(pages, first, strict=True):
-        until(page, f"{shown} !== {before} && {LIVE}")  # it starts again at 1000
+        until(page, f"{shown} !== {before} && {LIVE}")  # the shown number wraps at 1000
         then = page.evaluate(shown)
         assert (time.time() - then) % 1000 < BUSY_S
     context.close()
 
 
-# ---- while it is loaded ----
+# ---- while the page is loaded ----
 
 
 FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
@@ -251,7 +251,7 @@ FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
 
 
 def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
-    """Chromium breaks off all requests then. What a page keeps in its browser may be forbidden, too."""
+    """Chromium aborts all requests when the network changes. Here the browser also forbids storage."""
     page, broken = opened(live=False), []
     page.add_init_script(FORBIDDEN)
 
@@ -280,7 +280,7 @@ def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -
 
 
 def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
-    """A laptop slept for an hour."""
+    """The page missed an hour, as on a laptop that slept."""
     page = opened()
     seen = page.evaluate("""() => import('/page/store.js').then(({ store, takeFrame }) => {
         const ring = store.drives.get('pump-1').pasts.get('output_frequency');

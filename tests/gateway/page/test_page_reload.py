@@ -18,7 +18,7 @@ READ_AGAIN = "Reload the plant file"
 
 
 def tab_to(page: Any, name: str) -> None:
-    """Move the focus to a button by the tabulator alone."""
+    """Move the focus to a button by the Tab key alone."""
     for _ in range(30):
         page.keyboard.press("Tab")
         if page.evaluate("document.activeElement.textContent") == name:
@@ -100,5 +100,5 @@ def test_real_gateway_refuses_a_broken_file_and_reloads_a_good_one(page: Any, tm
         told(page, "plant.toml is in effect")
         assert page.locator("#ask .outcome li").all_inner_texts() == list(gateway.gateway.reload.restart)
         page.keyboard.press("Escape")
-        page.get_by_role("link", name="fan-2", exact=True).wait_for()  # an alarm may name it too
+        page.get_by_role("link", name="fan-2", exact=True).wait_for()  # not an alarm that names it
         notice.wait_for(state="hidden")

@@ -1,4 +1,4 @@
-"""Stop all: always at the same place, one question, sent at once, with its result."""
+"""Stop all: always at the same place, one question, sent immediately, with its result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def title(page: Any) -> Any:
 
 
 def told(page: Any, title: str) -> None:
-    """Wait until the dialog says this."""
+    """Wait until the dialog has this heading."""
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
@@ -31,7 +31,7 @@ def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener, size: s
     places = set()
     for view in VIEWS:
         page.evaluate("view => { location.hash = view }", view)
-        page.wait_for_timeout(300)  # the panel slides in
+        page.wait_for_timeout(300)  # until the panel has slid in
         seen, *place = page.evaluate(AT_ITS_PLACE)
         assert seen, view
         places.add(tuple(place))
@@ -85,7 +85,7 @@ def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeG
 
 
 def test_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> None:
-    """The browser moves the focus out of a closed dialog only some milliseconds later."""
+    """The browser moves the focus out of a closed dialog only after some milliseconds."""
     page = opened()
     page.keyboard.press("Shift+S")
     assert title(page).inner_text() == "Stop all 31 drives?"
@@ -99,7 +99,7 @@ def test_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> None:
 
 
 def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
-    """The same holds for the second click of a double click: it only asks."""
+    """Even the second click of a double click is accepted, because it only opens a question."""
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -109,7 +109,7 @@ def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, ga
             position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' })""",
         [x, y],
     )
-    page.mouse.dblclick(x, y)  # Cancel, and what lies behind it
+    page.mouse.dblclick(x, y)  # first click: Cancel; second click: the button behind it
     assert title(page).inner_text() == "Stop all 31 drives?"
     assert gateway.posts == []
 
@@ -128,7 +128,7 @@ def test_stop_all_works_while_a_dialog_is_open(opened: Opener, gateway: FakeGate
 def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """Stop all while the stop of one drive is under way: its outcome comes after the answer."""
+    """The outcome of one drive's stop arrives while Stop all asks, and must not replace that question."""
     page = opened("#/drives/pump-1")
     gateway.is_held = threading.Event()
     page.get_by_role("button", name="Stop pump-1").click()
@@ -146,7 +146,7 @@ def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
 
 
 def test_stop_works_if_other_parts_of_the_page_fail_to_load(opened: Opener, gateway: FakeGateway) -> None:
-    """A view that cannot be loaded takes all views with it, and no stop."""
+    """If one view cannot be loaded, all views fail, but stops work."""
     page = opened(live=False)
     page.route("**/page/table.js", lambda route: route.abort())
     page.route("**/page/vendor/*", lambda route: route.abort())
@@ -214,7 +214,7 @@ def test_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
 
 
 def test_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, gateway: FakeGateway) -> None:
-    """Its drives may take half a minute."""
+    """The stop of silent drives may take half a minute."""
     gateway.is_held, gateway.confirms = threading.Event(), True
     page = opened()
     page.locator("#stopall").click()
@@ -286,7 +286,7 @@ SECOND_CLICK = """([x, y]) => document.querySelector('#ask form button:not(.calm
 def test_double_click_confirms_a_sign_in_only_for_a_stop(
     opened: Opener, gateway: FakeGateway, view: str, asks: str, confirms: str, sent: list[Any]
 ) -> None:
-    """A keeper of passwords fills the token in at once."""
+    """A password manager may fill in the token immediately."""
     gateway.token = "right"
     page = opened(view)
     page.locator(asks).click()
@@ -315,7 +315,7 @@ def test_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGateway)
 def test_stop_is_sent_although_other_tabs_hold_all_connections(
     browser: Any, gateway: FakeGateway, few_drives: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nine tabs hold all six connections of the browser, because no frame comes."""
+    """Nine tabs occupy all six connections of the browser, because no new frame is made."""
     monkeypatch.setattr(fake_gateway, "HOLD_S", 120)
     context = browser.new_context()
     pages = [context.new_page() for _ in range(9)]
@@ -340,7 +340,7 @@ def test_stop_is_sent_although_other_tabs_hold_all_connections(
 def test_no_later_dialog_replaces_the_question_of_a_stop(
     opened: Opener, gateway: FakeGateway, case: str
 ) -> None:
-    """The answer to an earlier request arrives while the user is about to confirm the stop."""
+    """The answer to an earlier request arrives while the question of the stop is open."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []
     if case == "a reload":
@@ -359,7 +359,7 @@ def test_no_later_dialog_replaces_the_question_of_a_stop(
         page.get_by_label("New value, Hz").fill("31.5")
         page.get_by_role("button", name="Write to pump-1").click()
     until_met(page, lambda: held)
-    page.evaluate("document.querySelector('#stopall').click()")  # wherever a dialog is
+    page.evaluate("document.querySelector('#stopall').click()")  # works also behind a dialog
     assert title(page).inner_text() == "Stop all 31 drives?"
     with page.expect_response(f"**/{path}"):
         held[0].fulfill(status=401, json={"error": "This wants a token."})
@@ -370,7 +370,7 @@ def test_no_later_dialog_replaces_the_question_of_a_stop(
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-KEYS = {  # with its place on the keyboard, and whether Shift is held: what is asked
+KEYS = {  # (key, its place on the keyboard, is Shift held): the dialog's question
     ("S", "KeyS", True): "Stop all 31 drives?",
     ("s", "KeyS", False): "Stop pump-1?",
     ("s", "KeyS", True): "Stop all 31 drives?",  # with caps lock on
@@ -403,7 +403,7 @@ def test_stop_keys_work_on_every_keyboard_layout(opened: Opener) -> None:
 def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
-    page.keyboard.press("Shift+S")  # in the field
+    page.keyboard.press("Shift+S")  # typed into the text field
     assert title(page).inner_text() == "Change frequency setpoint of pump-1?"
     page.get_by_role("button", name="Cancel").focus()
     page.keyboard.press("Shift+S")
@@ -414,7 +414,7 @@ def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> 
 def test_page_waits_longer_than_the_gateway_repeats_a_stop(
     opened: Opener, gateway: FakeGateway, verb: str
 ) -> None:
-    """Otherwise, with one dead drive, it would never report which drives have stopped."""
+    """Otherwise, with one dead drive, the page would never report which drives have stopped."""
     page = opened("#/drives/pump-1")
     page.evaluate("""() => {
         const make = AbortSignal.timeout;

@@ -17,7 +17,7 @@ DRAWN = "document.querySelectorAll('#trend-plots canvas').length === 2"
 
 
 def asked(page: Any) -> list[dict[str, list[str]]]:
-    """Return a list that the page's questions for history are appended to."""
+    """Return a list to which the URLs of the page's history requests are appended."""
     questions: list[dict[str, list[str]]] = []
     page.on(
         "request",
@@ -27,7 +27,7 @@ def asked(page: Any) -> list[dict[str, list[str]]]:
 
 
 def asked_width(questions: list[dict[str, list[str]]]) -> int:
-    """Return the milliseconds of the latest request."""
+    """Return the time range of the latest history request, in ms."""
     return int(questions[-1]["to"][0]) - int(questions[-1]["from"][0])
 
 
@@ -76,7 +76,7 @@ def test_lines_of_a_large_plant_are_folded_except_for_problems(opened: Opener, g
 
 
 def test_frequency_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
-    """A drive that may be set to 320 Hz has no shorter bar than another one at the same frequency."""
+    """Drives at the same frequency have bars of equal length, whatever their maximum frequencies."""
     gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}
     rows = {"output_frequency": [41.0, 0], "frequency_setpoint": [48.0, 0]}
     one = {"state": "runs", "fault": None, "seen": 0, "ages_ms": [0], "values": rows}
@@ -94,7 +94,7 @@ def test_frequency_bars_of_all_drives_have_one_labelled_scale(opened: Opener, ga
 
 
 def line_of_one(number: int, most: float) -> dict[str, Any]:
-    """Return a line with its first drive alone, whose setpoint may be so many hertz."""
+    """Return a line with only its first drive, whose setpoint may be up to this many hertz."""
     line = fake_plant.plant({})["lines"][number]
     drive = line["drives"][0]
     registers = [
@@ -168,7 +168,7 @@ def test_words_of_states_are_not_cut_off(opened: Opener, size: tuple[int, int]) 
         too_wide, height = words.evaluate_all(parts)
         return bool(too_wide <= 0 and height <= 2 * 14 * 1.2 + 1)  # px: two lines, so no word is broken
 
-    until_met(page, is_whole)  # the page is laid out again a moment after its size has changed
+    until_met(page, is_whole)  # the layout follows a change of size with a delay
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (768, 1024)])
@@ -207,7 +207,7 @@ def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None
     assert rows.nth(8).locator(".value").inner_text() == "ready, at setpoint"
     page.get_by_text("50 % within 4.1 ms, 99 % within 6.1 ms").wait_for()
     assert "Missed 4 of 5120 values" in page.locator("#delays").inner_text()
-    looked_at = rows.nth(10).locator(".value")  # just now
+    looked_at = rows.nth(10).locator(".value")  # unpolled register, read just now
     until_met(page, lambda: looked_at.get_attribute("class") == "value")
     assert rows.nth(9).locator(".value").get_attribute("class") == "value old"  # read an hour ago
     assert page.locator("#plots canvas").count() == 3
@@ -228,7 +228,7 @@ def test_trends_zoom_in_by_dragging_and_back_out(opened: Opener) -> None:
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.3, y, steps=4)
     seen = len(questions)
-    until_met(page, lambda: len(questions) > seen + 1)  # an answer came in between
+    until_met(page, lambda: len(questions) > seen + 1)  # an answer has arrived meanwhile
     page.mouse.move(box["x"] + box["width"] * 0.5, y, steps=4)
     page.mouse.up()
     until_met(page, lambda: abs(asked_width(questions) - width / 4) < width / 50)
@@ -260,7 +260,7 @@ def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> No
 def test_markers_and_cursor_show_each_drives_newest_current_value(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """Zoomed in, each drive was read at instants of its own."""
+    """In a short range, the drives' samples have different times."""
     begin = 1764075600000
     for drive, offset in (("pump-1", 0), ("pump-2", 400)):
         times = [begin + offset + 1000 * n for n in range(10) if n < 5 or drive == "pump-1"]
@@ -273,11 +273,11 @@ def test_markers_and_cursor_show_each_drives_newest_current_value(
     page.get_by_label("pump-2", exact=True).check()
     until(page, "document.querySelectorAll('#trend-plots .plothead .wide').length === 3")
     for name in ("A", "B"):
-        page.get_by_role("button", name=f"Marker {name}").click()  # at 1/3 and 2/3
+        page.get_by_role("button", name=f"Marker {name}").click()  # markers at 1/3 and 2/3 of the range
     rows = page.locator("#marks tbody tr")
     until_met(page, lambda: rows.count() == 2)
     assert rows.nth(0).locator("td").all_inner_texts()[:2] == ["23.00", "26.00"]
-    assert rows.nth(1).locator("td").all_inner_texts()[:2] == ["22.00", "\u2013"]  # it holds for a second
+    assert rows.nth(1).locator("td").all_inner_texts()[:2] == ["22.00", "\u2013"]  # old after a second
     plot = page.locator("#trend-plots .u-over").first
     box = plot.bounding_box()
     page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 20)
@@ -286,7 +286,7 @@ def test_markers_and_cursor_show_each_drives_newest_current_value(
 
 
 def test_an_unpolled_register_has_no_empty_plot(opened: Opener, gateway: FakeGateway) -> None:
-    """A plot whose box is not there could not be taken away."""
+    """A plot without a checkbox could not be removed."""
     gateway.plant_changes = {"lines": fake_plant.plant({})["lines"]}
     for line in gateway.plant_changes["lines"]:
         for drive in line["drives"]:
@@ -323,7 +323,7 @@ def test_phone_selects_several_drives_and_shows_their_lines_apart(opened: Opener
     assert heads.all_inner_texts() == ["", ""]  # one drive needs no legend
     page.get_by_text("Drives and quantities").click()
     for name in ("pump-1", "filler-1"):
-        page.get_by_label(name, exact=True).check()  # which the list is not folded up by
+        page.get_by_label(name, exact=True).check()  # this must not close the list
     page.get_by_text("Drives and quantities").click()
     until_met(page, lambda: heads.first.locator("canvas").count() == 3)
     assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
@@ -334,7 +334,7 @@ def test_phone_selects_several_drives_and_shows_their_lines_apart(opened: Opener
     before = plot.bounding_box()
     plot.hover(position={"x": 200, "y": 40})
     until_met(page, lambda: ":" in heads.first.inner_text())  # the time at the cursor
-    assert plot.bounding_box() == before  # which the plot does not flee from
+    assert plot.bounding_box() == before  # the plot does not move
 
 
 def test_selection_is_limited_to_the_number_of_different_line_styles(opened: Opener) -> None:
@@ -350,7 +350,7 @@ def test_selection_is_limited_to_the_number_of_different_line_styles(opened: Ope
 def test_time_before_the_gateway_started_is_not_shown_as_fault_free(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """The gateway started in the middle of the displayed hour."""
+    """The gateway started in the middle of the shown hour."""
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     lanes = page.locator("#lane .bars")
     until_met(page, lambda: lanes.all_inner_texts() == ["none"] * 2)
@@ -427,7 +427,7 @@ DOTS = """async values => {
 
 
 def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
-    """Three values of a register that is read each second, in a plot with ten points a second."""
+    """Three values of a register that is read once a second, in a plot with ten points a second."""
     page = opened()
     nothing = [None] * 9
     assert page.evaluate(DOTS, [None, *nothing, None, *nothing, None]) == 0
@@ -435,8 +435,8 @@ def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
 
 
 def test_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -> None:
-    """Answers come each 0.6 s, one is missed, and none is requested for 3 s. Values hold for a second."""
-    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # at ms
+    """Values come every 0.6 s, one is missed, then none is requested for 3 s. Values are current for 1 s."""
+    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # by time in ms
     times = list(range(0, 4801, 300))
     mean = [answers.get(at) for at in times]
     told = {
@@ -456,7 +456,7 @@ def test_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -
 
 
 def test_axis_numbers_have_a_decimal_point_and_no_digit_groups(opened: Opener) -> None:
-    """1,000 is one thousand to some, and one to others."""
+    """In some countries "1,000" means one thousand, in others one."""
     page = opened(locale="de-DE")
     told = page.evaluate("""async () => {
         const { makePlot, line } = await import('/page/plots.js');
@@ -524,5 +524,5 @@ def test_log_shows_callers_writes_and_results(opened: Opener) -> None:
     assert rows.nth(4).locator(".bad").inner_text().strip() == "unconfirmed; no reply"
     for repeated, drive in ((rows.nth(2), "labeller"), (rows.nth(3), "mixer-2")):
         assert drive in repeated.inner_text()
-        written = repeated.locator("td").nth(2).inner_text()  # beside the time it would push the name away
+        written = repeated.locator("td").nth(2).inner_text()  # the repetitions stand in the write's column
         assert re.search(r"^stop\s+42 times since .*\d\d:\d\d:\d\d", written)

@@ -1,4 +1,4 @@
-"""Words, counts and marks on the page: a single drive, a new plant, and a lost gateway."""
+"""Words, numbers and marks on the page: digits, a single drive, a new plant, a lost gateway."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from watching import SIZES, Opener, until, until_met
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
 MINUTE_MS = 60_000
-# A plot of a minute whose last tick stands at its very end, and how dark the canvas is at its right edge.
+# Draw a plot of a minute whose last tick is at its end; return how dark the canvas is at its right edge.
 EDGE = """async () => {
   const { makePlot, line } = await import("/page/plots.js");
   const place = document.querySelector("#lines");
@@ -105,7 +105,7 @@ def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: Fake
     until(page, "document.body.classList.contains('dead')")
     told = []
     for _ in range(2):
-        page.wait_for_timeout(5100)  # it is drawn again after 5 s
+        page.wait_for_timeout(5100)  # the list is redrawn after 5 s
         page.evaluate("import('/page/faults.js').then(m => m.show())")
         told.append(lasted.inner_text())
     assert told[0] == told[1]
@@ -145,7 +145,7 @@ def test_fault_that_does_not_fit_still_colours_the_strip(opened: Opener, gateway
 
 
 def test_newest_minute_is_at_the_right_end_of_the_hour(opened: Opener, gateway: FakeGateway) -> None:
-    """Two minutes after the start there are two bars at the right of the hour, not at its left."""
+    """Two minutes after the start, the two bars are at the right end of the hour, not at the left."""
     newest = 1_764_115_200_000  # 00:00 UTC
     minutes = [
         {"time": newest - MINUTE_MS, "asked": 90, "misses": {"no reply": 2}},
@@ -190,7 +190,7 @@ def test_old_register_shows_its_age(opened: Opener) -> None:
 
 
 def test_values_of_viewed_registers_become_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
-    """It may be read once a minute, and stays current only while its drive answers."""
+    """Such a register may be read only once a minute; its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
     until_met(page, lambda: value.inner_text() == "4012h")

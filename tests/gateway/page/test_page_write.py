@@ -1,4 +1,4 @@
-"""A write: one register of one drive, confirmed by name, sent once, with its result."""
+"""A write to one register of one drive: the user confirms it, it is sent once, its result is shown."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from watching import Opener, press_enter, until, until_met, until_still
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
-# From then on the button that confirms lies here.
+# Make the confirming button of dialogs that open from now on lie at this point.
 CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
   const yes = document.querySelector('#ask button.danger');
   const place = { position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' };
@@ -109,18 +109,18 @@ def test_held_key_counts_as_one_press(opened: Opener, gateway: FakeGateway) -> N
     change.click()
     page.get_by_label("New value, Hz").fill("31.5")
     for _ in range(9):
-        page.keyboard.down("Enter")  # the first press, and what the system makes of it
+        page.keyboard.down("Enter")  # the first press, then its automatic repetitions
     page.keyboard.up("Enter")
     page.locator("#outcomes li").wait_for()
     assert len(gateway.posts) == 1
     assert not page.locator("#ask").evaluate("dialog => dialog.open")
-    change.press("Enter")  # a press of its own is taken at once
+    change.press("Enter")  # a separate press is accepted immediately
     assert page.locator("#ask").evaluate("dialog => dialog.open")
 
 
 @pytest.mark.parametrize("size", ["desk", "phone"])
 def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway, size: str) -> None:
-    """The dialog's button covers the panel's button, as on a scrolled phone."""
+    """The dialog's button lies over the panel's button, as on a scrolled phone."""
     page = opened("#/drives/pump-1", size)
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
@@ -138,7 +138,7 @@ def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: Fa
 
 
 def tap(page: Any, x: float, y: float, made_s: float) -> None:
-    """Tap there, as if it had been made at that time since the epoch and had waited for its turn since."""
+    """Dispatch a tap whose time stamp is `time`, as if it had waited in the browser's queue since."""
     session = page.context.new_cdp_session(page)
     for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
         touch = {"type": kind, "touchPoints": points, "timestamp": made_s}
@@ -157,7 +157,7 @@ SLOW_AT_CLICKS = f"""button => button.addEventListener('click', () => {{
 def test_a_second_tap_on_start_does_not_confirm_it(
     opened: Opener, gateway: FakeGateway, slows: bool, later_s: float
 ) -> None:
-    """A page that is slow draws its dialog after the second tap, which waits for its turn."""
+    """A slow page draws its dialog only after the second tap, which waits in the browser's queue."""
     page = opened("#/drives/pump-1", "phone", has_touch=True)
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
@@ -179,7 +179,7 @@ def test_a_second_tap_on_start_does_not_confirm_it(
 
 
 def press(page: Any, key: str, made_s: float, text: str = "") -> None:
-    """Press a key, as if that had been at that time since the epoch."""
+    """Dispatch a key press whose time stamp is `time`."""
     session = page.context.new_cdp_session(page)
     code = {"Enter": 13, "Tab": 9, " ": 32}[key]
     named = {"key": key, "code": "Space" if key == " " else key, "windowsVirtualKeyCode": code}
@@ -193,7 +193,7 @@ def press(page: Any, key: str, made_s: float, text: str = "") -> None:
 def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
     opened: Opener, gateway: FakeGateway, key: str, text: str
 ) -> None:
-    """On a slow page Tab goes from its Cancel to its other button, before anybody has seen them."""
+    """On a slow page, Tab and Enter could confirm a dialog before the user has seen it."""
     page = opened("#/drives/pump-1")
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
@@ -206,7 +206,7 @@ def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
     press(page, key, made_s + 0.6, text)
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
-    page.wait_for_timeout(600)  # until it was drawn
+    page.wait_for_timeout(600)  # until the dialog was drawn
     press(page, key, time.time(), text)
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
@@ -240,7 +240,7 @@ def test_stop_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway:
 
 
 def test_reload_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway: FakeGateway) -> None:
-    """Under the name that was confirmed may be another drive now."""
+    """After the reload, the confirmed name may mean another drive."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
     gateway.changes = gateway.plant_changes = {"revision": 2}

@@ -1,4 +1,4 @@
-"""Waits for the state of a page, from outside because its CSP forbids evaluated code."""
+"""Functions that wait for a state of a page by polling it, because its CSP forbids evaluated code."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Opener = Callable[..., Any]
 
 
 def missing(what: str) -> NoReturn:
-    """Skip on a user's machine; fail where everything must run."""
+    """Skip the test on a user's machine; fail it in CI, where all tests must run."""
     if os.environ.get("CI") == "true":
         pytest.fail(what)
     pytest.skip(what)
 
 
-PATIENCE_S = 60.0  # for events that are immediate on an idle machine
-LOOK_MS = 60  # each look takes four programs 2 ms of their processor
+PATIENCE_S = 60.0  # time limit for events that are immediate on an idle machine
+LOOK_MS = 60  # polling interval; each check costs 2 ms of processor time
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
 VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
@@ -35,7 +35,10 @@ AT_ITS_PLACE = """() => {
 
 
 def until(page: Any, expression: str) -> None:
-    """Wait until this expression is true on the page, which may reload in between. Raises AssertionError."""
+    """Wait until this expression is true on the page, which may reload meanwhile.
+
+    Raises AssertionError after PATIENCE_S.
+    """
 
     def met() -> object:
         try:
@@ -49,9 +52,9 @@ def until(page: Any, expression: str) -> None:
 
 
 def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
-    """Wait until a condition is met: the page may change a moment later.
+    """Wait until a condition is met, because the page may change with a delay.
 
-    Raises AssertionError.
+    Raises AssertionError after PATIENCE_S.
     """
     end = time.monotonic() + PATIENCE_S
     while not met():
@@ -69,25 +72,25 @@ def until_still(page: Any) -> None:
 
 
 def press_enter(page: Any) -> None:
-    """Press Enter once a dialog that opened or closed is drawn: before, the page takes no such key."""
+    """Press Enter when the opened or closed dialog is drawn: until then the page ignores the key."""
     page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.keyboard.press("Enter")
 
 
 def told(page: Any) -> str:
-    """Return the text of the head, for the message of a failure."""
+    """Return the text of the page's head, for the message of a failed wait."""
     return str(
         page.evaluate("['link', 'notice'].map(id => document.getElementById(id).textContent).join(', ')")
     )
 
 
 def cell(page: Any, drive: str, part: str) -> Any:
-    """Return a cell of the table of drives."""
+    """Return a cell of the table of drives, by drive and column."""
     return page.locator("tr.drive", has=page.get_by_role("link", name=drive, exact=True)).locator(
         f"td.{part}"
     )
 
 
 def link(page: Any) -> str:
-    """Return the text of the head about the connection."""
+    """Return the text about the connection in the page's head."""
     return str(page.locator("#link").inner_text().strip())

@@ -60,9 +60,7 @@ class Alarms:
     def __init__(self, since: int = 0, note: Callable[[Alarm], object] = lambda alarm: None) -> None:
         self.since = since
         self._note = note
-        self._lasting: dict[
-            tuple[str, str, str], Alarm
-        ] = {}  # active alarms, oldest first; keys: line, drive, kind
+        self._lasting: dict[tuple[str, str, str], Alarm] = {}  # active, oldest first; keys: line, drive, kind
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
         self._runs: dict[str, int] = {}  # by drive: its `stops` (see `look`) when a run was first seen

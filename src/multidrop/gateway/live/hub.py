@@ -21,9 +21,7 @@ Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # newest row
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 UNNAMED = "it shows a fault"  # the words for a fault without a text
 NOT_ASKED = "not asked recently"  # the words for state UNKNOWN if no value is fresh
-INCOMPLETE = (
-    "not all of it is known"  # the words for state UNKNOWN if some values are missing: a fault is possible
-)
+INCOMPLETE = "not all of it is known"  # words of UNKNOWN if values are missing: a fault is possible
 _STATES = {
     Condition.STOPPED: STANDS,
     Condition.RUNNING: RUNS,

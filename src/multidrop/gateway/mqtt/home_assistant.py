@@ -1,7 +1,6 @@
 """Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive. Pure.
 
-Each component has its own state topic, because a state topic of the device would also apply to its numbers
-and buttons.
+Each component has its own state topic: a state topic of the device would also apply to numbers and buttons.
 """
 
 from __future__ import annotations
