@@ -4,12 +4,12 @@ import sys
 
 
 def main() -> int:
-    """Run the command line. Ctrl-C ends it with a sentence, also while its modules are being imported."""
+    """Run the command line; return its exit code. Ctrl-C during the imports prints only one sentence."""
     try:
         from multidrop.cli import main
     except (KeyboardInterrupt, RuntimeError) as interruption:
         if not isinstance(interruption.__cause__ or interruption, KeyboardInterrupt):
-            raise  # Python wraps only an interruption of a class statement
+            raise  # only a RuntimeError from a class statement can have a KeyboardInterrupt as its cause
         print("multidrop: interrupted", file=sys.stderr)
         return 130
     return main()

@@ -42,7 +42,7 @@ EXPIRY = 1.0  # s
 
 
 def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
-    """Parse the port options. Raises ValueError for an invalid one."""
+    """Parse the port options. Raises ValueError for an invalid option."""
     switch = RS485(rs485)
     switch.check_port(port)
     return Echo(echo), TransactionIds(transaction), switch
@@ -55,18 +55,20 @@ class Bus:
     Modbus TCP. `baudrate` and `format` replace the families' defaults for drives that are attached without
     their own. `silence`, in s, replaces the standard's t3.5 between frames, if all drives tolerate it.
 
-    - `echo`: whether the adapter repeats what it sends: "on", "off" (until it does), or "auto" to detect it.
+    - `echo`: whether the adapter echoes the requests that it sends: "on", "off" (valid until an echo is
+      received), or "auto" to detect it.
     - `transaction`: "ignore" if a Modbus TCP gateway replies with transaction ids of its own.
-    - `rs485`: what switches between sending and receiving if the adapter does not: the driver ("kernel") or
-      the core by RTS ("rts-up", "rts-down").
-    - `settle`: seconds without requests after the port opens, at most 10, for devices that restart then.
+    - `rs485`: what switches the transceiver to sending and back if the adapter does not: the kernel's driver
+      ("kernel"), or multidrop by the RTS line ("rts-up", "rts-down").
+    - `settle`: seconds without requests after the port opens, at most 10, for devices that restart when it
+      opens.
     - `ledger`: the file that counts writes to EEPROM, shared by all processes. `audit`: the log of all
       writes.
     - `expiry`: seconds. A write that cannot be sent within this time of the call, not counting the verb's own
       waits, raises Expired.
     - `stop_on_exit`: stop all drives when the bus or the program ends; see the method.
-    - `mastership`: for a line of which other processes may be masters too. Without holding it, all requests
-      raise NotMaster, even stops, and the port is not opened.
+    - `mastership`: for a line on which another process may be the Modbus master. While this process does not
+      hold the mastership, the port is not opened, and all requests raise NotMaster, even stops.
 
     A stop cancels each earlier call that may move a motor, on any thread, with CancelledByStop. A drive is on
     one bus at a time. Leaving the `with` block waits for pending stops and closes the port. It stops no drive
@@ -124,7 +126,7 @@ class Bus:
         audit: Path | str | None = None,
         mastership: Mastership | None = None,
     ) -> Bus:
-        """Return a bus whose port is not open yet; a poller opens it, or a stop."""
+        """Return a bus whose port is not open yet; a poller or a stop opens it later."""
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
         facts = _facts(port, echo, transaction, rs485)
@@ -173,7 +175,7 @@ class Bus:
 
     @property
     def why_lost(self) -> str | None:
-        """Why the port is still lost ("/dev/ttyUSB0: there is no such port"); None while it is open."""
+        """The reason why the port is lost ("/dev/ttyUSB0: there is no such port"); None while it is open."""
         return self.line.why_lost
 
     def __enter__(self) -> Bus:
@@ -189,17 +191,18 @@ class Bus:
             raise
 
     def leave(self) -> None:
-        """Cancel all calls that move a motor, and start to stop the drives if `stop_on_exit` is set."""
+        """Cancel all calls that move a motor; if `stop_on_exit` is set, start to stop the drives."""
         self._leaving.begin()
 
     def part(self) -> None:
-        """Leave, and wait for all pending stops; the port stays open."""
+        """Do the same as `leave`, then wait for all pending stops; the port stays open."""
         self._leaving.finish()
 
     def close(self) -> None:
-        """Cancel calls, wait for stops, and close the port. A write in flight raises Unconfirmed.
+        """Cancel calls that move a motor, wait for stops, and close the port.
 
-        If a signal interrupts the wait, the closing still completes; a second call waits for that.
+        A write in flight raises Unconfirmed. If a signal interrupts the wait, the closing still completes; a
+        second call of `close` waits until the closing is complete.
         """
         self._close()
         if self.stops_on_exit:
@@ -256,7 +259,7 @@ class Bus:
     def remember(self, before: Bus) -> None:
         """Take over what a closed bus has learned about the drives of the same serial line.
 
-        Late replies to requests of that bus may still come.
+        The new bus must know them, because late replies to the closed bus's requests may still arrive.
         """
         self._exchanges.remember(before._exchanges)
 
@@ -276,9 +279,10 @@ class Bus:
     # ---- commands ----
 
     def check_identity(self, drive: Drive) -> None:
-        """Check that the drive at this address is of its declared family, as far as the family can.
+        """Check that the drive at this address is of its declared family, as far as its registers show it.
 
-        The check only reads, and is done only once until the port is reopened; the first write does it too.
+        The check only reads, and is done only once until the port is reopened. The first write to a drive
+        makes the same check.
         The first check also logs the drive's watchdog. Raises WriteForbidden for a drive of another family,
         and NoReply.
         """
@@ -291,7 +295,10 @@ class Bus:
         return self._writer.identity_check.is_known(drive)
 
     def watchdog(self, drive: Drive) -> str:
-        """Return a sentence on what the motor does if this client dies, as far as the drive reports it."""
+        """Return a sentence on what the motor does if this client dies.
+
+        It is read from the drive if possible, and otherwise taken from the family's document.
+        """
         check_drive(drive)
         return self._performer.watchdog(drive)
 

@@ -1,4 +1,4 @@
-"""Errors of a bus, as one tree with its data in fields.
+"""The exceptions of a bus, as one class hierarchy; their fields hold the details.
 
 A mistake of the caller is a ValueError or TypeError at the call; everything else is a BusError.
 """
@@ -56,9 +56,9 @@ class BadReply(BusError):
 
 
 class NoValue(BadReply):
-    """A good reply holds a NaN, or a count that is declared as "no value".
+    """A valid reply holds NaN, or a raw count that the family declares to mean "no value".
 
-    `values` has the registers of the same read that have a value.
+    `values` has the valid values of the same read, by register name.
     """
 
     def __init__(self, drive: str, register: str, values: Mapping[str, Any] = _NONE) -> None:
@@ -118,7 +118,10 @@ class Expired(BusError):
 
 
 class CancelledByStop(BusError):
-    """Cancelled before it was sent: by a stop, or because the bus was left or the drive detached."""
+    """A write or verb was cancelled before it was sent.
+
+    The cause is a stop, or that the bus was closed or the drive detached.
+    """
 
     def __init__(self, drive: str, what: str, why: str) -> None:
         super().__init__(f"{drive}: {what} was not sent: {why}; nothing more was sent")
@@ -164,7 +167,7 @@ class NotAttached(ValueError):
 
 
 class Advice(NamedTuple):
-    """The advice in a refusal: for a program, for the command line, and for a drive of a plant file.
+    """What to do after a refusal, worded for a program, the command line, and a drive of a plant file.
 
     `plant` is empty if it is the same as `command`.
     """
@@ -188,7 +191,7 @@ class Advice(NamedTuple):
         )
 
 
-ANOTHER_FAMILY = "another family is at its address"  # the rule of a WriteForbidden that withholds a stop too
+ANOTHER_FAMILY = "another family is at its address"  # `rule` of refusals that even a stop may raise
 
 
 class WriteForbidden(BusError, ValueError):
@@ -209,7 +212,7 @@ class WriteForbidden(BusError, ValueError):
         is_budget: bool = False,
     ) -> None:
         super().__init__(sentence)
-        self.advice = advice  # its words for a program are part of the sentence
+        self.advice = advice  # `sentence` contains `advice.program`
         self.register = register
         self.rule = rule
         self.place = place
@@ -224,4 +227,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """A drive answered once like a drive of another family; check its identity again, after other stops."""
+    """A drive answered once like another family: check its identity again after the stops of other drives."""

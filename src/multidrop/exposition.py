@@ -1,4 +1,4 @@
-"""Exposition: families of metrics as text, in the two formats that scrapers read. No I/O."""
+"""Format metrics as text, in the two formats that scrapers such as Prometheus read. No I/O."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
 PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus' own form, which promtool reads
 PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}  # replacements for kinds that the plain format lacks
 NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}  # suffixes of family names in the plain format
-MOST_LABELS = 16_384  # number of label texts in the cache: 5 MB
+MOST_LABELS = 16_384  # limit of label texts in the cache, about 5 MB
 
 Labels = Mapping[str, str]
 Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
 
 
 class MetricFamily(NamedTuple):
-    """Samples of one name, for scrapers such as Prometheus."""
+    """A metric: its name, kind and help text, and its samples, each with its labels."""
 
     name: str
     kind: str  # "gauge", "counter", "summary", "info" or "stateset"

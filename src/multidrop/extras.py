@@ -8,8 +8,8 @@ import shlex
 def install_command(extra: str) -> str:
     """Return the pip command for an extra's libraries.
 
-    It names the libraries, because `multidrop[extra]` is found only beside the sources. The extra follows as
-    the shell's comment.
+    The command names each library, because pip finds `multidrop[extra]` only in the directory of the sources.
+    The extra's name follows as a shell comment.
     """
     from importlib.metadata import PackageNotFoundError, requires  # most programs never need it
 

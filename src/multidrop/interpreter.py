@@ -5,14 +5,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_MODULES = ("_interpreters", "_xxsubinterpreters")  # since Python 3.13; before
+_MODULES = ("_interpreters", "_xxsubinterpreters")  # the module's name since Python 3.13, and before
 
 
 def refuse_other_interpreters() -> None:
     """Raise ImportError in a sub-interpreter.
 
-    The compiled module keeps its engine, types and callbacks for the whole process. Those of an interpreter
-    that ended would remain, and still be called.
+    The compiled module keeps its engine, types and callbacks for the whole process. After a sub-interpreter
+    ended, its callbacks would still be called.
     """
     for name in _MODULES:
         try:

@@ -174,7 +174,7 @@ def _named(kind: str, start: int, count: int) -> str:
 
 
 def _parts(start: int, count: int, most: int, words: int) -> Iterator[tuple[int, int]]:
-    """Yield the address and the count of numbers of each request needed to read `count` numbers."""
+    """Yield the start address and the number of values of each request that reads `count` values."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count = {count!r} is not 1 or more")
     for done in range(0, count, most):
@@ -190,7 +190,7 @@ def _coding(format: str, order: str) -> Coding:
 
 
 def _raw(value: float, format: str, coding: Coding) -> float:
-    """Return the raw count of a value. Raises TypeError or ValueError if the value does not fit."""
+    """Return the number to encode for `value`. Raises TypeError or ValueError if it does not fit `format`."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{value!r} is not a number")
     if not abs(value) < float("inf"):

@@ -1,6 +1,7 @@
 """Poller: all lines of a plant, polled continuously, as batches of rows.
 
-The core's own thread carries out the exchanges. One thread here tends all lines whenever the core needs it.
+The core's own thread carries out the exchanges. One Python thread queues new exchanges for all lines and
+handles lost ports, whenever the core requests it.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
-LOOK_NS = 50_000_000  # interval between checks of the lines, while a line or a reader of `fileno` needs them
-BUSY_NS = 100_000_000  # interval while lines only need new exchanges: a third of the time queued ahead
-REST_NS = 500_000_000  # interval while the lines need no work
-MOST_FAILURES = 8  # failures of the thread itself in a row before it gives up
-FAILED_NS = 50_000_000  # pause between its attempts
+LOOK_NS = 50_000_000  # interval between checks of the lines, if one is not well or `fileno` is in use
+BUSY_NS = 100_000_000  # the same interval if lines only need new exchanges: a third of AHEAD_NS
+REST_NS = 500_000_000  # the same interval if no line needs attention
+MOST_FAILURES = 8  # consecutive failures of the poller's thread before polling ends
+FAILED_NS = 50_000_000  # pause after a failure of the poller's thread
 
 _log = logging.getLogger("multidrop.polling")
 
@@ -63,8 +64,8 @@ class Poller(RowSource):
     PollingFailed (see `failure`). Without its mastership the poller sends no request and opens no port; each
     value that is due then has a row with that reason.
 
-    The logger `multidrop.line` has no polled frames. `multidrop poll --capture` writes them to a file for
-    Wireshark.
+    The logger `multidrop.line` does not log polled frames. `multidrop poll --capture` writes them to a file
+    for Wireshark.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class Poller(RowSource):
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # when to check lines for which the core has not called
+        self._look_ns = 0  # time of the next check of lines that the core has not called
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)
@@ -97,11 +98,11 @@ class Poller(RowSource):
     @undisturbed
     def _fill(self, plant: Plant) -> None:
         with self._changing:
-            self._check_polling()  # an interruption may have closed it already
+            self._check_polling()  # an interruption may have closed the poller already
             self._lines.fill(plant.lines)
 
     def forked(self) -> None:
-        """Mark the poller closed in a forked child, without rows."""
+        """Mark the poller closed in a forked child, which gets no rows."""
         self._closing = True
         self._over, self._caller = threading.Event(), None
         self._over.set()
@@ -142,17 +143,17 @@ class Poller(RowSource):
         self._end()
         if isinstance(error, KeyboardInterrupt):
             without_internals(error)
-        if error is not None:  # the error is raised on; other failures were logged
+        if error is not None:  # this error propagates; other failures were logged
             self._caller, self._is_failure_raised = None, True
         self.close()
 
     def close(self) -> None:
         """Stop polling and close the ports. Rows that are not taken yet can still be taken.
 
-        Waits up to a second for exchanges in flight; every slot that is over by then has a row. If a signal
-        interrupts the wait, the closing still completes; a second call waits for that. A function of
-        `on_batch` gets its last batches first. Raises that function's failure, and PollingFailed if polling
-        had failed; each only once.
+        Waits up to a second for exchanges in flight; every value that was due by then has a row. If a signal
+        interrupts the wait, the closing still completes; a second call of `close` waits until the closing is
+        complete. The function given to `on_batch` gets its last batches first. Raises that function's
+        failure, and PollingFailed if polling had failed; each only once.
         """
         self._end()
         give_signals_back()
@@ -341,8 +342,9 @@ class Poller(RowSource):
         """Poll one more drive on this line from now on; return the drive.
 
         `poll` lists registers or their names, or Polled for a register with a period of its own. Without
-        `poll`, all readings are polled. `every` is the period of the others in s; None means as fast as the
-        line allows. Raises ValueError for an unknown line, or a name or an address that is already used.
+        `poll`, all readings are polled. `every` is the period in s of registers without their own; None means
+        as fast as the line allows. Raises ValueError for an unknown line, or a name or an address that is
+        already used.
         """
         polled = drive if isinstance(drive, PolledDrive) else PolledDrive(drive, poll, every=every)
         self._add(line, polled)

@@ -85,7 +85,7 @@ class Supervisor:
         self.note_dead(name, "it was cancelled" if task.cancelled() else reason_of(failure), failure)
 
     def let_go(self, name: str) -> asyncio.Task[Any] | None:
-        """Return a permanent task, which may end from now on; None if it has ended already."""
+        """Let a permanent task end from now on. Return the task; None if it has ended already."""
         return self._kept.pop(name, None)
 
     async def release(self, *names: str) -> None:
@@ -100,7 +100,7 @@ class Supervisor:
     def start(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
         """Start a task that ends by itself. Its failure is logged unless it is awaited."""
         task = asyncio.get_running_loop().create_task(work, name=name)
-        self._short.add(task)  # the event loop keeps no reference to tasks
+        self._short.add(task)  # the event loop itself keeps only weak references to tasks
         task.add_done_callback(self._short.discard)
         return task
 

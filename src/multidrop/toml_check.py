@@ -52,7 +52,7 @@ def parse_document(data: bytes) -> dict[str, Any]:
 
 
 def _check_keys(text: str) -> None:
-    """Raise ValueError for keys with very many parts, whose cost in tomllib grows with the square."""
+    """Raise ValueError for a key with very many parts: tomllib's time grows with their number squared."""
     if text.count(".") > MOST_PARTS:
         pieces = re.split(r"[=,{}\[\]\n]+", text)
         if any(piece.count(".") > MOST_PARTS for piece in pieces):
@@ -83,7 +83,7 @@ class Key:
         return isinstance(value, self.kind) and value not in ("", [])
 
 
-Steps = tuple[tuple[str, int], ...]  # from the document to a table: the array's name and the table's number
+Steps = tuple[tuple[str, int], ...]  # a table's path: for each level, the array's name and the table's number
 
 
 class ConfigError(str):
@@ -94,7 +94,7 @@ class ConfigError(str):
 
 
 def line_numbers(path: Path) -> dict[tuple[Steps, str], int]:
-    """Return the line of each table's header, under the key "", and of each of its keys."""
+    """Return the line number of each key by its table's path and its name; "" means the table's header."""
     if not path.is_file():  # reading a serial port would block
         return {}
     found: dict[tuple[Steps, str], int] = {}
@@ -117,7 +117,8 @@ _ENTRY = re.compile(r"\s*([\w-]+)\s*=")
 
 
 def grouped(errors: Sequence[str]) -> tuple[str, ...]:
-    """Return the errors; a sentence with more than SHOWN_ALIKE places is there once, with their number."""
+    """Return the errors; of more than SHOWN_ALIKE with the same sentence, only one, with their number."""
+
     alike = Counter(getattr(error, "sentence", error) for error in errors)
     found: dict[str, str] = {}
     for error in errors:
@@ -129,7 +130,7 @@ def grouped(errors: Sequence[str]) -> tuple[str, ...]:
     return tuple(found.values())
 
 
-SHOWN_ALIKE = 3  # equal sentences that are each shown
+SHOWN_ALIKE = 3  # limit of errors with the same sentence that are shown separately
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class TomlPlace:
         return replace(self, labels=(*self.labels, *labels))
 
     def of_file(self, path: Path, *labels: str) -> TomlPlace:
-        """Return a place in another file that belongs to this one."""
+        """Return a place in another file that this file refers to; its errors are added to the same list."""
         return TomlPlace(path, labels, self.config_errors, self.seen)
 
     def wrong(self, sentence: object, key: str = "") -> None:
@@ -187,7 +188,7 @@ class TomlPlace:
     def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "", key: str = "") -> T | None:
         """Return make(*arguments). If that raises ValueError or TypeError, add the error and return None.
 
-        `hint` is appended to the error, `key` is the key that it is about.
+        `hint` is appended to the error's text; `key` is the key with the error.
         """
         try:
             return make(*arguments)
@@ -244,7 +245,7 @@ def check_period(seconds: float) -> None:
 
 
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
-    """Return the duration under this key in s; None if it is missing, or invalid, which adds an error."""
+    """Return the duration under this key in s, or None if it is missing. If it is invalid, add an error too."""
     return place.attempt(_duration_under, key, given[key], key=key) if key in given else None
 
 

@@ -1,6 +1,7 @@
 """Control: everything that is written to a drive, and every stop.
 
-The gateways' service is in `multidrop.control.commands`, which loads asyncio.
+The command service of gateways is in `multidrop.control.commands`; it is not imported here, because it loads
+asyncio.
 """
 
 from multidrop.control.audit_log import AuditLog as AuditLog

@@ -78,7 +78,7 @@ class Broadcaster:
         return {drive.name: self._state(drive) for drive in drives}
 
     def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
-        """Check each drive as for a write to that drive alone; return the first drive's call, restarted."""
+        """Check each drive as for a write to that drive alone; return a new call of the first drive."""
         check_author()
         calls = [self._performer.call(drive) for drive in drives]
         for call in calls:
@@ -94,7 +94,7 @@ class Broadcaster:
             return failure
 
     def stop(self, drives: Sequence[Drive]) -> bool:
-        """Broadcast a stop if the family of all drives is confirmed and has a broadcast stop.
+        """Broadcast a stop, if `identify` has confirmed each drive and their family has a broadcast stop.
 
         Return True if the stop may have been sent.
         """

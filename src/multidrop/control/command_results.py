@@ -49,7 +49,7 @@ def result_of_failed_stop(failure: BaseException) -> CommandResult:
 
     A stop is repeated, so its last error says little about the frames before it.
     """
-    if isinstance(failure, DriveException):  # each time that it was sent
+    if isinstance(failure, DriveException):  # the drive refused the stop each time
         return _failed(failure, CommandOutcome.FAILED)
     is_certain = isinstance(failure, SURE_OF_A_STOP)
     return _failed(failure, _outcome_of(failure) if is_certain else CommandOutcome.UNKNOWN)

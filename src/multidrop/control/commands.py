@@ -1,4 +1,4 @@
-"""Commands: the command service of servers with many clients; carries out verbs, writes and stops on drives.
+"""The command service of servers with many clients: carries out their verbs, writes and stops on drives.
 
 Each command has a thread of its own, so that a stop waits for no other command. The thread inherits its
 caller's context: the author (`written_by`) and the deadline (`written_before`). A command never raises; it
@@ -32,7 +32,7 @@ COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop m
 AGAIN_S = 0.2  # pause between turns of stops that have no thread
 TURN_S = 0.2  # duration of such a turn, which blocks the event loop
 STOP_S = 30.0  # how long a stop without a thread is repeated
-REPEATED_S = 30.0  # how long each called stop is repeated, by itself or by another stop of its drive
+REPEATED_S = 30.0  # least time from a stop's call for which it, or another stop of the drive, is repeated
 BEGINNING_S = 0.25  # longest time from a stop's call until it is listed as under way
 
 R = TypeVar("R")
@@ -94,10 +94,10 @@ def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
 
 
 def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | None) -> Results:
-    """Stop all drives of the line whose bus `bus` returns; return the results of the drives `names`."""
+    """Stop all drives on the bus that `bus` returns; return the results of the drives `names`, by name."""
     try:
         found: Mapping[str, Stopped] = bus().stop_all(seconds=seconds)
-    except Exception as failure:  # of any kind: everybody must see it
+    except Exception as failure:  # of any kind: each drive's result must show it
         return dict.fromkeys(names, result_of_failed_stop(failure))
     gone = result_of_failure(NotAttached("it is no longer on its line"))
     return {name: result_of_stop(found[name]) if name in found else gone for name in names}
@@ -189,7 +189,7 @@ async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
 
 
 class LineStop(NamedTuple):
-    """Drives of one line to stop. `whole` stops all drives of the line; None if `drives` are only some."""
+    """Drives of one line to stop. `whole` is a call that stops the whole line; None to stop only `drives`."""
 
     drives: Sequence[Drive]
     whole: StopWork | None = None
@@ -199,8 +199,8 @@ class RepeatedStops:
     """Repeats only one stop per drive at a time, however many clients of a server call one.
 
     The stop of a silent drive is repeated for 30 s, and each time its line waits for the reply. If the stop
-    of every call were repeated, this would delay the stops of other drives, and all reads. `stop` stops one
-    drive. Use it only in the server's event loop.
+    of every call were repeated, this would delay the stops of other drives, and all reads. `stop` is the
+    function that stops one drive. Use this class only in the server's event loop.
     """
 
     def __init__(
@@ -245,7 +245,7 @@ class RepeatedStops:
     def of(self, drive: Drive) -> StopFuture | None:
         """Return the future that is repeating this drive's stop; None if there is none.
 
-        A whole line's stop may be over for this drive and continue only for others; then it is None too.
+        The stop of a whole line may be over for this drive and continue only for others; then return None.
         """
         stops, called = self._repeated.get(drive, (None, 0.0))
         if stops is None or stops.done():
@@ -283,7 +283,7 @@ class RepeatedStops:
         return {drive.name: result}
 
     def _soon(self, drive: Drive) -> StopFuture:
-        """Send a stop now; if one is in flight, send one after it for all calls that wait."""
+        """Send a stop now; if a stop is in flight, send only one after it for all waiting calls."""
         if drive not in self._sent:
             return self._send(drive)
         if drive not in self._waiting:

@@ -1,7 +1,7 @@
 """Ledger: count the writes of each register that a drive may keep in EEPROM, across restarts.
 
-Several processes share the file. It identifies a drive by its port's identity and its address. An EEPROM
-survives about 10,000 writes; a yearly budget makes them last for ten years.
+Several processes share the file. In it a drive is identified by its port's identity and its address. An
+EEPROM survives about 10,000 writes; a yearly budget makes them last for ten years.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from multidrop.transport.simulated_ports import is_simulated, ledger_of
 YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # writes that an EEPROM survives (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
-BUDGET = CYCLES // YEARS  # writes of one register in a year
+BUDGET = CYCLES // YEARS  # limit of writes of one register in a year
 NO_HOME = Path("/nonexistent")  # the home of a user without one
-LATEST = 6e10  # UTC in s: later times, or as long before 1970, are damage
-YEARLY = "times in a year"  # part of the reason if the budget is used up
+LATEST = 6e10  # UTC in s: a later time, or one as far before 1970, shows that the file is damaged
+YEARLY = "times in a year"  # words that only the refusal for a used-up yearly budget contains
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
 
 
@@ -30,7 +30,8 @@ LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPR
 class LedgerCell:
     """One register of one drive in a ledger.
 
-    `port` is the port's identity (see port_identity). `spelt` is the port's name, as in older entries.
+    `port` is the port's identity (see port_identity). `spelt` is the port's name, which older entries have
+    instead.
     """
 
     port: str
@@ -51,9 +52,9 @@ class Wear:
 
 
 def default_path() -> Path:
-    """Return the path for state that survives restarts (XDG base directory specification).
+    """Return the ledger's path in the user's directory for state (XDG base directory specification).
 
-    A user without a home, as in a container, gets a path that cannot be written. Stops work without it.
+    For a user without a home, as in a container, the path cannot be written; stops work nevertheless.
     """
     try:
         state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
@@ -102,7 +103,7 @@ class Ledger:
         return ""
 
     def note(self, cells: Sequence[LedgerCell], now: float) -> None:
-        """Count stops in one transaction, without a limit.
+        """Count the writes of stops in one transaction, even beyond the budget.
 
         Waits up to 5 s if another process has locked the file. Raises OSError if it cannot be written.
         """
@@ -112,7 +113,7 @@ class Ledger:
             ledger.commit()
 
     def wear(self, now: float) -> list[Wear]:
-        """Return every cell ever written, sorted by writes in the last year, most first."""
+        """Return the wear of every cell ever written, sorted by writes in the last year, most first."""
         if not self.path.exists():
             return []
         with self._opened() as ledger:

@@ -1,8 +1,8 @@
 """ExitHook: before this process ends, stop the drives of all buses with `stop_on_exit`.
 
-A process has one hook, for its exit and for SIGINT, SIGTERM and SIGHUP. The signal handler only starts the
-last acts, which run in threads of their own. It does not wait for them, because they may need a lock that the
-interrupted thread holds.
+A process has one hook, for its exit and for SIGINT, SIGTERM and SIGHUP. A bus registers its stops there as a
+"last act", which runs in its own thread. The signal handler starts the last acts without waiting for them,
+because they may need a lock that the interrupted thread holds.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ class ExitHook:
         """If no last act is left, restore the earlier handlers. Does nothing outside the main thread."""
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
-            if self._acts:  # another one was added in between
+            if self._acts:  # another act was added in between
                 self.take_signals()
 
     def _at_exit(self) -> None:

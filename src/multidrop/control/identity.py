@@ -1,7 +1,7 @@
 """IdentityCheck and EchoCheck: find out which device answers at a drive's address.
 
-IdentityCheck confirms that the device is of its declared family. EchoCheck tells a drive's confirmation from
-its adapter's echo, because many confirmations are, like an echo, copies of their requests.
+IdentityCheck confirms that the device is of its declared family. EchoCheck distinguishes the reply to a write
+from the adapter's echo: most such replies are, like an echo, copies of their requests.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Timed = Callable[[], AbstractContextManager[None]]
 
 
 class Suspicion(NamedTuple):
-    """Why a drive may be of another family; whether that is certain, and the make that it shows."""
+    """The reason to suspect that a drive is of another family, and the make that it answers as, if known."""
 
     why: str
     is_certain: bool = False
@@ -92,7 +92,7 @@ class _Confirmed(NamedTuple):
 
     port: object  # the open port; another object after it is reopened
     silences: int  # number of unanswered requests until then
-    pauses: int  # number of pauses in polling until then
+    pauses: int  # number of pauses of PAUSE_NS or more between the drive's replies until then
     at_ns: int
     slept_ns: int  # time that the computer had slept until then
 
@@ -104,7 +104,9 @@ class IdentityCheck:
         self._exchanges = exchanges
         self._echo = echo
         self._known: dict[Drive, _Confirmed] = {}  # confirmed drives
-        self._stoppable: dict[Drive, tuple[object, set[float]]] = {}  # the open port, and the allowed words
+        self._stoppable: dict[
+            Drive, tuple[object, set[float]]
+        ] = {}  # open port, and raw counts of stops allowed
         self._doubted: dict[Drive, tuple[object, str]] = {}  # the open port, and why it may be another make
         self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
 
@@ -144,7 +146,7 @@ class IdentityCheck:
         """
         was_heard = self._was_heard(drive)
         if was_heard and self._has_answered_all(drive):
-            return  # it cannot have been replaced
+            return  # the drive cannot have been replaced since its last check
 
         def do(step: Step) -> object:
             if isinstance(step, Wait):
@@ -197,12 +199,12 @@ class IdentityCheck:
 
         Raises CheckAgain after the first suspicion: call this again after the stops of other drives.
 
-        A stop word of one family may mean run in another. But a failed check is not proof: a parameter such
-        as an address or a baud rate may hold a value that is not in force yet, and a reply may belong to an
-        earlier request. In such a case the stop is sent. The stop is withheld only if `identify` fails SURE
-        times in a row, every request was answered so far, and one of these holds: another built-in family
-        recognises the drive; the drive shows a make whose motor this count would run; or `identify` is
-        certain (it raised WriteForbidden with the rule ANOTHER_FAMILY).
+        The raw count that stops one family may run the motor of another. But a failed check is not proof: a
+        parameter such as an address or a baud rate may hold a value that is not in force yet, and a reply may
+        belong to an earlier request. In such a case the stop is sent. The stop is withheld only if `identify`
+        fails SURE times in a row, every request was answered so far, and one of these conditions is true:
+        another built-in family recognises the drive; the drive answers as a make whose motor this raw count
+        would run; or `identify` is certain (it raised WriteForbidden with the rule ANOTHER_FAMILY).
         """
         port = self._exchanges.line.queue
         on_port, allowed = self._stoppable.get(drive, (None, set()))
@@ -211,7 +213,7 @@ class IdentityCheck:
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         on, before = self._suspected.pop(drive, (port, None))
-        if suspicion is not None and suspicion.make is not None:  # which was shown SURE times
+        if suspicion is not None and suspicion.make is not None:  # the drive answered as this make SURE times
             raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and (before is None or on is not port):
             self._suspected[drive] = port, suspicion
@@ -219,7 +221,7 @@ class IdentityCheck:
         if suspicion is not None and suspicion == before:
             other = self._lookalike(drive, register, count) or self._shown(drive, rivals)
             if other is not None or suspicion.is_certain:
-                raise _withheld(drive, suspicion.why, other)  # it is checked again before the next stop
+                raise _withheld(drive, suspicion.why, other)  # the next stop checks the drive again
         if suspicion is not None:
             self._doubted[drive] = port, suspicion.why
         self._stoppable[drive] = port, (allowed if on_port is port else set()) | {count}
@@ -266,18 +268,18 @@ class IdentityCheck:
         except Exception:  # no reply, or an error in the family's own code: the stop is sent
             return self._rival(drive, rivals)
         if self._is_in_step(drive):
-            self._know(drive, port, silences, was_heard=False)  # else it is already known
+            self._know(drive, port, silences, was_heard=False)  # a known drive is not checked before a stop
         return None
 
     def _rival(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
-        """Return the suspicion of a rival that a drive of weak identity shows."""
+        """Return a suspicion if the family's identity is weak and the drive answers as one of these makes."""
         make = self._shown(drive, rivals) if drive.identity_is_weak else None
         return None if make is None else Suspicion(_declare(make), make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make]) -> Make | None:
-        """Return the first of these makes that the drive shows SURE times.
+        """Return the first of these makes that the drive answers as, SURE times; None if there is none.
 
-        After a request without a reply, only makes that do not answer every request are still looked for.
+        After a request without a reply, only makes that may leave a request unanswered are still tried.
         """
         try:
             probe = Evidence(
@@ -302,9 +304,9 @@ class IdentityCheck:
         return None
 
     def _lookalike(self, drive: Drive, register: Register[Any], count: float) -> Drive | None:
-        """Return a drive of the built-in family that recognises this drive SURE times.
+        """Return a drive object of the built-in family that recognises this drive SURE times; else None.
 
-        A family in which the count at this register is a stop, too, is skipped.
+        Families in which the same raw count at this register is also a stop are skipped.
         """
         settings = drive.settings
         for family in MODELS.values():
@@ -327,9 +329,9 @@ class IdentityCheck:
             return False
 
     def _reads_as(self, other: Drive, drive: Drive, script: Script[Any]) -> Any:
-        """Return the result of a script that reads registers of `other` from this drive; False: it failed.
+        """Return the result of a script that reads registers of `other` from this drive; False if it fails.
 
-        Raises NoReply.
+        Raises NoReply if the drive does not answer.
         """
 
         def do(step: Step) -> object:
@@ -346,13 +348,13 @@ class IdentityCheck:
 
 
 def _of_same_register(drive: Drive) -> list[Make]:
-    """Return the makes whose control register is at the address of this drive's."""
+    """Return the makes whose control register has the same address as this drive's."""
     control = drive.registers.get("control")
     return [make for make in MAKES if control is not None and make.control == control.address]
 
 
 def _stops(family: type[Drive], register: Register[Any], count: float) -> bool:
-    """Return True if a count at this register is harmless in the family, such as its own stop."""
+    """Return True if a raw count at this register is harmless in the family, such as its own stop."""
     control = family.registers.get("control")
     return (
         control is not None
@@ -366,7 +368,7 @@ def _declare(make: Make) -> str:
 
 
 def _forget_setpoint(drive: Drive) -> None:
-    """Forget a setpoint that cannot be read: after such a silence the drive may have lost its power."""
+    """Forget the setpoint if the drive cannot report it: the drive may have lost power while it was silent."""
     if drive.setpoint_name in drive.registers and not drive.register(drive.setpoint_name).readable:
         drive.commanded = None
 

@@ -89,7 +89,8 @@ class Performer:
     def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
         """Carry out a plain write; return its outcome.
 
-        A write that stops the motor cancels other calls, and is sent immediately and without other checks.
+        A write that stops the motor cancels other calls, and is sent immediately, without the checks of other
+        writes.
         """
         raw = raw_count(drive, register, value)
         check_plain(drive, register, raw)
@@ -115,7 +116,7 @@ class Performer:
             return self._writer.raw(drive, request, call)
 
     def check_identity(self, drive: Drive) -> None:
-        """Check that a drive is of its declared family, unless it is known; also log its watchdog."""
+        """Check that a drive is of its declared family and log its watchdog, unless this was done before."""
         if not self._writer.identity_check.is_known(drive):
             self._look_at_identity(drive, self.call(drive))
 

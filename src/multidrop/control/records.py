@@ -66,8 +66,8 @@ class WriteRecords:
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger before it is sent. Raises WriteForbidden if the budget is used up.
 
-        Raises it too if the last write of an EEPROM register was less than LEAST_INTERVAL ago, unless within
-        `commissioning`.
+        For a register in EEPROM, also raises it if the last write was less than LEAST_INTERVAL seconds ago,
+        unless within `commissioning`.
         """
         least = LEAST_INTERVAL if kept is Kept.EEPROM and not _commissioning.get() else 0.0
         ledger = self._ledger.at(self._line.identity)
@@ -141,7 +141,7 @@ class WriteRecords:
         return record | {"outcome": outcome} | known
 
     def _put(self, record: dict[str, Any], log: Callable[..., None], text: str = "") -> None:
-        """Queue a record for the audit log, and pass a sentence (by default made from it) to `log`."""
+        """Queue a record for the audit log, and pass `text`, or a sentence made from the record, to `log`."""
         record = self._complete(record)
         if self.audit is not None:
             self._unlogged.append((clock.utc_ns(), record))
@@ -163,7 +163,7 @@ class WriteRecords:
         self._count_queued()
 
     def catch_up_aside(self) -> None:
-        """Start the same work on separate threads, without waiting."""
+        """Start the work of `catch_up` on separate threads, without waiting."""
         if self._uncounted:
             _ledger_thread.put(self._count_queued)
         if self._unlogged:

@@ -49,7 +49,7 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise WriteForbidden if this write may command the motor and the drive's class is not confirmed.
 
-    A stop needs no confirmation. In a family file, other counts that are declared harmless need one.
+    A stop needs no confirmation. In a family file, all other raw counts need it, even harmless ones.
     """
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # its addresses may be wrong
     if is_harmless(register, raw):
@@ -60,7 +60,7 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this write needs a verb, as one that moves a motor or resets a fault.
+    """Raise WriteForbidden if only a verb may send this write, such as one that starts a motor.
 
     A command that does not move the motor by itself is allowed if the drive's class is confirmed.
     """
@@ -107,7 +107,7 @@ def is_harmless(register: Register[Any], raw: float) -> bool:
 def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
     """Read the registers and the motor state that the rules depend on.
 
-    Raises WriteForbidden if `value` is out of their bounds or the motor does not stand although it must.
+    Raises WriteForbidden if `value` is beyond a limit, or if the motor must be at rest and is not.
     """
     for name, sign, word in ((register.at_least, 1, "below"), (register.at_most, -1, "above")):
         bound = (yield from _bound(drive, name)) if name else None

@@ -93,7 +93,7 @@ class StopAttempt:
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
         self.doubt = ""  # why the drive may be of another family
-        self._shows_more_than_zeros = True  # of the reads since the last write
+        self._shows_more_than_zeros = True  # False if all reads since the last write returned 0
         self._begin()
 
     def _begin(self) -> None:
@@ -137,7 +137,7 @@ class StopAttempt:
         return False
 
     def _unproven(self) -> Unconfirmed | None:
-        """Return a failure if all that shows a standstill are zeros of a drive that may be another make."""
+        """Return Unconfirmed if the drive may be of another make and showed nothing but zeros; else None."""
         if not self.doubt or self._shows_more_than_zeros:
             return None
         reason = (
@@ -149,7 +149,8 @@ class StopAttempt:
     def _next_step(self) -> Step:
         """Resume the script; return its next step.
 
-        If the script raises SystemExit or the like, keep it until all stops are over; raise Unconfirmed.
+        If the script raises SystemExit or the like, raise Unconfirmed instead, and keep that exception until
+        all stops are over.
         """
         try:
             return self._resume()
@@ -385,12 +386,12 @@ class StopRun:
     def interrupted(self, interruption: BaseException) -> None:
         """Send each unfinished stop again, once, and add a note on its progress to the interruption.
 
-        A second interruption ends this, and then has the notes.
+        A second interruption ends this method, and then gets the notes.
         """
         latest = interruption
         try:
             self._begin()
-            for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):  # the interrupted one last
+            for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):  # the interrupted attempt last
                 attempt.once_more(self._stopper.do)
         except BaseException as another:
             latest = another
@@ -504,7 +505,7 @@ def _now() -> float:
 
 
 def _limit(seconds: float | None) -> float | None:
-    """Return a stop's time limit as a float, because other number types may not add to a float.
+    """Return a stop's time limit as a float, because a number of another type may not add to a float.
 
     An invalid limit does not prevent the stop: log a warning and return None, which means no limit.
     """
@@ -527,7 +528,8 @@ def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttem
     """Carry out the stops in turn, one step at a time; call `end` at least once when a stop is over."""
     waiting = [stop for stop in stops if not stop.is_over]
     while waiting:
-        stop = min(waiting, key=_due)  # the one that has been due for longest
+        stop = min(waiting, key=_due)  # the stop that is due first
+
         clock.sleep(max(0.0, stop.due - _now()))
         waiting.remove(stop)
         if stop.advance(do, _now):

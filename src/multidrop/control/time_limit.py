@@ -45,9 +45,10 @@ def written_before(limit: Limit) -> Iterator[None]:
     """Within the block, raise Expired if a call's first write cannot be sent by the time of `limit`.
 
     `limit` is called at the start of each call. It returns a time in ns on the clock of
-    `time.monotonic_ns()`; 0 is always past. A stop that is called after that cancels the call, so a program
-    whose `limit` returns 0 once it has seen a stop misses none. Time that the computer sleeps within the
-    block counts. A verb's later writes expire by the bus's own `expiry`. Stops are always sent.
+    `time.monotonic_ns()`; 0 is always past. A stop that is called after `limit` returned cancels the call. So
+    a program whose `limit` returns 0 once it has seen a stop sends no write after a stop. Time that the
+    computer sleeps within the block counts. A verb's later writes expire by the bus's own `expiry`. Stops
+    are always sent.
 
     The block applies to this thread, or to this task and `asyncio.to_thread`. If `limit` is not a function,
     each call except a stop raises TypeError.

@@ -49,7 +49,7 @@ class Writer:
     # ---- writing ----
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
-        """Check all rules except those for plain writes, and write once; return the outcome.
+        """Check all rules except `check_plain`, and write once; return the outcome.
 
         Raises CancelledByStop or Expired if the write was not sent.
         """
@@ -79,7 +79,7 @@ class Writer:
     def insist(
         self, drive: Drive, step: Write, timeout: float = 0.0, log: Callable[..., None] | None = None
     ) -> Outcome:
-        """Write a stop, or a count that is harmless at any time, past all rules and the ledger's budget.
+        """Write a stop, or a raw count that is harmless at any time, without checking rules or the budget.
 
         Raises WriteForbidden only on proof that the drive is of another family. On a line with late replies,
         waits up to `timeout` seconds for its own reply. `log` records the write; by default, the record is

@@ -1,4 +1,4 @@
-"""Drives as their manuals describe them, without I/O: registers, facts of the line, verbs."""
+"""Drives as their manuals describe them: registers, line settings and timing, verbs. No I/O."""
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError as DeclarationError

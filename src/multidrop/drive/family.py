@@ -1,7 +1,7 @@
 """Drive: the base class of all families, with facts of the manual, registers, and verbs.
 
-A family is a subclass that declares registers. Its verbs command the motor. They are scripts, which the bus
-runs to which the drive is attached.
+A family is a subclass that declares registers and verbs. Verbs command the motor. They are scripts, which are
+run by the bus that the drive is attached to.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ class Drive(RegisterAccess):
     response_delay_characters: ClassVar[float] = 0.0  # the same in characters, if that is longer
     response_timeout: ClassVar[float] = 0.3  # s without a reply before an exchange fails
     answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
-    turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
+    turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
     least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange to the next request to the drive
-    # True if the drive answers or refuses each read of its tables. A late reply could then pass for another
-    # register's, so a proof is read before the first value.
+    # True if the drive answers every read in its tables with a value or an exception. A late reply could then
+    # pass for another register's reply, so a register with a known value is read before the first value.
     answers_every_read: ClassVar[bool] = False
 
     # ---- registers, exceptions and commands ----
@@ -88,23 +88,25 @@ class Drive(RegisterAccess):
         5: "acknowledged, still working",
         6: "busy",
     }
-    damaged: ClassVar[frozenset[int]] = frozenset()  # codes for a request that arrived damaged
-    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # codes of a drive that will answer later
+    damaged: ClassVar[frozenset[int]] = frozenset()  # exception codes for a request that arrived damaged
+    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # exception codes of a drive that is busy for now
     broadcasts: ClassVar[bool] = False  # whether the document defines broadcasts
     identify_recognises: ClassVar[bool] = False  # True if a drive of another make never passes `identify`
-    identity_proofs: ClassVar[tuple[Any, ...]] = ()  # of a family file: registers with their values
+    identity_proofs: ClassVar[tuple[Any, ...]] = ()  # from a family file: registers with known values
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # what to set on its keypad
-    line_parameters: ClassVar[str] = ""  # the parameters for its address, baud rate and format
-    parameter_space: ClassVar[ParameterSpace | None] = None  # None: the document has no rule for addresses
+    line_parameters: ClassVar[str] = ""  # names of the parameters for address, baud rate and format
+    parameter_space: ClassVar[ParameterSpace | None] = (
+        None  # None: parameters' addresses follow no known rule
+    )
     no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
     texts: ClassVar[Mapping[str, Text]] = {}
 
-    bus: Any = None  # the bus that it is attached to
+    bus: Any = None  # the bus that the drive is attached to
 
     # ---- the class ----
 
@@ -123,7 +125,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _declared(cls, kind: type[A]) -> dict[str, A]:
-        """Return the class's attributes of this type by name, without those that a subclass has replaced."""
+        """Return all attributes of this type by name; an attribute that a subclass has replaced is left out."""
         found: dict[str, A] = {}
         for owner in reversed(cls.__mro__):
             for name, attribute in vars(owner).items():
@@ -181,7 +183,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
-        """Return True for the document's framings, and for TCP if any is Modbus."""
+        """Return True for the document's framings, and for TCP if any of them is a Modbus framing."""
         return framing in cls.framings or (
             framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
         )
@@ -223,7 +225,7 @@ class Drive(RegisterAccess):
             self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
-        if not self.name.isprintable():  # a truncated line of a text recording must be recognised
+        if not self.name.isprintable():  # a line break would look like a truncated line in a text recording
             raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
@@ -231,7 +233,7 @@ class Drive(RegisterAccess):
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.link: Link = NO_LINK
         self.stops_called: Sequence[int] = (0,)  # the first item is the number of stops called so far
-        # Takes a verb and the number of stops seen; returns a new call, which any later stop cancels.
+        # Takes a verb's name and a number of stops; returns a new call, which any stop after these cancels.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (
@@ -329,10 +331,10 @@ class Drive(RegisterAccess):
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers whose raw counts lie in a known range, each with its least and greatest count.
+        """Return registers whose raw counts lie in a known range, each with its least and greatest raw count.
 
-        If a family reads one register at a time, replies of two registers differ only by their values. So the
-        ranges must not overlap.
+        The ranges must not overlap: if a family reads one register at a time, only the value in a reply shows
+        which register it belongs to.
         """
         return {}
 
@@ -396,7 +398,7 @@ class Drive(RegisterAccess):
             raise NotVerified(self.name, what, f"the drive holds {register.format(held)}")
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise WriteForbidden if the setpoint is unknown, 0, or no longer the value written last."""
+        """Raise WriteForbidden if the setpoint that the drive holds is unknown, 0, or not that written last."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
@@ -419,10 +421,11 @@ class Drive(RegisterAccess):
         return WriteForbidden(why, advice=Advice.call("reset_fault"))
 
     def _started(self, direction: Direction | None = None) -> Script[None]:
-        """Wait until the motor is seen to run, and in `direction` if given and shown by the drive.
+        """Wait until the drive shows that the motor runs, and in `direction` if that is given.
 
-        A motor that turned the other way gets more time, for its ramps. Raises NotVerified if the drive
-        trips, Unconfirmed if the motor is not seen to run in time.
+        The direction is ignored if the drive does not show one. A motor that turned in reverse gets more time
+        for its ramps. Raises NotVerified if the drive trips, and Unconfirmed if the motor is not seen to run
+        in time.
         """
         if not (yield from until(self._runs, limit=START_TIME)):
             seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
@@ -493,7 +496,7 @@ class Drive(RegisterAccess):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped."""
+        """Turn the motor slowly until a stop is called."""
         raise self._unsupported("jog command")
         yield
 
@@ -511,13 +514,13 @@ class Drive(RegisterAccess):
 
     @verb
     def release_control(self) -> Script[None]:
-        """Return control of the motor to the drive's panel or terminals; only at rest."""
+        """Return control of the motor to the drive's panel or terminals; only while the motor is at rest."""
         raise self._unsupported("way to return control")
         yield
 
     @verb
     def state(self) -> Script[State]:
-        """Return condition, direction and fault."""
+        """Return the motor's condition and direction, and the drive's fault."""
         raise self._unsupported("state")
         yield
 
@@ -529,7 +532,7 @@ TAKEN_NAMES = frozenset(
 )
 
 
-# ---- checks that a register belongs to the drive: addresses mean something else in another family ----
+# ---- checks that a register belongs to the drive's family, because families use addresses differently ----
 
 
 def check_drive(drive: Drive) -> None:

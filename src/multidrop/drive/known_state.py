@@ -26,7 +26,7 @@ class StateReader:
     def __init__(self, drive: Drive) -> None:
         self._drive = copy(drive)
         self._shown: tuple[dict[str, float | None], State | None] | None = (
-            None  # the last state, and the values that it came from
+            None  # the values used by the last call, and the state that it returned
         )
         self.has_state = type(drive).state is not Drive.state
         """True if the family's document defines a state."""
@@ -82,7 +82,7 @@ def _known(state: object, read: Mapping[str, float | None]) -> State | None:
 def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
     """Return True if a fault of the drive can be detected from the registers with these names.
 
-    A record of the newest fault counts, because a new fault changes it.
+    A register with a record of the newest fault is enough, because a new fault changes its value.
     """
     if {FAULT, *FAULT_RECORDS} & {*polled}:
         return True

@@ -65,7 +65,7 @@ URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
 
 
 def check_port(port: str) -> str:
-    """Return `port` unchanged if it is a valid port name in a file or on a command line.
+    """Return `port` unchanged if it is a valid name of a port.
 
     Raises NoSuchPort for a URL with an unknown scheme, with a user or a password, or without its host or port
     number.
@@ -150,8 +150,8 @@ def framing_on(
 def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:
     """Raise ValueError unless `agreed` is a valid silence in s.
 
-    `own` is the silence in s that an RTU drive's document requires. Raises also if both are shorter than 1.5
-    characters, because such a silence may occur within a frame.
+    `own` is the silence in s that an RTU drive's document requires, else None. Also raises ValueError if both
+    silences are shorter than 1.5 characters, because such a silence may occur within a frame.
     """
     is_number = isinstance(agreed, (int, float)) and not isinstance(agreed, bool)
     if not (is_number and 0 <= agreed <= LONGEST_SILENCE):

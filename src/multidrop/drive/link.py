@@ -1,4 +1,4 @@
-"""RegisterAccess: the read and write methods of a drive; and Link: the bus's part of them."""
+"""RegisterAccess: the read and write methods of a drive. Link: the methods of a bus that they call."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ T = TypeVar("T", bound=float)
 
 
 class TextWanted(Exception):
-    """One of the registers to read is a text, which needs requests of its own."""
+    """Raised if one of the registers to read is a text, which needs separate requests."""
 
 
 class Link(Protocol):
-    """The reads and writes of one bus; see the methods of Drive."""
+    """The bus's implementation of a drive's reads and writes; see the methods of the same names in Drive."""
 
     @property
     def values(self) -> Any:
         """A function of a drive and a sequence of registers or names that returns their values by name.
 
-        It raises TextWanted if one of them is a text.
+        The function raises TextWanted if one of the registers is a text.
         """
 
     def text(self, drive: Any, text: Text) -> str: ...
@@ -56,7 +56,7 @@ class NoLink:
 
 
 def not_attached(drive: Any) -> NotAttached:
-    """Return the error for a call that needs a bus."""
+    """Return the error for a call that needs a bus, when the drive is on none."""
     return NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
 
 

@@ -1,4 +1,4 @@
-"""The verbs of a drive by name, with options as in JSON."""
+"""Look up the verbs of a drive by name, and convert their options from JSON values."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from functools import cached_property
 from multidrop.core import LOW_BYTE_FIRST, LOW_WORD_FIRST
 from multidrop.core import NumberFormat as NumberFormat
 
-WORDS = {  # of 16 bits
+WORDS = {  # number of 16-bit words of each format
     NumberFormat.U16: 1,
     NumberFormat.I16: 1,
     NumberFormat.I8: 1,
@@ -30,8 +30,8 @@ WORDS = {  # of 16 bits
     NumberFormat.F64: 4,
 }
 FLOATS = {NumberFormat.F16: ">e", NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
-SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})  # a float64 holds each exactly
-WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # a float does not hold these exactly
+SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})  # a float64 holds each value exactly
+WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # a float64 does not hold all values exactly
 # The order of the bytes on the wire, A the most significant; a single word has AB or BA.
 ORDERS = {
     "AB": 0,
@@ -82,7 +82,7 @@ def arranged(data: bytes, order: str) -> bytes:
 
 
 def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
-    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if it ends earlier."""
+    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if the data is too short."""
     if number_format is NumberFormat.BIT:
         return data[at // 8] >> at % 8 & 1 if at // 8 < len(data) else None
     size = 2 * WORDS[number_format]
@@ -112,7 +112,7 @@ def signed(bits: int, count: int) -> int:
 
 
 def bits_of(number: float, number_format: NumberFormat) -> int:
-    """Return the bits of this number; the high bits of a whole number are cut off if they do not fit."""
+    """Return the bits of this number; high bits (decimal: digits) that do not fit are cut off."""
     if number_format in FLOATS:
         number = nearest_or_infinite(number, number_format)
         return int.from_bytes(struct.pack(FLOATS[number_format], number))
@@ -141,7 +141,10 @@ def nearest_or_infinite(value: float, number_format: NumberFormat) -> float:
 
 
 def shortest(value: float, scale: Fraction, number_format: NumberFormat) -> str:
-    """Return the shortest decimal that means the F16 or F32 nearest to `value`, in units of `scale`."""
+    """Return the shortest decimal text of `value` for which the drive would hold the same F16 or F32.
+
+    The drive holds `value / scale`.
+    """
     if not math.isfinite(value):
         return str(value)
     held = nearest_or_infinite(value / scale, number_format)
@@ -156,12 +159,12 @@ def shortest(value: float, scale: Fraction, number_format: NumberFormat) -> str:
     return repr(found + 0.0).removesuffix(".0")
 
 
-MOST_POWER = 22  # of ten that a float64 holds exactly
+MOST_POWER = 22  # 10 ** 22 is the largest power of ten that a float64 holds exactly
 
 
 @dataclass(frozen=True)
 class Coding:
-    """The encoding of one quantity: format, byte order, part, invalid counts and exact scale."""
+    """The encoding of one quantity: number format, byte order, bit range, invalid raw counts, exact scale."""
 
     number_format: NumberFormat
     order: str = "ABCD"
@@ -197,15 +200,15 @@ class Coding:
 
     @cached_property
     def mask(self) -> int:
-        """The bits of the whole number that belong to the part."""
+        """A mask of the number's bits that belong to the part; all bits if there is no part."""
         return ((1 << self._part_width) - 1) << (self.part[0] if self.part else 0)
 
     @cached_property
     def invalid_patterns(self) -> tuple[tuple[int, int], ...]:
-        """Mask and bit pattern of each invalid count; NaN is always invalid.
+        """Mask and bit pattern of each invalid raw count, without NaN, which is always invalid.
 
-        A count that fits into the part is compared with the part, a larger one with the whole number. A count
-        outside the format's span gives the bits themselves, such as 8000H of a signed number.
+        A raw count that fits into the part is compared with the part, a larger raw count with the whole
+        number. A raw count outside the format's span gives the bits themselves, such as 8000H of an I16.
         """
         return tuple(self._pattern(count) for count in self.invalid if count == count)
 
@@ -223,12 +226,12 @@ class Coding:
     # ---- reading ----
 
     def raw_in(self, data: bytes, at: int) -> float | None:
-        """Return the raw count at word (BIT: bit) `at` of a reply's data; None for an invalid count."""
+        """Return the raw count at word (BIT: bit) `at` of a reply's data; None if invalid or missing."""
         bits = bits_in(data, at, self.number_format, self.order)
         return None if bits is None else self.raw_of(bits)
 
     def raw_of(self, bits: int) -> float | None:
-        """Return the raw count of a number's bits; None for an invalid count."""
+        """Return the raw count of a number's bits; None if it is invalid."""
         if any(bits & mask == pattern for mask, pattern in self.invalid_patterns):
             return None
         if self.part is None:
@@ -253,7 +256,7 @@ class Coding:
     def count_of(self, value: float) -> float:
         """Return the raw count nearest to a value; in a float format, the nearest float of its width.
 
-        Raises OverflowError beyond the largest float.
+        Raises OverflowError if the raw count is beyond the format's largest float.
         """
         count = self.exact_count(value)
         return nearest(count, self.number_format) if self.number_format in FLOATS else round(count)
@@ -261,8 +264,8 @@ class Coding:
     def exact_count(self, value: float) -> Fraction:
         """Return the raw count of a value, unrounded.
 
-        A float is read as its shortest decimal: 0.3 is three tenths. A float that is a whole count is taken
-        exactly, because a 64-bit count needs that.
+        A float is read as its shortest decimal: 0.3 is three tenths. But if the raw count is a whole number
+        without this, it is used, because the shortest decimal may be inexact for 64-bit numbers.
         """
         count = (Fraction(value) - self.offset) / self.step
         return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step

@@ -1,7 +1,7 @@
-"""Parameter spaces: a family's rule from a parameter's code to its address.
+"""Parameter spaces: a family's rule that computes a parameter's address from its code.
 
-A family has one as `parameter_space`. Most parameters are not declared as registers: the rule is enough to
-save and restore them as raw counts. A declared setting adds its name, unit, limits and factory value.
+The class has the rule as `parameter_space`. Most parameters are not declared as registers: the rule is enough
+to save and restore them as raw counts. A declared setting adds its name, unit, limits and factory value.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ParameterGroup:
     as_hex: bool = False
 
     def codes(self) -> Mapping[str, int]:
-        """Return each code's address."""
+        """Return the address of each parameter, by its code."""
         base = 16 if self.as_hex else 10
         return {
             f"{self.prefix}{index:0{self.digits}d}": self.start + int(str(index), base)
@@ -117,7 +117,7 @@ class Parameter(Register[Any]):
 
     @property
     def default_raw(self) -> int | None:
-        """The raw count from the factory, if the manual prints it."""
+        """The factory value as a raw count; None if the manual does not state it."""
         return None if self.default is None else int(self.coding.count_of(self.default))
 
 

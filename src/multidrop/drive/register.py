@@ -41,14 +41,14 @@ class Kept(Enum):
 
 
 class Carrier(Enum):
-    """Field of a frame that carries a table's values."""
+    """The part of a frame that carries a value of a table."""
 
     BIT = "bit"
     WORD = "word"
     LONG = "four bytes"  # Delixi's D3..D0
     NUMBER = "parameter number"  # Delixi's P1P0
 
-    __hash__ = object.__hash__  # as above
+    __hash__ = object.__hash__  # for speed, as in Kept
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # words in the names of va
 
 
 class Worded(IntEnum):
-    """Named numbers; if the name is a code of the manual, `words` explains it."""
+    """Named numbers. If the name is only a code of the manual, such as E07, `words` explains it."""
 
     words: str
 
     def __new__(cls, value: int, words: str = "") -> Self:
-        """Return the member of this number."""
+        """Create the member with this number."""
         member = int.__new__(cls, value)
         member._value_ = value
         member.words = words
@@ -209,7 +209,7 @@ class Register(Generic[T]):
 
     @property
     def value_unit(self) -> str:
-        """The unit of the values: `unit`, or "raw count" if the scale is not stated."""
+        """The unit of the register's values: `unit`, or "raw count" if the manual does not state the scale."""
         return self.unit if self.values is not None or self.step is not None else "raw count"
 
     @property
@@ -236,7 +236,10 @@ class Register(Generic[T]):
         return cast(T, number) if self.values is None and not self.is_bit else self.decode(number)
 
     def decode(self, raw: float) -> T:
-        """Return the value of a raw count; a plain number if the enumeration has no name for it."""
+        """Return the value of a raw count: in the unit, or as a member of the enumeration if it has one.
+
+        A raw count without a member is returned as an int.
+        """
         if self.values is not None:
             try:
                 return self.values(int(raw))
@@ -297,7 +300,7 @@ class Register(Generic[T]):
 
     @property
     def _counts(self) -> bool:
-        """True if numbers are choices or raw counts, which must not be rounded."""
+        """True if the values are choices or raw counts, which must not be rounded."""
         return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
@@ -389,7 +392,7 @@ def _number_in(text: str) -> float:
 
 
 def _short(value: float) -> str:
-    """Return a number for a message; it may be larger than any float."""
+    """Return a number as text for a message; the number may be larger than any float."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
@@ -406,25 +409,25 @@ class Details(TypedDict, total=False):
     #: Lowest and highest bit of a reading that is only a part of the number in its words. `invalid` counts
     #: that do not fit into the part are compared with the whole number.
     part: tuple[int, int]
-    order: str  #: bytes as they come on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
+    order: str  #: order of the bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
     scale_register: str  #: reading whose signed count is this one's power of ten; one request reads both
     span: tuple[float, float]  #: smallest and largest value that may be written
-    at_least: str  #: register or option whose present value is the least that may be written
-    at_most: str  #: register or option whose present value is the most
+    at_least: str  #: register or option whose present value is the smallest that may be written
+    at_most: str  #: register or option whose present value is the largest that may be written
     number_format: NumberFormat  #: width, sign and kind of the number in the frame
     table: Table  #: address space and function codes
     kept: Kept  #: RAM or EEPROM; by default the table's
     ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
     default: float  #: value from the factory
-    while_running: bool  #: may be changed while the motor turns; None if not stated
+    while_running: bool  #: whether it may be changed while the motor turns; None if not stated
     broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
-    #: A write may start, stop or reset something, so only verbs write it. Unless stated, this holds for
-    #: commands, and for settings that have `harmless`.
+    #: True if a write may start, stop or reset something, so that only verbs write it. The default is True
+    #: for commands, and for settings that have `harmless`.
     moves: bool
-    #: Of a register that moves the motor, the raw counts that anyone may write at any time, and again when
-    #: the reply is lost. All others are for verbs, which send them once.
+    #: For a register that moves the motor: the raw counts that any caller may write at any time, and that are
+    #: sent again if the reply is lost. All other raw counts are sent only by verbs, and only once.
     harmless: tuple[int, ...]
-    never: str  #: reason why the library never writes it
+    never: str  #: reason why the library never writes the register
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write
     place: str  #: section of the manual
     outside: str  #: source, if it is not the family's own document

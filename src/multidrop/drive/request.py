@@ -32,9 +32,9 @@ def read_limit(family: Any, table: Table) -> int:
 
 
 def function_limit(family: Any, function: int) -> int:
-    """Return how many addresses, declared or not, one read by this function may have.
+    """Return how many addresses, declared or not, one read by this function code may have.
 
-    This is the smallest limit that the family states, but at least its longest register.
+    This is the smallest limit that the family states, but at least the length of its longest register.
     """
     standard = STANDARD_LIMITS[FUNCTIONS[function]]
     stated: list[int] = [most for table, most in family.most_registers.items() if table.read == function]

@@ -1,4 +1,6 @@
-"""Scripts: the steps of a verb, as a generator without any I/O.
+"""Scripts: generators that yield the steps of a verb. No I/O.
+
+
 
 A script yields steps (read, write, wait) and receives their results.
 """

@@ -83,7 +83,7 @@ def _mistakes(place: str, check: Callable[[], object]) -> list[str]:
 
 
 def _description(drive: Drive) -> tuple[object, ...]:
-    """Return the facts that are equal for two objects of the same drive with the same options."""
+    """Return a drive's class and options as a key, which is equal for two objects of the same drive."""
     return (
         type(drive),
         drive.address,
@@ -128,16 +128,17 @@ class Staying:
     def await_stops(self) -> None:
         """Cancel the calls of the leaving drives, and wait for their stops.
 
-        With `stop_on_exit`, drives whose address is not used by a joining drive are stopped first; for a
-        joining drive, the old family's stop could mean something else. All stops are over before any drive
-        is removed, because a removed drive could not be stopped while another motor still ramps down.
+        With `stop_on_exit`, the leaving drives are stopped first, except those whose address a joining drive
+        takes: the leaving drive's stop could mean something else to the joining drive. All stops are over
+        before any drive is removed, because a removed drive could not be stopped while another motor still
+        ramps down.
         """
         taken = {polled.drive.address for polled in self.drives.joining}
         leaving = [polled.drive for polled in self.drives.leaving]
         self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives, and wait for the last exchange of those whose name is in `names`."""
+        """Remove the leaving drives; for those whose name is in `names`, wait until their last exchange ends."""
         leaving = [polled.drive for polled in self.drives.leaving]
         for drive in leaving:
             self.line.remove(drive)
@@ -153,7 +154,7 @@ class Staying:
 
     @property
     def moves(self) -> bool:
-        """True if drives leave or join."""
+        """True if any drive leaves or joins the line."""
         return bool(self.drives.leaving or self.drives.joining)
 
     def is_free(self, leaving: Mapping[str, Staying]) -> bool:
@@ -176,7 +177,7 @@ class Staying:
 
 @dataclass(frozen=True)
 class Coming:
-    """A line to open, and the present line that uses its port, or None."""
+    """A line to open; `before` is the present line on the same port, or None."""
 
     wanted: PlantLine
     before: PolledLine | None
@@ -194,7 +195,7 @@ class Adoption:
         self._check()
 
     def _pair(self) -> None:
-        """Match each wanted line with a present line, by name or else by port."""
+        """Match each line of the new plant with a present line, by name or else by port."""
         named = {line.name: line for line in self._lines}
         found = {
             wanted.name: line
@@ -261,7 +262,7 @@ class Adoption:
 
         If a joining drive has the name of a drive that leaves another line, that other line is changed first.
         Lines that wait for each other are changed together, once all their stops are over. This happens
-        before any port is opened, so that a slow port never delays the stop of an exchanged drive.
+        before any port is opened, so that a slow port never delays the stop of a drive that is replaced.
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for line in self._plant.lines for polled in line.drives}
@@ -305,7 +306,7 @@ class Adoption:
         return failures
 
     def _put(self, coming: Coming, bus: Bus, start: bool) -> None:
-        """Add a line with this bus, and poll it if `start` is set.
+        """Add a line with this bus; if `start` is set, start to poll it.
 
         Raises LineError if the port cannot have a drive's settings.
         """

@@ -45,7 +45,7 @@ ROW_COLUMNS = ("time", *Row._fields[1:])  # names of the columns that hold rows
 
 
 def shown_span(rows: Sequence[Row]) -> str:
-    """Return a text with the number of rows and drives and the time span, for a repr."""
+    """Return a text for a repr: the numbers of rows and drives, the duration, and the time of the first row."""
     if not rows:
         return "no rows"
     first, last = min(row.time_ns for row in rows), max(row.time_ns for row in rows)
@@ -143,9 +143,9 @@ class Batch(Rows):
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
 
     def columns(self) -> BatchColumns:
-        """Return the columns, without a copy, and the names of their codes.
+        """Return the columns, without a copy, and the names that their codes stand for.
 
-        For many rows this is much cheaper than a `Row` for each.
+        For many rows this is much faster than one `Row` object for each.
         """
         time, sent, uncertainty, drive, register, value, status, valid = (
             self._columns.array(name).toreadonly()
@@ -201,7 +201,7 @@ class PickedColumns(Columns):
 
 
 def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
-    """Return a bit for each row, the least significant first: 1 if its status is 0."""
+    """Return a bitmap with one bit per row, the least significant bit first: 1 if the row's status is 0."""
     bits = "".join("0" if code else "1" for code in reversed(statuses))
     return memoryview(int(bits or "0", 2).to_bytes((len(statuses) + 7) // 8, "little"))
 
@@ -251,9 +251,9 @@ class GatheredRows(Columns):
         return self._rows
 
     def add(self, batch: Batch) -> bool:
-        """Copy a batch's rows. Return False, without copying, if they are from another poller.
+        """Append a copy of a batch's rows; return True.
 
-        The codes of another poller mean other names.
+        Return False, without copying, if the batch is from another poller, whose codes mean other names.
         """
         columns, drives, registers = batch.parts()
         if drives is not self._drives or registers is not self._registers:
@@ -277,7 +277,7 @@ class GatheredRows(Columns):
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
-    """Append the rows to the last element, or to a new one if their codes differ."""
+    """Append the rows to the last element of `gathered`, or to a new element if they are of another poller."""
     if not gathered or not gathered[-1].add(batch):
         _, drives, registers = batch.parts()
         gathered.append(GatheredRows(drives, registers))

@@ -1,4 +1,4 @@
-"""Jobs: the blocks in which a drive is polled, each with its exchange and the layout of its rows."""
+"""Jobs: the blocks of registers in which a drive is polled, each with its exchange and its rows' layout."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ MOST_NAMES = 1 << 16  # limit of the uint16 name codes
 
 
 class RowNames:
-    """Names of drives and registers. Rows store the numbers of names."""
+    """Names of drives and registers, and the numbers that rows store instead of names."""
 
     def __init__(self) -> None:
         self.drives = Names()
         self.registers = Names()
 
     def check_room(self, drives: Iterable[PolledDrive]) -> None:
-        """Raise ValueError if, with these drives, there are more names than numbers for them."""
+        """Raise ValueError if there would be more than MOST_NAMES names with these drives."""
         wanted = list(drives)
         of_drives = {*self.drives.listed, *(polled.drive.name for polled in wanted)}
         of_registers = {*self.registers.listed, *(poll.register.name for d in wanted for poll in d.polls)}
@@ -56,8 +56,8 @@ class PolledJob(Job):
     block: Block
     exchange: Exchange
     rows: RowLayout
-    own_ns: int  # duration of silence and characters, without the response delay
-    may_be_too_long: bool  # whether the drive may not answer so long a request
+    own_ns: int  # duration of the exchange's silence and characters, without the response delay
+    may_be_too_long: bool  # whether the request may be longer than the drive answers
 
     @property
     def name(self) -> str:
@@ -74,17 +74,17 @@ class PlannedJobs:
 
 
 class JobMaker:
-    """Makes the jobs of one line, and returns the same job for the same block at the same rate."""
+    """Makes the jobs of one line. The same block at the same rate always gets the same job object."""
 
     def __init__(self, bus: Bus, names: RowNames) -> None:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by all rates, so refusals stay known
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by all rates; they count refusals
         self._skipped = 0  # skipped slots of forgotten jobs
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
-        """Plan a drive's polls for this response delay in s; return the jobs.
+        """Plan the requests that poll a drive, for a response delay of `delay` s; return their jobs.
 
         Raises ValueError for a register of another drive.
         """
@@ -107,7 +107,7 @@ class JobMaker:
         return self._made[key]
 
     def forget(self, jobs: Iterable[PolledJob]) -> None:
-        """Forget those of these jobs that have a period, because rates may change without limit.
+        """Forget these jobs, except those without a period, to bound memory if rates change often.
 
         Jobs without a period are kept, because the core may repeat them until the port is closed.
         """

@@ -29,7 +29,7 @@ MOST_LINES = (1 << 16) - 1  # limit of a row queue's line numbers
 
 
 class LineSet:
-    """Lines, each with the number by which the core identifies it; only one thread at a time changes them."""
+    """A poller's lines, each with the number that the core knows it by. Changed by one thread at a time."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class LineSet:
                     failures[place] = bus
                 else:
                     buses[place] = bus
-                    stack.callback(bus.close)  # unless all goes well
+                    stack.callback(bus.close)  # carried out unless `pop_all` is reached
             if failures:
                 raise failures[min(failures)]
             for place, line in enumerate(declared):
@@ -118,7 +118,7 @@ class LineSet:
         done: SimpleQueue[tuple[int, Future[Bus | OSError]]] = SimpleQueue()
 
         def work() -> None:
-            with suppress(IndexError):  # none is left
+            with suppress(IndexError):  # no line is left
                 while True:
                     place, line = left.popleft()
                     done.put((place, _settled(partial(self._opened, line))))
@@ -173,7 +173,9 @@ class LineSet:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
-        if self.stops_on_exit:  # checked last: a thread that sets it after this check sees this line
+        if (
+            self.stops_on_exit
+        ):  # checked after adding: a thread that sets it later finds this line in `_lines`
             bus.stop_on_exit()
         return line
 
@@ -195,7 +197,7 @@ class LineSet:
 
     @contextmanager
     def tended(self) -> Iterator[None]:
-        """Let stops reopen lost ports themselves after this block, because the poller no longer does."""
+        """After the block, let stops reopen lost ports themselves, because the poller no longer does."""
         try:
             yield
         finally:
@@ -203,7 +205,7 @@ class LineSet:
                 line.bus.tended(False)
 
     def end_polling(self) -> None:
-        """Stop polling; commands are still carried out."""
+        """Stop polling on all lines; commands are still carried out."""
         for line in self._lines:
             line.bus.line.end()
 
@@ -221,15 +223,15 @@ class LineSet:
         going = list(lines)
         with ExitStack() as stack:
             for line in reversed(going):
-                stack.callback(line.close, why)  # even if closing another line fails
+                stack.callback(line.close, why)  # carried out even if closing another line fails
             self.wind_down(going)
 
     def wind_down(self, lines: Sequence[PolledLine]) -> None:
         """Stop polling these lines, and wait for stops and exchanges in flight.
 
-        Drives whose bus has `stop_on_exit` are stopped first. All stops are waited for. Exchanges in flight
-        are waited for up to ENDING_NS, but not beyond the end of the mastership: half of its guard time later
-        the kernel kills a process whose ports are still open.
+        Drives whose bus has `stop_on_exit` are stopped first. The wait for stops has no limit. The wait for
+        exchanges in flight ends after ENDING_NS, or earlier when the mastership expires: half of its guard
+        time later the kernel kills a process whose ports are still open.
         """
         for line in lines:
             line.bus.leave()  # starts the stops of all lines before waiting for any

@@ -1,4 +1,4 @@
-"""PolledLine: the polling of one line, with its drives, its schedule, and a port that may be lost.
+"""PolledLine: polls the drives of one line by a schedule, and reopens the line's port if it is lost.
 
 A drive's blocks are planned again if its measured response delay differs too much from the planned one.
 """
@@ -97,10 +97,10 @@ def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
     }
 
 
-LEARN_NS = 1_000_000_000  # interval between measurements of exchange durations
+LEARN_NS = 1_000_000_000  # interval between updates of exchange durations from measured response delays
 RELEARN_NS = 2_000_000_000  # the same interval while the core repeats the bus cycle
 REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
-STANDBY_NS = 500_000_000  # interval between miss rows of a line that is not polled at present
+STANDBY_NS = 500_000_000  # interval between miss rows while this process may not poll the line
 RETRY_NS = 500_000_000  # pause after polling failed; doubled by each further failure
 LONGEST_RETRY_NS = 30_000_000_000
 SOUND_NS = 10_000_000_000  # time without a failure after which earlier failures are forgotten
@@ -108,18 +108,18 @@ MARGIN = 0.05  # fraction by which a response delay may lie outside the range of
 
 
 class PolledLine:
-    """A line's bus, drives and schedule.
+    """Polls one line: its bus, drives and schedule.
 
-    `number` identifies the line when the core requests attention for it. Any thread may add and remove
-    drives; the poller's thread calls `tend`.
+    `number` identifies the line when the core calls the poller's thread, which then calls `tend`. Any thread
+    may add and remove drives.
     """
 
     def __init__(
         self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
     ) -> None:
-        self.declared = declared  # valid except for its drives, which change
+        self.declared = declared  # its `drives` are those of the start; `polled` has the present drives
         self.bus = bus
-        self.switching = declared.switching  # s that a change of settings takes; after `end`, as measured
+        self.switching = declared.switching  # s that a change of port settings takes; measured after `end`
         self.started_ns = clock.now_ns()
         self.number = number
         self._is_left = False  # whether `leave` was called
@@ -133,9 +133,9 @@ class PolledLine:
         self._planned: dict[PolledDrive, PlannedJobs] = {}  # includes removed drives, until `forget`
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
-        self._gone: dict[int, Peer] = {}  # peers of removed drives, by address; may still be in an exchange
+        self._gone: dict[int, Peer] = {}  # by address, removed drives' peers, maybe still in an exchange
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
-        self._observed: list[tuple[int, int, bool]] = []  # for each: failures, late until, has answered
+        self._observed: list[tuple[int, int, bool]] = []  # for each of `_polled`, as in `_observe`
         self._is_started = False
         self._learnt_ns = 0
         self._reopening = Reopening(bus)
@@ -175,10 +175,10 @@ class PolledLine:
         return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def add(self, polled: PolledDrive) -> None:
-        """Start polling a drive; one that was polled before has the same jobs again.
+        """Start polling a drive. A drive that was polled before gets the same jobs again.
 
-        Wait first for the last exchange of an earlier drive at its address: only then are that drive's late
-        replies known.
+        First waits for the last exchange of an earlier drive at its address, because only then the late
+        replies of the earlier drive are known.
         """
         self.await_gone(polled.drive.address)
         settings = polled.drive.settings  # before locking: polling must not wait while a port is being opened
@@ -242,7 +242,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good, but keep its peer."""
+        """Forget the jobs of a drive that was removed for good; its peer stays known."""
         with self._lock:
             self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
             self._maker.forget_drive(drive)
@@ -277,13 +277,14 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def _change_jobs(self, drive: Drive, wanted: list[PolledJob], now_ns: int) -> None:
-        """Replace a drive's jobs by these; its queued exchanges are still carried out.
+        """Replace a drive's jobs with `wanted`; its queued exchanges are still carried out.
 
         Refused registers are polled normally again.
         """
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
-        # A new job takes the earliest slot of the old jobs of its period, or else of any present job.
+        # A new job's first slot is the earliest slot of the old jobs with its period, or else of any present
+        # job with its period.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)
@@ -307,14 +308,16 @@ class PolledLine:
             self.started_ns = clock.now_ns()
             self.bus.tended(True)
             self.bus.reset_statistics()
-            polled = [polled.drive for polled in self.polled]  # the bus may have other drives too
+            polled = [
+                polled.drive for polled in self.polled
+            ]  # the bus may also have drives that are not polled
             for drive in in_order(polled, self.switching):
                 self._schedule_jobs(drive, self.started_ns)
             self._is_started = True
         self._row_queue.call(self.number)
 
     def is_steady(self, now_ns: int) -> bool:
-        """Return True while the line needs attention only when the core calls."""
+        """Return True while the core repeats the bus cycle by itself, so that no check is needed."""
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
     def is_well(self, now_ns: int) -> bool:
@@ -401,7 +404,7 @@ class PolledLine:
             self._miss_unasked(now_ns)
 
     def _observe(self, now_ns: int) -> None:
-        """Report the drives' failures and late replies to the schedule's back-off, if they changed."""
+        """Report the drives' failures and late replies to the schedule's back-off, if they have changed."""
         seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
         if seen == self._observed:
             return
@@ -441,7 +444,7 @@ class PolledLine:
                 self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
-        """Make misses of the skipped slots that are due; slots may be skipped before they are due."""
+        """Add miss rows for the skipped slots that are due by now; slots may be skipped in advance."""
         unasked = self._schedule.unasked
         if unasked:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)
@@ -450,7 +453,7 @@ class PolledLine:
     # ---- not the master, a port that is lost, and the end ----
 
     def _stand_by(self, now_ns: int, why: Status) -> None:
-        """Every STANDBY_NS, make a miss of each value that is due, instead of polling."""
+        """Instead of polling, add a miss row for each value that is due, every STANDBY_NS."""
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
             self._miss(self._schedule.pass_all(now_ns), why)
@@ -462,9 +465,10 @@ class PolledLine:
         self._lost_ns = self._reopen_ns = now_ns
 
     def _regain(self, now_ns: int) -> None:
-        """Reopen the port in a thread; until that succeeds, make a miss of each value that is due.
+        """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
 
-        The first attempt makes no misses, so that a port that is back immediately continues in the same slot.
+        The first attempt adds no miss rows: a port that can be reopened immediately continues in the same
+        slot.
         """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
@@ -488,7 +492,7 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Make misses of all slots that are over, and close the bus; later calls fail with `why`."""
+        """Add miss rows for all unread slots that are over, and close the bus; later calls fail with `why`."""
         self.bus.line.why_closing = why
         with self._lock:
             try:

@@ -1,4 +1,4 @@
-"""PortQueue: exchanges that the core carries out on a port, queued in advance or repeated.
+"""PortQueue: the exchanges that the core carries out on a port. They are queued in advance, or repeated.
 
 If all drives of a line answer and are polled as fast as possible, the core repeats the bus cycle by itself.
 Otherwise the queue is refilled with many exchanges at a time.
@@ -23,7 +23,7 @@ class PortQueue:
     def __init__(self, schedule: Schedule[PolledJob]) -> None:
         self._schedule = schedule
         self.port: Port | None = None
-        self._done = 0  # the port's number of completed exchanges at the last count
+        self._done = 0  # number of the port's exchanges completed at the last `conclude`
         self._queued: deque[Turn[PolledJob]] = deque()  # turns that the core has not carried out yet
         self._ahead_ns = 0  # total duration of the queued turns
         self._newest: Turn[PolledJob] | None = None  # the last turn carried out

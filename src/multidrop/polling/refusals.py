@@ -1,10 +1,10 @@
 """Refusals: split blocks that a drive does not answer as a whole, and poll refused registers rarely.
 
-So no register is lost because of its neighbours. Refused registers and split blocks are retried every
-SET_ASIDE_NS, and polled as before once the drive answers them. Rows are not made from the retries of a split
-block. A drive may also give no reply to a block that is too long. Such a block is split if the class states
-no limit, the block was never answered, and the drive answers other requests. A drive that answers nothing is
-sent requests for one register.
+So a refused register does not prevent its neighbours from being read. Refused registers and split blocks are
+retried every SET_ASIDE_NS, and polled as before once the drive answers them. Rows are not made from the
+retries of a split block. A drive may also give no reply to a block that is too long. Such a block is split if
+the class states no limit, the block was never answered, and the drive answers other requests. A drive that
+has never answered is also sent requests for a single register.
 """
 
 from __future__ import annotations
@@ -31,11 +31,13 @@ class Refusals:
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
-        self._set_aside: dict[PolledJob, PolledJob] = {}  # from a rare job in use to the job it replaces
+        self._set_aside: dict[PolledJob, PolledJob] = {}  # from a rare job in use to the job that it replaces
         self._rare: dict[PolledJob, PolledJob] = {}  # from a job to the rare job that can replace it
-        self._wholes: dict[PolledJob, PolledJob] = {}  # from a part to the planned job that was split
-        self._trials: dict[PolledJob, PolledJob] = {}  # from a retry of a split block to its planned job
-        self._probes: dict[int, PolledJob] = {}  # by address of a drive all of whose blocks may be too long
+        self._wholes: dict[PolledJob, PolledJob] = {}  # from a part of a split job to the planned job
+        self._trials: dict[
+            PolledJob, PolledJob
+        ] = {}  # from the retry job of a split block to the planned job
+        self._probes: dict[int, PolledJob] = {}  # by drive address, the job that reads a single register
 
     @property
     def names(self) -> list[str]:
@@ -50,7 +52,7 @@ class Refusals:
             self._make_whole(trial, now_ns)
         for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
             job = self._set_aside.pop(rare)
-            job.rows.refusals = 0  # only now: the job may have been in flight when it was set aside
+            job.rows.refusals = 0  # not earlier: a reply in flight when it was set aside may add a refusal
             self._schedule.replace([rare], [job], now_ns)
         for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
             if parts := halves(job.owner, job.block):
@@ -64,7 +66,7 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True if a job must be split or set aside: after REFUSALS, or for a part after the first."""
+        """Return True if a job must be split or set aside: after REFUSALS, or 1 for a part of a split block."""
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
             return False
@@ -114,7 +116,7 @@ class Refusals:
     # ---- silence ----
 
     def _split_unanswered(self, job: PolledJob, now_ns: int) -> None:
-        """Split a block that may be too long, once the drive is seen to answer shorter requests."""
+        """Split a block that may be too long and is not answered, once the drive answers other requests."""
         peer, drive = job.exchange.peer, job.owner
         if job.rows.is_answered or job in self._trials:
             return

@@ -1,6 +1,6 @@
 """RowSource: the rows of a poller, as batches.
 
-Rows are collected in the core, in a limited number of chunks, and taken from there, the oldest first.
+The core collects rows in a limited number of chunks; consumers take the oldest chunk first.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _DEFERRED = (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.i
 
 
 def check_function(function: object) -> None:
-    """Raise TypeError unless this is a plain function: a call of an async or generator one runs nothing."""
+    """Raise TypeError unless this is a plain function: a call of an async or generator function runs nothing."""
     if not callable(function):
         raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
     while isinstance(function, partial):
@@ -47,7 +47,7 @@ def _check_returned(function: object, returned: object) -> None:
     """Raise TypeError if the function returned a coroutine or a generator."""
     if isinstance(returned, Awaitable | Generator | AsyncIterator):
         if inspect.iscoroutine(returned):
-            returned.close()  # else Python warns, too
+            returned.close()  # otherwise Python also warns that it was never awaited
         raise TypeError(_DEFERS.format(function))
 
 
@@ -87,11 +87,11 @@ class BatchCaller:
 
 
 FILLING_NS = 10_000_000  # minimum interval between batches taken from a chunk that is not full
-ASYNC_LOOK_S = 0.05  # interval between checks for rows in an event loop
+ASYNC_LOOK_S = 0.05  # interval at which `async for` checks for rows
 
 
 class RowSource:
-    """Rows in the core's queue, and the ways to take them."""
+    """The rows in the core's queue, and the methods to take them."""
 
     def __init__(self, row_queue: RowQueue, names: RowNames) -> None:
         self._row_queue = row_queue
@@ -113,7 +113,7 @@ class RowSource:
         return self._wakeup.fileno()
 
     def take(self) -> Batch | None:
-        """Return the oldest queued rows without waiting; None if there are none, or only a few new ones.
+        """Return the oldest queued rows without waiting; None if there are no rows, or only a few new rows.
 
         Raises PollingFailed if polling has failed and no rows are left.
         """
@@ -130,7 +130,7 @@ class RowSource:
         return Batch(columns, self._names.drives, self._names.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
-        """Yield batches as they come, about one every `every` s, for `seconds` s or until the poller closes.
+        """Yield batches, about one every `every` s, for `seconds` s or until the poller is closed.
 
         Once the poller is closed, the remaining batches are yielded immediately. Raises PollingFailed like
         `take`.

@@ -62,14 +62,14 @@ TIMES = ("time", "monotonic_ns")
 
 
 class _WideColumn:
-    """Values of one register, each with the number of its row."""
+    """The values of one register of one drive, each with the number of its row."""
 
     def __init__(self) -> None:
         self.rows = array("q")
         self.values = array("d")
 
     def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
-        """Return a bit for each row (1 if it has a value) and the values, in the order of `places`."""
+        """Return a bitmap (1 for each row with a value) and the values; `places` has each row's new place."""
         valid = bytearray((len(places) + 7) // 8)
         values = array("d", bytes(8 * len(places)))
         for row, value in zip(self.rows, self.values, strict=True):
