@@ -245,7 +245,8 @@ def check_period(seconds: float) -> None:
 
 
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
-    """Return the duration under this key in s, or None if it is missing. If it is invalid, add an error too."""
+    """Return the duration under this key in s; None if it is missing or invalid. Add an error if invalid."""
+
     return place.attempt(_duration_under, key, given[key], key=key) if key in given else None
 
 

@@ -368,7 +368,7 @@ def _declare(make: Make) -> str:
 
 
 def _forget_setpoint(drive: Drive) -> None:
-    """Forget the setpoint if the drive cannot report it: the drive may have lost power while it was silent."""
+    """Forget the setpoint if the drive cannot report it: it may have lost power while it was silent."""
     if drive.setpoint_name in drive.registers and not drive.register(drive.setpoint_name).readable:
         drive.commanded = None
 

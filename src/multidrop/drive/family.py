@@ -97,9 +97,7 @@ class Drive(RegisterAccess):
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # what to set on its keypad
     line_parameters: ClassVar[str] = ""  # names of the parameters for address, baud rate and format
-    parameter_space: ClassVar[ParameterSpace | None] = (
-        None  # None: parameters' addresses follow no known rule
-    )
+    parameter_space: ClassVar[ParameterSpace | None] = None  # None: addresses follow no known rule
     no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
@@ -125,7 +123,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _declared(cls, kind: type[A]) -> dict[str, A]:
-        """Return all attributes of this type by name; an attribute that a subclass has replaced is left out."""
+        """Return the attributes of this type by name, except those that a subclass has replaced."""
         found: dict[str, A] = {}
         for owner in reversed(cls.__mro__):
             for name, attribute in vars(owner).items():
@@ -398,7 +396,7 @@ class Drive(RegisterAccess):
             raise NotVerified(self.name, what, f"the drive holds {register.format(held)}")
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise WriteForbidden if the setpoint that the drive holds is unknown, 0, or not that written last."""
+        """Raise WriteForbidden if the drive's setpoint is unknown, 0, or differs from the one written last."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:

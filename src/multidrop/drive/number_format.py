@@ -82,7 +82,7 @@ def arranged(data: bytes, order: str) -> bytes:
 
 
 def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
-    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if the data is too short."""
+    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if it is too short."""
     if number_format is NumberFormat.BIT:
         return data[at // 8] >> at % 8 & 1 if at // 8 < len(data) else None
     size = 2 * WORDS[number_format]

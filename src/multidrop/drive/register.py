@@ -209,7 +209,7 @@ class Register(Generic[T]):
 
     @property
     def value_unit(self) -> str:
-        """The unit of the register's values: `unit`, or "raw count" if the manual does not state the scale."""
+        """The unit of the values: `unit`, or "raw count" if the manual does not state the scale."""
         return self.unit if self.values is not None or self.step is not None else "raw count"
 
     @property

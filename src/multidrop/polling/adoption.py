@@ -138,7 +138,7 @@ class Staying:
         self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives; for those whose name is in `names`, wait until their last exchange ends."""
+        """Remove the leaving drives; wait until the last exchange ends of each whose name is in `names`."""
         leaving = [polled.drive for polled in self.drives.leaving]
         for drive in leaving:
             self.line.remove(drive)

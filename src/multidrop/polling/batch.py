@@ -45,7 +45,7 @@ ROW_COLUMNS = ("time", *Row._fields[1:])  # names of the columns that hold rows
 
 
 def shown_span(rows: Sequence[Row]) -> str:
-    """Return a text for a repr: the numbers of rows and drives, the duration, and the time of the first row."""
+    """Return a text for a repr: the numbers of rows and drives, the duration, and the first row's time."""
     if not rows:
         return "no rows"
     first, last = min(row.time_ns for row in rows), max(row.time_ns for row in rows)
@@ -277,7 +277,7 @@ class GatheredRows(Columns):
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
-    """Append the rows to the last element of `gathered`, or to a new element if they are of another poller."""
+    """Append the rows to the last element of `gathered`, or to a new one if they are of another poller."""
     if not gathered or not gathered[-1].add(batch):
         _, drives, registers = batch.parts()
         gathered.append(GatheredRows(drives, registers))

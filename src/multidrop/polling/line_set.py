@@ -173,9 +173,7 @@ class LineSet:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
-        if (
-            self.stops_on_exit
-        ):  # checked after adding: a thread that sets it later finds this line in `_lines`
+        if self.stops_on_exit:  # checked after adding: a thread that sets it later finds this line
             bus.stop_on_exit()
         return line
 

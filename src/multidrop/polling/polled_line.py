@@ -308,9 +308,7 @@ class PolledLine:
             self.started_ns = clock.now_ns()
             self.bus.tended(True)
             self.bus.reset_statistics()
-            polled = [
-                polled.drive for polled in self.polled
-            ]  # the bus may also have drives that are not polled
+            polled = [polled.drive for polled in self.polled]  # the bus may have unpolled drives too
             for drive in in_order(polled, self.switching):
                 self._schedule_jobs(drive, self.started_ns)
             self._is_started = True
@@ -492,7 +490,7 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Add miss rows for all unread slots that are over, and close the bus; later calls fail with `why`."""
+        """Add miss rows for all slots that are over, and close the bus; later calls fail with `why`."""
         self.bus.line.why_closing = why
         with self._lock:
             try:

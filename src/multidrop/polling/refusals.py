@@ -34,9 +34,7 @@ class Refusals:
         self._set_aside: dict[PolledJob, PolledJob] = {}  # from a rare job in use to the job that it replaces
         self._rare: dict[PolledJob, PolledJob] = {}  # from a job to the rare job that can replace it
         self._wholes: dict[PolledJob, PolledJob] = {}  # from a part of a split job to the planned job
-        self._trials: dict[
-            PolledJob, PolledJob
-        ] = {}  # from the retry job of a split block to the planned job
+        self._trials: dict[PolledJob, PolledJob] = {}  # from a split block's retry job to its planned job
         self._probes: dict[int, PolledJob] = {}  # by drive address, the job that reads a single register
 
     @property
@@ -66,7 +64,7 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True if a job must be split or set aside: after REFUSALS, or 1 for a part of a split block."""
+        """Return True if a job must be split or set aside: after REFUSALS, or 1 for part of a split block."""
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
             return False

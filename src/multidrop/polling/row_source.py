@@ -27,7 +27,7 @@ _DEFERRED = (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.i
 
 
 def check_function(function: object) -> None:
-    """Raise TypeError unless this is a plain function: a call of an async or generator function runs nothing."""
+    """Raise TypeError for an async or generator function: a call of it would run nothing."""
     if not callable(function):
         raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
     while isinstance(function, partial):
