@@ -1,4 +1,4 @@
-"""The audit log: each write with its author, its frame, its outcome and the reason for it."""
+"""The audit log has each write with its author, its frame, its outcome and the reason for the outcome."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert (noted[1]["drive"], noted[1]["address"], noted[1]["port"]) == ("invt-che@1", 1, "hall")
 
 
-def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(
+def test_an_unwritable_log_prevents_no_stop(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
@@ -142,7 +142,7 @@ Noted = list[tuple[str, str | None, str | None]]
 
 
 class Audited:
-    """A bus with one CHE, and what its log says."""
+    """A bus with one CHE drive and an audit log, and a method that returns the log's records."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
         self.path = path
@@ -175,7 +175,7 @@ def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
         drive.set_frequency(30)
     drive.set_frequency(10)
     noted = audited.noted()
-    annas = [entry for entry in noted if entry[1] == "anna"]  # a stop's last record may follow later writes
+    annas = [entry for entry in noted if entry[1] == "anna"]  # a stop's last record may come late
     assert {write.partition(" = ")[0] for write, _, _ in annas} >= {"setpoint", "control"}
     assert len(annas) >= 6
     assert {way for _, _, way in annas} == {"web, 10.0.0.7"}
@@ -185,15 +185,15 @@ def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
     ]
 
 
-def test_a_write_in_doubt_has_its_author(audited: Audited) -> None:
+def test_an_unconfirmed_write_is_recorded_with_its_author(audited: Audited) -> None:
     audited.line.loses = lambda request: request.function == 6
     with written_by("anna"), suppress(Unconfirmed):
         audited.drive.set_frequency(20)
     assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
 
 
-def test_a_stop_that_follows_a_failed_start_is_its_callers(audited: Audited) -> None:
-    """`start_staggered` stops its drives on threads of their own."""
+def test_stops_after_a_failed_staggered_start_have_the_callers_author(audited: Audited) -> None:
+    """`start_staggered` stops its drives on new threads, which must have the caller as author."""
     drive = audited.drive
     drive.set_frequency(20)
     audited.line.loses = lambda request: request.data == b"\0\1"
@@ -204,7 +204,7 @@ def test_a_stop_that_follows_a_failed_start_is_its_callers(audited: Audited) -> 
 
 
 async def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
-    drive, turn = audited.drive, asyncio.Lock()  # the simulated bus bears one caller at a time
+    drive, turn = audited.drive, asyncio.Lock()  # the simulated bus serves only one caller at a time
 
     async def write(name: str, hz: float, mine: asyncio.Event, other: asyncio.Event) -> None:
         with written_by(name, "asyncio"):
@@ -226,7 +226,7 @@ async def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> N
     assert audited.noted()[2:] == [("setpoint = 20.00 %", None, None)]
 
 
-def test_the_innermost_block_counts_and_ends(audited: Audited) -> None:
+def test_the_innermost_author_block_counts_until_its_end(audited: Audited) -> None:
     with written_by("anna", "web"):
         with written_by("boris"), suppress(ZeroDivisionError):
             audited.drive.set_frequency(20)
@@ -236,13 +236,13 @@ def test_the_innermost_block_counts_and_ends(audited: Audited) -> None:
 
 
 class Nameless:
-    """An object that cannot be shown."""
+    """An object whose `repr` fails."""
 
     def __repr__(self) -> str:
         raise ZeroDivisionError
 
 
-NAMES: list[tuple[Any, str | None]] = [  # and as it is noted of a stop
+NAMES: list[tuple[Any, str | None]] = [  # each with the name that a stop's record has
     ("", None),
     ("  ", None),
     ("a\nb", r"a\nb"),
@@ -257,12 +257,12 @@ NAMES: list[tuple[Any, str | None]] = [  # and as it is noted of a stop
 
 @pytest.mark.parametrize(("who", "noted"), NAMES, ids=range(len(NAMES)))
 @pytest.mark.parametrize("is_way", [False, True])
-def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
+def test_with_an_invalid_author_only_a_stop_is_sent(
     audited: Audited, who: Any, noted: str | None, is_way: bool
 ) -> None:
     bus, drive = audited.bus, audited.drive
     if is_way and who == "":
-        return  # no way
+        return  # an empty `way` is valid
     drive.set_frequency(30)
     with written_by(*(("anna", who) if is_way else (who, "web"))):
         for call in (
@@ -288,7 +288,7 @@ def test_under_a_name_that_would_spoil_the_log_a_stop_alone_is_sent(
     assert sorted(stops) == [("control = STOP", *by)] * 2 + [("stop", *by)] * 4
 
 
-def test_a_log_from_before_is_read(audited: Audited) -> None:
+def test_a_log_of_an_older_version_is_read_and_extended(audited: Audited) -> None:
     audited.path.write_text('{"time": "2026-01-01T00:00:00.000000000Z", "write": "old", "outcome": "done"}\n')
     with written_by("anna"):
         audited.drive.set_frequency(20)

@@ -1,4 +1,4 @@
-"""Broadcast stops: sent only to drives of one known family, and never after a later stop."""
+"""Broadcasts: only to drives of one confirmed family; a setpoint is not broadcast after a stop."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_there_are_families_with_broadcasts() -> None:
 
 @every_broadcasting
 def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    """One family's stop may be another's run, whichever was attached first."""
+    """The stop of one family may run the motor of the other, in whichever order they were attached."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
     line, drives, sims = line_of(monkeypatch, *models)
@@ -84,7 +84,7 @@ def test_stop_all_broadcasts_if_all_drives_are_alike(monkeypatch: pytest.MonkeyP
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 
-def test_stop_all_without_a_broadcast_of_the_family(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_sends_no_broadcast_if_the_family_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, sims = line_of(monkeypatch, "erman-er-g-220", "erman-er-g-220")
     for drive in drives:
         drive.set_frequency(20)
@@ -95,7 +95,7 @@ def test_stop_all_without_a_broadcast_of_the_family(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
-def test_drives_that_got_neither_broadcast_nor_stop_have_failed(
+def test_a_drive_that_was_sent_neither_broadcast_nor_stop_is_failed(
     monkeypatch: pytest.MonkeyPatch, models: tuple[str, str]
 ) -> None:
     line, _, _ = line_of(monkeypatch, *models)
@@ -108,7 +108,7 @@ def test_drives_that_got_neither_broadcast_nor_stop_have_failed(
 
 
 class Quiet(Toy):
-    """Its broadcast word stops no drive."""
+    """A drive whose harmless broadcast is no stop."""
 
     model = "quiet"
     broadcasts = True
@@ -118,7 +118,7 @@ class Quiet(Toy):
 
     @verb
     def state(self) -> Script[State]:
-        """Report nothing."""
+        """Report the state as unknown."""
         yield from ()
         return State(Condition.STOPPED)
 
@@ -181,7 +181,7 @@ def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
 
 @every_broadcasting
 @pytest.mark.parametrize("frames", range(1, 12))
-def test_nothing_that_was_called_before_it_starts_a_motor_after_it(
+def test_no_call_from_before_a_broadcast_stop_starts_a_motor_after_it(
     monkeypatch: pytest.MonkeyPatch, model: str, frames: int
 ) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
@@ -211,25 +211,23 @@ def setpoint_of(drive: Any) -> Any:
 
 
 @pytest.mark.parametrize("model", SETTING)
-def test_a_setpoint_is_not_broadcast_after_the_bus_is_left(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_after_leave_a_stop_is_broadcast_but_no_setpoint(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
     with pytest.raises(CancelledByStop, match="the bus was left"):
         line.bus.broadcast(setpoint_of(drives[0]), 0.0)
-    line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # unlike a stop
+    line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # a stop is still broadcast
     (sent,) = broadcasts(line)
     assert sent.start == drives[0].control.address
 
 
 @pytest.mark.parametrize("moment", ["before it is sent", "while it waits for its turn"])
-def test_a_setpoint_that_was_called_before_a_stop_is_not_broadcast_after_it(
+def test_a_setpoint_broadcast_is_cancelled_by_a_later_stop(
     monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     line, drives, _ = line_of(monkeypatch, "invt-che", "invt-che")
-    line.sleep(60)  # who is there is asked again
+    line.sleep(60)  # after this silence the identities are checked again
     carry_out, begun = line.carry_out, len(line.frames)
 
     def stop_meanwhile(exchange: Exchange, **details: Any) -> Completion:
@@ -245,8 +243,8 @@ def test_a_setpoint_that_was_called_before_a_stop_is_not_broadcast_after_it(
     assert line.written == []
 
 
-def test_a_setpoint_that_is_late_is_not_broadcast(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Nor is it noted as one that may have been sent."""
+def test_an_expired_setpoint_is_not_broadcast(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The audit log must not record it as possibly sent."""
     audit = tmp_path / "audit"
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims, audit=audit)
@@ -262,7 +260,7 @@ def test_a_setpoint_that_is_late_is_not_broadcast(monkeypatch: pytest.MonkeyPatc
 
 
 def test_identity_checks_of_many_drives_do_not_expire_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They take longer than the time in which a write's turn must come."""
+    """The checks of 20 drives take longer than the expiry of one write."""
     line, drives, _ = line_of(monkeypatch, *["invt-che"] * 20)
     line.sleep(60)
     line.queue_time = 0.1
@@ -273,7 +271,7 @@ def test_identity_checks_of_many_drives_do_not_expire_a_broadcast(monkeypatch: p
 def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The last drive was silent for long enough to be replaced; the others just answered."""
+    """After a long silence, the second drive is replaced by one of another family."""
     line, drives, sims = line_of(monkeypatch, "invt-che", "invt-che")
     line.sleep(60)
     sims[1]["device"] = 0x010A
@@ -282,8 +280,8 @@ def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced(
     assert line.written == []
 
 
-def test_a_broadcast_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The port is lost after it, so no other frame is sent."""
+def test_a_stop_that_was_only_broadcast_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The port is lost after the broadcast, so that no other frame is sent."""
     line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
 
     def lose(request: Message) -> bytes | None:
@@ -297,7 +295,7 @@ def test_a_broadcast_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> Non
         assert "sent 1 times, it was never confirmed" in told.why
 
 
-def test_two_interruptions_say_of_each_drive_that_it_was_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notes_of_two_interruptions_say_that_the_stop_was_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
 
     def press(request: Message) -> bytes | None:
@@ -315,7 +313,7 @@ def test_two_interruptions_say_of_each_drive_that_it_was_broadcast(monkeypatch: 
 # ---- a stop of all drives ----
 
 
-def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
+def test_only_stop_and_zero_are_broadcast_and_never_on_a_mixed_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
@@ -388,12 +386,12 @@ def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.M
     stopped = line.bus.stop_all()
     assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
     assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
-    assert all(each.seconds < 11 for each in stopped.values())  # one ramp, not three after another
+    assert all(each.seconds < 11 for each in stopped.values())  # all motors ramp down together
     assert all_stopped(line, sims)
 
 
 def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The port fails with it, and comes back."""
+    """The port is lost during the broadcast, and comes back."""
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:

@@ -38,7 +38,7 @@ from multidrop.transport.prepared import make_exchange
 
 
 class Rig(Drive):
-    """A test rig: one register of each kind."""
+    """A family for tests, with one register of each kind."""
 
     response_timeout = 0.1
     most_registers = {HOLDING: 4}
@@ -54,7 +54,7 @@ class Rig(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Take it for a rig: there is nothing else on these lines."""
+        """Accept any drive."""
         yield from ()
 
 
@@ -71,12 +71,12 @@ def path(sim: Simulator) -> str:
 
 
 def sent(drive: SimulatedDrive) -> dict[int, int]:
-    """Count the requests of each function that reached the drive."""
+    """Return the number of requests that reached the drive, by function code."""
     return dict(drive.counters.functions)
 
 
 def losing(*functions: int) -> Callable[[bytes], bytes]:
-    """The fate of replies to these functions: lost."""
+    """Return a fault that loses all replies to these function codes."""
     return lambda reply: b"" if reply[1] in functions else reply
 
 
@@ -84,7 +84,7 @@ def losing(*functions: int) -> Callable[[bytes], bytes]:
 
 
 @patient
-def test_one_value_in_its_unit() -> None:
+def test_a_value_is_read_in_its_unit() -> None:
     rig = simulated(Rig(1))
     rig["torque"] = 33.3
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
@@ -96,7 +96,7 @@ def test_one_value_in_its_unit() -> None:
 
 
 @patient
-def test_many_values_in_the_order_asked_for() -> None:
+def test_read_many_returns_values_in_the_requested_order() -> None:
     with unpaced(EncodedDrive(Rig(1))) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
         asked = [ours.gain, ours.speed, ours.limit, ours.torque, ours.gain]
@@ -121,7 +121,7 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
     there = EncodedDrive(family(1))
     with unpaced(there) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(family, 1)
-        ours.read(ours.readings()[0])  # the first value is asked for again
+        ours.read(ours.readings()[0])  # the very first value is read twice, which must not be counted below
         before = bus.peer(ours).counters()
         requests = there.counters.requests
         found = ours.read_many(ours.readings())
@@ -151,7 +151,7 @@ def test_drives_of_all_families_at_their_own_baud_rate_and_format() -> None:
             assert ours.read(register) == proof(ours, register)
 
 
-def test_the_bus_has_defaults_for_drives_without_their_own() -> None:
+def test_baud_rate_and_format_of_a_bus_are_used_by_drives_without_their_own() -> None:
     with unpaced(simulated(Toy(1))) as sim, Bus(path(sim), baudrate=19200, format="8N2") as bus:
         assert str(bus.attach(Toy, 1).settings) == "19200 8N2"
         assert str(bus.attach(Toy, 2, baudrate=9600).settings) == "9600 8N2"
@@ -162,8 +162,8 @@ def test_the_bus_has_defaults_for_drives_without_their_own() -> None:
 
 
 @patient
-def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
-    """One bit is added, as to the standard's own."""
+def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
+    """On the line one bit is added to it, as to the standard's t3.5."""
     drives = [simulated(ErmanERG220(at, silence=600e-6)) for at in (1, 2)]
     with Simulator([Wire(drives)]) as sim, Bus(sim.wires[0].path, silence=600e-6) as bus:
         for at in (1, 2):
@@ -356,7 +356,7 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
 
 @pytest.mark.slow
 @table("mistake", MISTAKES)
-def test_a_mistake_is_raised_before_the_first_frame(mistake: str) -> None:
+def test_an_invalid_argument_raises_before_any_frame_is_sent(mistake: str) -> None:
     call, kind, sentence = MISTAKES[mistake]
     rig = simulated(Rig(1))
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
@@ -387,7 +387,7 @@ def test_a_lost_confirmation_of_an_unreadable_register_is_unconfirmed() -> None:
     assert str(caught.value) == "Rig@1: it is not known whether target = 1500 rpm took effect: no reply"
     assert (caught.value.drive, caught.value.what) == ("Rig@1", "target = 1500 rpm")
     assert sent(rig)[0x06] == 1
-    assert rig["target"] == 1500  # as it happens
+    assert rig["target"] == 1500  # the write did take effect
 
 
 @pytest.mark.slow
@@ -401,7 +401,7 @@ def test_a_write_on_a_line_without_replies_is_sent_once() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_that_says_nothing_is_asked_a_few_times() -> None:
+def test_a_read_of_a_silent_drive_is_retried_a_few_times() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x03)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1, name="pump")
@@ -416,7 +416,7 @@ def test_a_drive_that_says_nothing_is_asked_a_few_times() -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("half_a_second")
-def test_a_damaged_reply_is_shown() -> None:
+def test_the_error_shows_the_bytes_of_a_damaged_reply() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, lambda reply: reply[:-1] + b"\0") as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1, name="pump")
@@ -440,7 +440,7 @@ def test_a_read_is_repeated_after_noise() -> None:
         assert ours.read(ours.speed) == 1480
 
 
-WRONG = {  # pymodbus, libmodbus and minimalmodbus each take some of these for the reply
+WRONG = {  # pymodbus, libmodbus and minimalmodbus each accept some of these as the reply
     "another address": checksums.rtu("02 03 02 00 07"),
     "another function": checksums.rtu("01 04 02 00 07"),
     "too many registers": checksums.rtu("01 03 04 00 07 00 07"),
@@ -454,7 +454,7 @@ WRONG = {  # pymodbus, libmodbus and minimalmodbus each take some of these for t
 def test_a_wrong_reply_is_never_data(wrong: str) -> None:
     with faulty(simulated(Rig(1)), lambda reply: WRONG[wrong]) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
-        with pytest.raises((BadReply, NoReply)):  # where this machine is late
+        with pytest.raises((BadReply, NoReply)):  # NoReply if this computer reads the reply too late
             ours.read(ours.speed)
 
 
@@ -491,7 +491,7 @@ def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
         (YD1000(1, baudrate=1200), 500, 500),
     ],
 )
-def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, most_ms: int) -> None:
+def test_timeouts_are_within_the_document_s_limits(drive: Drive, least_ms: int, most_ms: int) -> None:
     with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
         known = bus.peer(bus.attach(drive)).c
     assert (known.least_timeout_ns, known.most_timeout_ns) == (least_ms * 1_000_000, most_ms * 1_000_000)
@@ -501,7 +501,7 @@ def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, mos
 
 
 @patient
-def test_a_stop_to_all_of_one_family() -> None:
+def test_a_broadcast_stop_stops_all_drives_of_one_family() -> None:
     drives = [simulated(InnovertIBD(address)) for address in (1, 2)]
     with unpaced(*drives) as sim, Bus(path(sim)) as bus:
         for drive in drives:
@@ -551,11 +551,10 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
 
 @pytest.mark.slow
 @patient
-def test_a_bus_that_is_closed_while_others_use_it() -> None:
-    """A late call gets an error.
+def test_reads_on_a_bus_that_another_thread_closes_end_with_an_error() -> None:
+    """A call after the closing raises an error.
 
-    Each bus has a line of its own: a reply that is lost with a port is owed to whoever opens that port again,
-    and this would be waited for as patiently.
+    Each bus has its own line: on the same line, the next bus would wait for late replies to the closed one.
     """
     for _ in range(20):
         with unpaced(simulated(Rig(1))) as sim:
@@ -575,19 +574,19 @@ def test_a_bus_that_is_closed_while_others_use_it() -> None:
 
 
 class Single(Toy):
-    """Asked for one register at a time."""
+    """A drive that is read one register at a time."""
 
     most_registers = {HOLDING: 1}
 
 
 class Successor(Single):
-    """Another family."""
+    """A drive of another family at the same address."""
 
     model = "successor"
 
 
 def when_asked(bus: Bus, act: Callable[[], object]) -> None:
-    """Do this once, as a thread is about to give an exchange to the line."""
+    """Call `act` once, when a thread is about to carry out its next exchange."""
     carry_out = bus.line.carry_out
 
     def act_and_carry_out(*arguments: Any, **details: Any) -> Any:
@@ -605,11 +604,11 @@ def test_a_read_of_several_requests_ends_if_its_drive_is_detached() -> None:
         when_asked(bus, lambda: bus.detach(pump))
         with pytest.raises(NotAttached):
             pump.read(Single.output_frequency, Single.output_current, Single.fault)
-        assert peer.exchanges == 1  # at its address may be another family now
+        assert peer.exchanges == 1  # no second request: another family may have its address now
 
 
-def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that() -> None:
-    """Else the late reply to that would be taken for its own."""
+def test_a_drive_attached_at_a_detached_drive_s_address_expects_its_late_replies() -> None:
+    """Otherwise the late reply to the old drive's request could be taken for the new drive's reply."""
     sim = simulated(Single(1))
     with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
         pump = bus.attach(Single, 1)
@@ -621,7 +620,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that()
         def exchange_it() -> None:
             bus.detach(pump)
             taking.start()
-            taking.join(0.1)  # it would be over at once
+            taking.join(0.1)  # without a pending exchange, the attach would end immediately
             assert not taken
 
         when_asked(bus, exchange_it)
@@ -632,7 +631,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_a_thread_has_asked_that()
 
 
 @pytest.mark.parametrize("wrong", ["audit", "ledger"])
-def test_a_bus_that_cannot_be_made_leaves_its_port(wrong: str) -> None:
+def test_a_bus_with_invalid_arguments_leaves_no_port_open(wrong: str) -> None:
     with Simulator([Wire([simulated(Toy(1))])]) as simulator:
         port = simulator.wires[0].path
         with pytest.raises(TypeError) as kept:

@@ -57,7 +57,7 @@ STOPS: dict[str, Stop] = {
 
 
 @pytest.mark.parametrize("way", STOPS)
-def test_a_refused_stop_has_failed(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+def test_a_stop_refused_by_the_drive_is_failed(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
 
     def refuse(request: Message) -> bytes | None:
@@ -81,19 +81,19 @@ def test_an_unconfirmed_stop_is_unknown(monkeypatch: pytest.MonkeyPatch, way: st
 
 
 @pytest.mark.parametrize("way", STOPS)
-def test_a_confirmed_stop_is_done(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+def test_a_stop_that_is_seen_to_succeed_is_done(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     _, drive, _ = one(monkeypatch, InnovertIBD(1))
     assert STOPS[way](drive)[drive.name].ok
 
 
-def test_a_stop_of_a_line_that_is_gone_says_so_for_each_drive() -> None:
+def test_a_stop_of_a_removed_line_has_the_outcome_unknown_for_each_drive() -> None:
     def gone() -> None:
         raise KeyError("hall")
 
     assert [one.outcome for one in stop_line(gone, ["a", "b"], None).values()] == [CommandOutcome.UNKNOWN] * 2
 
 
-def test_a_drive_that_left_its_line_meanwhile_was_not_sent_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stop_of_a_removed_drive_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(InvtCHE(1)))
     found = stop_line(lambda: line.bus, ["gone"], None)
     assert found["gone"].outcome is CommandOutcome.NOT_SENT
@@ -129,7 +129,7 @@ def test_a_write_has_a_result_and_never_raises(
 
 
 class Threads(Supervisor):
-    """A supervisor that gets so many threads."""
+    """A supervisor that can start only `threads` threads; then it raises `failure`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -171,7 +171,7 @@ class Motors:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-async def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
+async def test_without_threads_every_stop_is_sent_before_waiting_for_a_motor(
     threads: Threads, failure: Exception
 ) -> None:
     threads.threads, threads.failure = 1, failure
@@ -182,7 +182,7 @@ async def test_without_threads_all_stops_are_sent_before_one_is_waited_for(
 
 
 @pytest.mark.slow
-def test_without_threads_the_loop_runs_and_free_threads_are_used(threads: Threads) -> None:
+def test_without_threads_the_event_loop_keeps_running_and_later_threads_are_used(threads: Threads) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
 
@@ -279,40 +279,40 @@ def on_threads(works: Sequence[StopWork]) -> list[StopFuture]:
     return [asyncio.get_running_loop().run_in_executor(None, work, None) for work in works]
 
 
-async def test_a_stop_during_a_repeated_one_is_sent_once() -> None:
+async def test_a_stop_called_while_another_is_repeated_is_sent_once() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     repeated = asyncio.get_running_loop().create_future()
     stops.note([drive], repeated)
     called = [stops.send_once(drive) for _ in range(5)]
-    await until_met(lambda: pump.calls == [0.0])  # the first one's; the others wait for it, together
+    await until_met(lambda: pump.calls == [0.0])  # the first call sends; the other four wait together
     pump.turns.release()
     await until_met(lambda: pump.calls == [0.0, 0.0])
-    called.append(stops.send_once(drive))  # it comes too late for that one
+    called.append(stops.send_once(drive))  # a call after the second stop was sent
     pump.turns.release(2)
     await until_met(lambda: pump.calls == [0.0, 0.0, 0.0] and not stops._sent)
-    await asyncio.sleep(0.05)  # all of them await the one that is repeated
+    await asyncio.sleep(0.05)  # all calls now wait for the repeated stop
     assert not any(one.done() for one in called)
-    called[1].cancel()  # its client is gone
+    called[1].cancel()  # the client disconnected
     repeated.set_result({"pump": STANDS})
     assert all([(await one)["pump"].ok for one in called if one is not called[1]])
     assert stops.of(drive) is None
 
 
-async def test_a_stop_is_repeated_further_if_the_earlier_one_gives_up() -> None:
+async def test_a_stop_is_repeated_itself_if_the_earlier_stop_gives_up() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     before = asyncio.get_running_loop().create_future()
     stops.note([drive], before)
     pump.turns.release()
-    stops.send_once(drive).cancel()  # its client is gone, and it goes on
+    stops.send_once(drive).cancel()  # the client disconnected; its stop continues
     called = stops.send_once(drive)
     pump.turns.release()
     await until_met(lambda: len(pump.calls) == 2 and not stops._sent)
     await asyncio.sleep(0.05)
     before.set_result({"pump": SILENT})
-    await until_met(lambda: pump.calls[-1] is None)  # repeated as if it had been called alone
-    assert pump.calls.count(None) == 1  # for both
+    await until_met(lambda: pump.calls[-1] is None)  # now repeated, as a stop that was called alone
+    assert pump.calls.count(None) == 1  # one repeated stop for both calls
     pump.turns.release()
     assert (await called)["pump"].ok is False
 
@@ -325,16 +325,16 @@ def test_a_stop_counts_as_repeated_from_its_call_to_its_end() -> None:
         repeated = asyncio.get_running_loop().create_future()
         pump.under_way = {}
         stops.note([drive], repeated)
-        assert stops.of(drive) is repeated  # its thread need not have begun
+        assert stops.of(drive) is repeated  # although its thread may not have started yet
         await asyncio.sleep(0.9 * BEGINNING_S)
         assert stops.of(drive) is repeated
         await asyncio.sleep(0.2 * BEGINNING_S)
-        assert stops.of(drive) is None  # it is over, and others of its line are not
+        assert stops.of(drive) is None  # its own stop is over; the stops of others on the line continue
         pump.under_way = {"pump": "no stop was sent yet"}
         await asyncio.sleep(20.0)
         assert stops.of(drive) is repeated
         bus, drive.bus = pump.bus, None
-        assert stops.of(drive) is None  # it was taken off
+        assert stops.of(drive) is None  # the drive was detached
         drive.bus = bus
         repeated.set_result({"pump": STANDS})
         assert stops.of(drive) is None
@@ -352,12 +352,12 @@ def test_drives_are_divided_into_new_and_repeated_stops() -> None:
         repeated.set_result({})
         assert stops.divided(drives) == (drives, [])
         stops.note([drives[2]], asyncio.get_running_loop().create_future())
-        assert set(stops._repeated) == {drives[2]}  # a plant is read anew for years
+        assert set(stops._repeated) == {drives[2]}  # finished stops are forgotten
 
     run_controlled(live())
 
 
-def test_a_whole_line_is_stopped_at_once_unless_a_drive_of_it_is_being_stopped() -> None:
+def test_a_line_is_stopped_as_a_whole_unless_one_of_its_drives_is_being_stopped() -> None:
     async def live() -> None:
         wholes: list[float | None] = []
 
@@ -382,7 +382,7 @@ def test_a_whole_line_is_stopped_at_once_unless_a_drive_of_it_is_being_stopped()
 
 
 class TimedStops:
-    """Stops of a drive that take some seconds of the loop's; the first that are repeated are given up."""
+    """Stops that last some seconds of the loop's time; the first `given_up` repeated ones do not succeed."""
 
     def __init__(self, drive: Any, given_up: int) -> None:
         self.stops = RepeatedStops(self._stop, self._begin)
@@ -401,11 +401,11 @@ class TimedStops:
         return [ended]
 
     async def called_beside(self, seconds: float) -> CommandResult:
-        """Return the end of one that is called beside another, which is given up after so long."""
+        """Return the result of a stop called during a repeated stop, which gives up after `seconds`."""
         repeated = asyncio.get_running_loop().create_future()
         self.stops.note([self._drive], repeated)
         called = self.stops.send_once(self._drive)
-        assert len(self.stops._tasks) == 1  # nothing else holds it
+        assert len(self.stops._tasks) == 1  # the only reference to the task
         asyncio.get_running_loop().call_later(seconds, repeated.set_result, {"pump": SILENT})
         told = (await called)["pump"]
         assert not self.stops._tasks

@@ -47,9 +47,9 @@ def writes(ledger: Ledger) -> int:
 
 
 @pytest.mark.parametrize("room", range(0, 90, 10))
-def test_a_record_that_had_no_room_harms_no_other(tmp_path: Path, room: int) -> None:
+def test_a_record_that_did_not_fit_on_the_disk_damages_no_other(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
-    log, other = AuditLog(path), AuditLog(path)  # of another process
+    log, other = AuditLog(path), AuditLog(path)  # `other` stands for another process
     log.add(0, {"write": "first"})
     with full_at(path.stat().st_size + room):
         for _ in range(2):
@@ -73,7 +73,7 @@ def test_reading_the_audit_log_skips_lines_that_are_not_records(tmp_path: Path) 
 def test_closing_waits_for_a_record_that_another_thread_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A stop is noted when it is over, and its line may be closed in that very moment."""
+    """A stop is recorded when it ends; its line may be closed at the same time."""
     begun, go_on = threading.Event(), threading.Event()
 
     class SlowLog(AuditLog):
@@ -128,7 +128,7 @@ def test_a_full_disk_prevents_no_stop_and_later_records_are_written(
     flush(PATIENCE_S)
     assert not sim.motor.energised
     assert "the audit log cannot be written: " in caplog.text
-    assert line.bus.audit_trouble == "File too large"  # what `full_at` has a full disk say
+    assert line.bus.audit_trouble == "File too large"  # the error of the full disk that `full_at` simulates
     drive.set_frequency(30)
     assert line.bus.audit_trouble == ""
     line.bus.close()
@@ -139,7 +139,7 @@ def test_a_full_disk_prevents_no_stop_and_later_records_are_written(
     ]
 
 
-def test_on_a_full_disk_noted_first_blocks_writes_but_no_stop(
+def test_on_a_full_disk_noted_first_prevents_writes_but_no_stop(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -188,10 +188,10 @@ def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(
     assert ended["why"].endswith("its caller was interrupted")
 
 
-def test_a_stop_is_two_lines_however_often_it_is_sent(
+def test_a_stop_has_two_audit_records_however_often_it_is_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """One line is written at the call, before the first frame, so a killed process leaves it."""
+    """The first line is written before the first frame, so that it exists if the process is killed."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
     drives = [line.attach(InvtCHE(address)) for address in (1, 2)]
@@ -230,7 +230,7 @@ def test_a_stop_is_two_lines_however_often_it_is_sent(
     }
 
 
-def test_a_disk_that_does_not_open_the_audit_log_is_given_up(
+def test_opening_the_audit_log_on_a_hung_disk_times_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     answers = threading.Event()
@@ -252,15 +252,13 @@ def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sen
 
 
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192, 12288])
-def test_a_ledger_on_a_full_disk_keeps_the_write_back_and_goes_on_afterwards(
-    tmp_path: Path, room: int
-) -> None:
+def test_a_full_disk_makes_the_ledger_refuse_writes_until_there_is_room(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     for at in range(3):
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
     others = 0
     with full_at(room), raises_unkept():
-        while others < 1000:  # until it must grow, where it has room for some
+        while others < 1000:  # until the file must grow
             others += not ledger.enter(LedgerCell("p" * 200, 2, "m", f"r{others}"), NOON, 0.0)
     assert others < 1000
     assert ledger.enter(CELL, NOON + 3, 0.0) == ""
@@ -268,7 +266,7 @@ def test_a_ledger_on_a_full_disk_keeps_the_write_back_and_goes_on_afterwards(
 
 
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192])
-def test_a_ledger_that_was_created_on_a_full_disk(tmp_path: Path, room: int) -> None:
+def test_a_ledger_created_on_a_full_disk_works_once_there_is_room(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     with full_at(room), pytest.raises(OSError, match="cannot be kept"):
         ledger.enter(CELL, NOON, 0.0)
@@ -276,30 +274,30 @@ def test_a_ledger_that_was_created_on_a_full_disk(tmp_path: Path, room: int) -> 
     assert writes(ledger) == 1
 
 
-def test_a_ledger_in_a_read_only_directory_keeps_the_write_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_ledger_prevents_eeprom_writes_but_no_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     with read_only_directory() as directory:
         for path in (directory / "wear.sqlite", directory / "deep" / "wear.sqlite"):
             line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
             with pytest.raises(OSError, match=r"the ledger of EEPROM writes .*wear\.sqlite cannot be kept"):
                 drive.set_frequency(10)
             assert line.written == []
-            drive.stop()  # needs none
+            drive.stop()  # needs no ledger
             assert len(line.written) == 1
 
 
-def test_a_clock_that_is_set_back_an_hour_frees_one_write_and_no_more(tmp_path: Path) -> None:
+def test_a_clock_set_back_by_an_hour_allows_only_one_write(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     assert ledger.enter(CELL, NOON, 60.0) == ""
     set_back = NOON - HOUR
     assert ledger.enter(CELL, set_back, 60.0) == ""
-    for second in range(60):  # by the clock as it is now
+    for second in range(60):  # by the clock after it was set back
         assert "was written" in ledger.enter(CELL, set_back + second, 60.0)
     assert ledger.enter(CELL, set_back + 60, 60.0) == ""
     assert writes(ledger) == 3
 
 
-def test_a_clock_that_is_set_back_by_little_frees_a_write_too(tmp_path: Path) -> None:
-    """The time since the last one cannot be known then."""
+def test_a_clock_set_back_by_a_quarter_second_allows_one_write(tmp_path: Path) -> None:
+    """The time since the last write is unknown then."""
     ledger = Ledger(tmp_path / "wear")
     assert ledger.enter(CELL, 1000.0, 60.0) == ""
     assert ledger.enter(CELL, 999.75, 60.0) == ""
@@ -307,7 +305,7 @@ def test_a_clock_that_is_set_back_by_little_frees_a_write_too(tmp_path: Path) ->
 
 
 def test_stops_are_counted_together_or_not_at_all(tmp_path: Path) -> None:
-    """In one transaction: each of its own would wait for a disk, or for who holds the file."""
+    """One transaction is used, because each transaction may wait for the disk or for another process."""
     ledger = Ledger(tmp_path / "wear")
     wrong = replace(CELL, register="no text: \udcff")
     with pytest.raises(ValueError, match="surrogates not allowed"):
@@ -317,11 +315,11 @@ def test_stops_are_counted_together_or_not_at_all(tmp_path: Path) -> None:
     assert [wear.writes for wear in ledger.wear(1000.0)] == [2]
 
 
-def test_a_clock_that_is_set_back_gives_no_budget_back(tmp_path: Path) -> None:
+def test_a_clock_set_back_restores_no_budget(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite", budget=10)
     for at in range(10):
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
-    for set_back in (HOUR, 86400.0, NOON):  # at last to 1970, as a board without a battery begins
+    for set_back in (HOUR, 86400.0, NOON):  # NOON: to 1970, where a board without a battery starts
         assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
 
 
@@ -329,8 +327,10 @@ def test_a_clock_that_is_set_back_gives_no_budget_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """10 Hz to an EEPROM for an hour of such a clock: once a minute at most, and once for the jump."""
+def test_a_setpoint_loop_writes_once_a_minute_despite_a_clock_set_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The EEPROM is written at most once a minute, and once more when the clock jumps back."""
     log = tmp_path / "audit.jsonl"
     line, drive, sim = one(monkeypatch, DelixiModbus(1), audit=log)
     utc = [1_700_000_000 * 10**9]
@@ -348,17 +348,15 @@ def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyP
         tried.append(second)
     gaps = sorted(after - before for before, after in pairwise(tried))
     assert len(tried) >= 5
-    assert all(gap >= 58 for gap in gaps[1:])  # all but the one in which the clock was set back
+    assert all(gap >= 58 for gap in gaps[1:])  # except the gap in which the clock was set back
     assert sim.counters.eeprom_writes["frequency"] == len(tried)
     line.bus.close()
     times = [str(each["time"]) for each in read_audit(log)]
     assert len(times) == len(tried)
-    assert times != sorted(times)  # the log says what the clock said, in the order of what was done
+    assert times != sorted(times)  # the records are in the order of writing, with times as the clock had them
 
 
-def test_a_budget_of_a_drive_s_own_ledger_outlives_the_bus(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_ledger_counts_remain_when_the_bus_is_closed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for life in range(3):
         _, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "wear.sqlite")
         drive.set_frequency(10 + life)

@@ -42,7 +42,7 @@ class Act:
 
 @pytest.fixture
 def caught() -> Iterator[list[int]]:
-    """Return a list of the signals that reached the handlers which the program had set before."""
+    """Return a list of the signals that reached the handlers installed before the hook's."""
     found: list[int] = []
     before = [
         (each, signal.signal(each, lambda number, frame: found.append(number)))
@@ -54,14 +54,14 @@ def caught() -> Iterator[list[int]]:
 
 
 @BOTH
-def test_a_second_signal_is_held_until_all_is_done(caught: list[int], number: int) -> None:
+def test_a_second_signal_is_delayed_until_all_stops_are_over(caught: list[int], number: int) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     for act in acts:
         hook.add(act.begin, act.work)
     signal.raise_signal(number)
-    assert all(act.is_begun for act in acts)  # at once
+    assert all(act.is_begun for act in acts)  # immediately
     for act in acts:
-        assert act.works.wait(PATIENCE)  # side by side: none of them is over
+        assert act.works.wait(PATIENCE)  # both run in parallel: neither is over
     signal.raise_signal(number)
     acts[0].go_on.set()
     assert caught == []
@@ -79,7 +79,7 @@ def test_a_signal_while_one_bus_closes_starts_the_stops_of_others(caught: list[i
     timer.start()
     release = threading.Thread(target=lambda: (acts[1].works.wait(PATIENCE), acts[0].go_on.set()))
     release.start()
-    hook.finish(made[0])  # the signal comes meanwhile
+    hook.finish(made[0])  # the signal arrives during this call
     assert caught == []
     acts[1].go_on.set()
     until(lambda: caught)
@@ -88,8 +88,8 @@ def test_a_signal_while_one_bus_closes_starts_the_stops_of_others(caught: list[i
     release.join()
 
 
-def test_a_bus_that_opens_after_the_signal_is_stopped_at_once(caught: list[int]) -> None:
-    """Its motors would turn on, and the process would wait for it."""
+def test_a_bus_opened_after_the_signal_is_stopped_immediately(caught: list[int]) -> None:
+    """Otherwise its motors would keep turning while the process waits."""
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
     signal.raise_signal(signal.SIGTERM)
@@ -100,14 +100,14 @@ def test_a_bus_that_opens_after_the_signal_is_stopped_at_once(caught: list[int])
     until(lambda: caught)
 
 
-def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
+def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
     caught: list[int], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 1000.0
     monkeypatch.setattr("multidrop.control.exit_hook.time.monotonic", lambda: now)
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
-    for _ in range(5):  # slowly, as many as one likes
+    for _ in range(5):  # slow signals do not count, however many
         signal.raise_signal(signal.SIGINT)
         now += 0.7
     assert caught == []
@@ -117,16 +117,16 @@ def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
         now += 0.1
         assert len(caught) == count
     assert capfd.readouterr().err == f"multidrop: {CUT_SHORT}\n"
-    hook.finish(made)  # nobody waits for it
+    hook.finish(made)  # does not wait for the act any more
     act.go_on.set()
     until(lambda: not threading_names() & {"multidrop exit"})
     assert len(caught) == 1
 
 
-def test_a_third_signal_cuts_the_stops_short_with_stderr_closed(
+def test_a_third_signal_ends_the_wait_even_if_stderr_is_closed(
     caught: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Standard error may be closed, or a terminal that is gone."""
+    """Standard error may be closed, or its terminal may be gone."""
 
     def write(fd: int, data: bytes) -> int:
         raise OSError(errno.EIO, "Input/output error")
@@ -142,13 +142,13 @@ def test_a_third_signal_cuts_the_stops_short_with_stderr_closed(
     until(lambda: not threading_names() & {"multidrop exit"})
 
 
-def test_hang_ups_cut_nothing_short(caught: list[int]) -> None:
-    """The kernel and the shell may each send one, and several terminals may close."""
+def test_repeated_hang_up_signals_do_not_end_the_wait(caught: list[int]) -> None:
+    """The kernel and the shell may each send SIGHUP when a terminal closes."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         hook, act = ExitHook(), Act()
         made = hook.add(act.begin, act.work)
-        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # not this process's end
+        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # not the end
         for _ in range(4):
             signal.raise_signal(signal.SIGHUP)
         assert act.is_begun
@@ -161,7 +161,7 @@ def test_hang_ups_cut_nothing_short(caught: list[int]) -> None:
 
 
 @pytest.mark.parametrize("has", [signal.SIG_IGN, lambda number, frame: None], ids=["nohup", "its own"])
-def test_a_hang_up_that_does_not_end_the_program_is_left_alone(caught: list[int], has: Any) -> None:
+def test_sighup_is_not_handled_if_the_program_handles_or_ignores_it(caught: list[int], has: Any) -> None:
     before = signal.signal(signal.SIGHUP, has)
     try:
         hook = ExitHook()
@@ -199,10 +199,10 @@ def test_a_last_act_may_be_finished_on_any_thread(caught: list[int]) -> None:
     assert caught == [signal.SIGTERM]
 
 
-def test_a_bus_that_comes_as_the_last_one_goes_has_the_signals(
+def test_a_bus_opened_while_the_last_one_closes_still_handles_signals(
     caught: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else SIGTERM would end the process, and leave its motors running."""
+    """Otherwise SIGTERM would end the process and leave the new bus's motors running."""
     hook, acts = ExitHook(), [Act(), Act()]
     first, let_go = hook.add(acts[0].begin, acts[0].work), hook._let_go
 
@@ -222,7 +222,9 @@ def test_a_bus_that_comes_as_the_last_one_goes_has_the_signals(
     until(lambda: caught == [signal.SIGTERM])
 
 
-def test_adding_an_act_without_the_signals_raises(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adding_an_act_raises_if_no_handler_can_be_installed(
+    caught: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     first = hook.add(acts[0].begin, acts[0].work)
     has_taken, goes_on, told = threading.Event(), threading.Event(), list[ValueError]()
@@ -251,8 +253,8 @@ def test_adding_an_act_without_the_signals_raises(caught: list[int], monkeypatch
     assert not acts[1].is_begun
 
 
-def test_a_signal_that_was_put_back_after_the_end_has_the_effect_it_had(caught: list[int]) -> None:
-    """By code that had it for a while, during which the bus was left."""
+def test_our_handler_restored_after_the_end_has_the_earlier_effect(caught: list[int]) -> None:
+    """Other code replaced the hook's handler, and put it back after the bus was closed."""
     hook = ExitHook()
     for comes_again in (False, True):
         made = hook.add(lambda: None, lambda: None)
@@ -268,10 +270,8 @@ def test_a_signal_that_was_put_back_after_the_end_has_the_effect_it_had(caught: 
 
 
 @pytest.mark.parametrize("is_over", [True, False], ids=["the first bus is closed", "the first bus is open"])
-def test_a_later_bus_takes_signals_that_the_program_has_handled_since(
-    caught: list[int], is_over: bool
-) -> None:
-    """The first bus was closed on another thread, which cannot give the signals back, or is still open."""
+def test_a_later_bus_handles_signals_that_the_program_took_over(caught: list[int], is_over: bool) -> None:
+    """The first bus is still open, or was closed on a thread, which cannot restore signal handlers."""
     hook, acts, handled = ExitHook(), [Act(), Act()], list[int]()
     first = hook.add(acts[0].begin, acts[0].work)
     acts[0].go_on.set()
@@ -290,8 +290,8 @@ def test_a_later_bus_takes_signals_that_the_program_has_handled_since(
 
 
 @pytest.mark.parametrize("effect", ["called", "default", "ignored"])
-def test_a_program_handler_may_call_ours_in_turn(caught: list[int], effect: str) -> None:
-    """The signal then has its earlier effect once, unless that would end the program behind its handler."""
+def test_a_program_handler_may_call_our_handler(caught: list[int], effect: str) -> None:
+    """The signal has its earlier effect once. The default effect, which ends the process, is left out."""
     hook, act, handled = ExitHook(), Act(), list[int]()
     if effect != "called":
         signal.signal(signal.SIGTERM, signal.SIG_DFL if effect == "default" else signal.SIG_IGN)
@@ -306,11 +306,11 @@ def test_a_program_handler_may_call_ours_in_turn(caught: list[int], effect: str)
     signal.raise_signal(signal.SIGTERM)
     assert act.is_begun
     act.go_on.set()
-    until(lambda: len(handled) == 2)  # when it came, and after the stops
+    until(lambda: len(handled) == 2)  # on arrival, and after the stops
     assert caught == ([signal.SIGTERM] if effect == "called" else [])
 
 
-def test_a_handler_that_ours_replaced_may_call_an_earlier_one_of_ours(caught: list[int]) -> None:
+def test_a_replaced_program_handler_may_call_our_earlier_handler(caught: list[int]) -> None:
     hook, handled = ExitHook(), list[int]()
     hook.add(lambda: None, lambda: None)
     ours: Any = signal.getsignal(signal.SIGTERM)
@@ -320,14 +320,14 @@ def test_a_handler_that_ours_replaced_may_call_an_earlier_one_of_ours(caught: li
         ours(number, frame)
 
     signal.signal(signal.SIGTERM, handle)
-    last = hook.add(lambda: None, lambda: None)  # takes the signal again
+    last = hook.add(lambda: None, lambda: None)  # installs our handler again
     signal.raise_signal(signal.SIGTERM)
     until(lambda: handled)
     assert last.is_over
     assert handled == [signal.SIGTERM]
 
 
-def test_a_thread_reports_that_the_program_took_the_signals_back(
+def test_a_bus_made_on_a_thread_warns_that_the_program_replaced_our_handler(
     caught: list[int], caplog: pytest.LogCaptureFixture
 ) -> None:
     hook, handled = ExitHook(), list[int]()
@@ -360,13 +360,13 @@ def test_a_forked_child_has_its_own_last_acts(caught: list[int]) -> None:
     hook.finish(made)
 
 
-def test_a_signal_that_is_held_is_sent_on_once(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two acts may end at once, before the main thread comes to it."""
+def test_a_delayed_signal_is_sent_on_only_once(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two acts may end before the main thread handles the signal that was sent on."""
     sent: list[int] = []
     hook, act = ExitHook(), Act()
     monkeypatch.setattr("multidrop.control.exit_hook._send", lambda number, ident: sent.append(number))
     hook.add(act.begin, act.work)
-    for count in (1, 2):  # the next one is held and sent on too
+    for count in (1, 2):  # the next signal is delayed and sent on too
         signal.raise_signal(signal.SIGTERM)
         act.go_on.set()
         until(lambda count=count: len(sent) == count)
@@ -382,7 +382,7 @@ def test_a_signal_that_is_held_is_sent_on_once(caught: list[int], monkeypatch: p
     signal.raise_signal(sent[-1])
 
 
-def test_a_signal_says_at_once_which_drives_are_being_stopped(
+def test_a_signal_immediately_prints_which_drives_are_being_stopped(
     caught: list[int], capfd: pytest.CaptureFixture[str]
 ) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
@@ -426,7 +426,7 @@ with ExitStack() as stack:
 
 @contextmanager
 def lines(count: int) -> Iterator[tuple[list[list[ReceivedRequests]], list[str]]]:
-    """The requests of the four drives of each line, and the ports."""
+    """Yield the received requests of four drives for each line, and the lines' ports."""
     received: list[list[ReceivedRequests]] = []
     for _ in range(count):
         sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3, 4)]
@@ -463,7 +463,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
             each.loses = lambda request: True
         process.send_signal(signal.SIGINT)
         until(lambda: stops(received[0]))
-        for _ in range(20):  # two that come at once are one
+        for _ in range(20):  # signals that arrive together are handled as one
             process.send_signal(signal.SIGINT)
             try:
                 process.wait(0.1)
@@ -478,7 +478,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["wait", "steer", "read"])
 def test_ctrl_c_is_raised_in_the_user_s_code_once_the_motors_stand(how: str) -> None:
-    """Whatever the program does meanwhile, its traceback has none of our lines."""
+    """The traceback has no lines of this package, whatever the program was doing."""
     with lines(1) as (received, ports), client(how, ports) as process:
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=PATIENCE)
@@ -496,7 +496,7 @@ def test_ctrl_c_is_raised_in_the_user_s_code_once_the_motors_stand(how: str) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGTERM, signal.SIGINT))
 def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
-    """It comes when the first drive has its stop, and the others have none perhaps."""
+    """The second signal arrives when perhaps only the first drive was sent its stop."""
     with lines(1) as (received, ports), client("wait", ports) as process:
         process.send_signal(number)
         until(lambda: stops(received[0]))
@@ -508,7 +508,7 @@ def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_signal_while_the_block_is_left_leaves_no_motor_running() -> None:
+def test_a_signal_while_the_with_block_ends_leaves_no_motor_running() -> None:
     with lines(1) as (received, ports), client("leave", ports) as process:
         until(lambda: stops(received[0]))
         process.send_signal(signal.SIGTERM)
@@ -534,7 +534,7 @@ def test_a_second_bus_does_not_wait_for_the_ramps_of_the_first() -> None:
 
 
 def seen(drive: ReceivedRequests, others: list[ReceivedRequests], found: list[bool]) -> Callable[[Any], bool]:
-    """Note at its first stop that the others still turn along their ramps."""
+    """When this drive is stopped, append to `found` whether all the others still ramp down."""
 
     def loses(request: Any) -> bool:
         if request.start == 0x1000 and request.data[-1:] == b"\5" and drive.sim.motor.frequency > 0:
@@ -583,10 +583,10 @@ def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int],
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_a_signal_stops_a_drive_though_the_program_handled_it_since_the_last_poller(
+def test_a_signal_stops_drives_although_the_program_installed_a_handler_between_pollers(
     caught: list[int],
 ) -> None:
-    """The program handles SIGTERM itself in between, and its handler still runs, once the motor stands."""
+    """The program's own SIGTERM handler, installed between two pollers, runs once the motor has stopped."""
     from lines import line, plant, polled
 
     from multidrop.bus import Bus

@@ -23,7 +23,7 @@ from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, Uns
 
 FAMILIES: dict[str, Callable[[int], Drive]] = {**MAKE, **PROFILES}
 STARTED_BY = {**STARTS, **PROFILE_STARTS}
-NO_EXCEPTIONS = "delixi-native"  # its error replies have codes of their own: tests/families
+NO_EXCEPTIONS = "delixi-native"  # its error replies use other codes: see tests/families
 
 VERBS: dict[str, Callable[[Any], Any]] = {
     "set_frequency": lambda drive: drive.set_frequency(25),
@@ -61,21 +61,21 @@ tripped   start         !/?  !/?       !/?  !/?   !/?     !/x       !/?  !/?    
 tripped   stop          ok   ok        ?    ?     ok      ok/x      ok   ?      ?          ?    ?
 tripped   reset_fault   ok   ok/?      ?    ?     ok/?    x         ?/ok ?      ?          -    -
 """
-SEVERAL_WORDS = {"abb-acs355", "siemens-v20", "schneider-atv320"}  # a start goes through several states
+SEVERAL_WORDS = {"abb-acs355", "siemens-v20", "schneider-atv320"}  # a start takes several control words
 SECOND: dict[tuple[str, str], set[str]] = {
     ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},  # unreadable
     ("set_frequency", "-"): {
         "erman-er-g-220",
         "delixi-modbus",
         "yd1000",
-    },  # whose limit or value is read first
+    },  # a limit or the present value is read before the write
     ("start", "ok"): SEVERAL_WORDS,
     ("start", "-"): SEVERAL_WORDS,
-    ("start", "?"): {"yd1000"},  # whose status freezes in a trip
+    ("start", "?"): {"yd1000"},  # its status does not change after a trip
     ("start", "x"): {"yd1000"},
-    ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # cannot be seen to stand
-    ("reset_fault", "?"): {"invt-che", "delixi-native"},  # by one pulse
-    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # by a pulse and further words
+    ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # cannot show a standstill
+    ("reset_fault", "?"): {"invt-che", "delixi-native"},  # resets with a single pulse
+    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # resets with a pulse and further control words
 }
 HEAD, *ROWS = [line.split() for line in TABLE.strip().splitlines()]
 REPEATED = (("fresh", "stop"), ("tripped", "stop"), ("running", "coast"), ("running", "set_frequency"))
@@ -92,7 +92,7 @@ NOT_ARRIVING = ("never", "silent", "exception", "deaf", "echo")  # the drive doe
 
 
 class Cell:
-    """One drive in its situation, whose line is at fault from the first write of the verb on."""
+    """One drive in its situation; the fault affects the line from the verb's first write on."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, family: str, situation: str) -> None:
         self.line, self.drive, self.sim = one(monkeypatch, FAMILIES[family](1))
@@ -117,7 +117,7 @@ class Cell:
         return [write for write in self.writes if self._is_start(write)]
 
     def strike(self, fault: str) -> None:
-        """Give the line this fault."""
+        """Make the line have this fault."""
         line = self.line
         losing: dict[str, Callable[[Message], bool]] = {
             "lost-once": lambda request: is_write(request) and len(self.writes) == 1,
@@ -146,7 +146,7 @@ class Cell:
         )
 
     def _answer_of_the_request_before(self, request: Message) -> bytes | None:
-        """From the first write on, for three requests."""
+        """Return the reply to the previous request, for three requests from the first write on."""
         if not self.writes or len(self._late) == 3:
             return None
         reply = self.sim.answer(request, self.line.seconds)
@@ -168,7 +168,7 @@ class Cell:
 
 
 def check(cell: Cell, situation: str, verb: str, fault: str, outcome: str) -> None:
-    """Assert what holds in every cell."""
+    """Assert the rules that apply to every cell."""
     assert len(cell.starts) <= (verb in TURNING), "a start is sent once, and only by a start"
     if outcome in ("-", "!", "n") and fault != "unreadable":
         assert cell.writes == [], "nothing was sent"

@@ -1,4 +1,4 @@
-"""Replies that are lost, damaged, doubled, merged, truncated, or amid junk: none is mistaken for another.
+"""Replies that are lost, damaged, doubled, merged, truncated or amid junk: no value is misattributed.
 
 test_hostile_line.py has more kinds of faults. Here the far end is independent of the library: the drives'
 registers, the checksums, and the check of sent frames. A seed reproduces the faults and their order; the port
@@ -31,14 +31,14 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 
 SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "1")))
-FRAMES = usually(60, 160)  # that the far end hears
-STRANGER = 99  # no drive of ours has this address
+FRAMES = usually(60, 160)  # number of frames that the far end must receive
+STRANGER = 99  # address of a drive that is not polled
 MOTOR = "yd1000"
-REGISTERS = 5  # of each drive
+REGISTERS = 5  # limit of polled registers of each drive
 
 
 class Hostile:
-    """The fate of replies: one in three is mistreated, in one way."""
+    """Distorts one reply in three, in a random way."""
 
     def __init__(self, seed: int) -> None:
         self.struck: Counter[str] = Counter()
@@ -68,12 +68,12 @@ class Hostile:
         return said[:at] + bytes([said[at] ^ 1 << bit]) + said[at + 1 :]
 
     def _merged(self, said: bytes) -> bytes:
-        """It comes with the next one."""
+        """Keep the reply, and send it together with the next one."""
         self._kept = said
         return b""
 
     def _foreign(self) -> bytes:
-        """Another master's exchange with a drive that is not ours, whole and with a good checksum."""
+        """Return a valid frame of another master's exchange with the drive STRANGER."""
         count, value = self._chance.randint(1, 4), self._chance.randrange(0x10000)
         words = f"{value:04X}" * count
         return self._chance.choice(
@@ -88,7 +88,7 @@ class Hostile:
 
 
 def responder_drive(kind: str, drive: PolledDrive) -> ResponderDrive:
-    """It holds another number in each register that is polled, and no two drives share one."""
+    """Return a drive with a different number in each polled register; no number occurs in two drives."""
     found = ResponderDrive(KINDS[kind], drive.drive.address)
     for register, (least, _) in drive.drive.known_counts().items():
         found.hold(register.address, least)
@@ -105,7 +105,7 @@ def value(address: int, at: int) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("frames", FRAMES)
-def test_nothing_is_mistaken_and_nothing_moves_unasked(frames: int, seed: int) -> None:
+def test_no_value_is_misattributed_and_no_motor_moves_without_a_call(frames: int, seed: int) -> None:
     drives: dict[str, Drive] = {
         kind: quick(kind)(address, name=kind, **KINDS[kind].makes) for address, kind in enumerate(KINDS, 1)
     }
@@ -113,7 +113,7 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(frames: int, seed: int) -
         kind: polled(each, [reg for reg in each.readings() if reg.values is None][:REGISTERS])
         for kind, each in drives.items()
     }
-    asked[MOTOR] = polled(drives[MOTOR], [])  # its values are its motor's
+    asked[MOTOR] = polled(drives[MOTOR], [])  # not polled: its values change with its motor
     responder_line = ResponderLine([responder_drive(kind, each) for kind, each in asked.items()])
     hostile = Hostile(seed)
     responder_line.mangle = hostile.mangle
@@ -121,7 +121,7 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(frames: int, seed: int) -
     over = threading.Event()
 
     def command() -> None:
-        """Start the motor and stop it, again and again."""
+        """Start and stop the motor repeatedly."""
         motor = drives[MOTOR]
         while not over.is_set():
             with suppress(BusError):
@@ -134,7 +134,7 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(frames: int, seed: int) -
     rows: list[Row] = []
 
     def is_enough() -> bool:
-        """Every drive has given a value, and the far end has heard enough."""
+        """Return True if every drive has given a value and the far end has received enough frames."""
         rows.extend(rows_of(poller))
         heard = {row.drive for row in rows if row.value is not None}
         return len(responder_line.log) >= frames and heard == set(drives) - {MOTOR}

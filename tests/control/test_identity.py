@@ -36,7 +36,7 @@ GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
 
 @contextmanager
 def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
-    """One confirmed drive on a line of its own."""
+    """Yield a bus with one drive whose identity is confirmed, the drive, and the requests it receives."""
     sim = simulated(MAKE[model](1))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
@@ -52,13 +52,13 @@ def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
 
 
 def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
-    """Lose the replies to one read, with a short timeout; wait for later replies on a busy machine too."""
+    """Lose the replies to one read, with a short timeout; then allow long timeouts for a busy computer."""
     timeouts = bus.peer(drive).c
     timeouts.least_timeout_ns = timeouts.most_timeout_ns = 50_000_000
     received.loses = lambda request: True
     with pytest.raises(NoReply):
         drive.read(next(register for register in drive.registers.values() if register.readable))
-    until(lambda: len(received.requests) == bus.statistics().counters.sent)  # the last is heard late perhaps
+    until(lambda: len(received.requests) == bus.statistics().counters.sent)  # the last one may be late
     received.loses = lambda request: False
     received.requests.clear()
     timeouts.least_timeout_ns = timeouts.most_timeout_ns = 1_000_000_000
@@ -88,7 +88,7 @@ def test_a_silent_drive_is_identified_once_before_the_next_write(
         monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
         before = bus.peers[drive].silences
         drive.set_frequency(10)
-        assert looks == [] or bus.peers[drive].silences > before  # on a busy machine
+        assert looks == [] or bus.peers[drive].silences > before  # silent only if this computer was too busy
         looks.clear()
         be_silent(bus, drive, received)
         drive.set_frequency(20)
@@ -109,7 +109,7 @@ def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
         monkeypatch.setattr(
             type(drive).identify, "_script", lambda drive: looks.append("look") or look(drive)
         )
-        if pause == "read since":  # which says nothing of who answers
+        if pause == "read since":  # a plain read does not show which drive answers
             bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
             drive.read(next(register for register in drive.registers.values() if register.readable))
         else:
@@ -121,7 +121,7 @@ def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
 
 
 @pytest.mark.parametrize("model", MAKE)
-def test_a_stop_of_a_drive_that_was_idle_asks_nothing_first(model: str) -> None:
+def test_a_stop_after_an_idle_time_is_sent_without_a_read_before(model: str) -> None:
     with known(model) as (bus, drive, received):
         bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
         received.requests.clear()
@@ -131,7 +131,7 @@ def test_a_stop_of_a_drive_that_was_idle_asks_nothing_first(model: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
-def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> None:
+def test_a_stop_of_a_silent_drive_is_sent_without_a_read_before(model: str) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         drive.start()
@@ -146,7 +146,7 @@ def _asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _idle_and_asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For six seconds each."""
+    """Let 0.6 PAUSE_NS pass awake and 0.6 PAUSE_NS asleep: together more than PAUSE_NS."""
     now_ns, boottime_ns = clock.now_ns, clock.boottime_ns
     monkeypatch.setattr(clock, "now_ns", lambda: now_ns() + 6 * PAUSE_NS // 10)
     monkeypatch.setattr(clock, "boottime_ns", lambda: boottime_ns() + 12 * PAUSE_NS // 10)
@@ -156,7 +156,7 @@ def _idle(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
     at_ns = clock.now_ns
     monkeypatch.setattr(clock, "now_ns", lambda: at_ns() + 2 * PAUSE_NS)
-    _asleep(bus, drive, monkeypatch)  # both clocks go on
+    _asleep(bus, drive, monkeypatch)  # the boot-time clock must advance too
 
 
 def _read_since(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +174,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
     model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Polled or not, it may have been replaced unseen."""
+    """It may also have been replaced, even if it was polled."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         received.requests.clear()
@@ -226,7 +226,7 @@ def test_a_setpoint_is_kept_if_one_reply_was_lost(model: str) -> None:
 
 @pytest.mark.slow
 def test_missed_polls_count_as_silence() -> None:
-    """Polling during the interruption is enough."""
+    """Missed polls alone, without calls, make the drive's identity uncertain."""
     sim = simulated(MAKE["invt-che"](1))
     assert isinstance(sim, MotorDrive)
     received = ReceivedRequests(sim)
@@ -245,10 +245,10 @@ def test_missed_polls_count_as_silence() -> None:
     assert received.writes == []
 
 
-# ---- drives that were taken off, and attached again ----
+# ---- drives that were detached and attached again ----
 
 
-def test_a_drive_that_was_taken_off_is_asked_again_before_it_is_moved(
+def test_a_detached_drive_is_identified_again_before_a_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
@@ -261,12 +261,12 @@ def test_a_drive_that_was_taken_off_is_asked_again_before_it_is_moved(
     assert len(bus.written) == 1
 
 
-def test_a_drive_that_was_taken_off_is_asked_again_before_its_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_detached_drive_is_identified_again_before_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """An allowed stop does not confirm the drive for a start."""
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None
-    drive.stop()  # no two answers were the same
+    drive.stop()  # sent, because the two wrong identities differ
     begun = len(bus.written)
     bus.bus.detach(drive)
     bus.attach(drive)
@@ -276,11 +276,11 @@ def test_a_drive_that_was_taken_off_is_asked_again_before_its_stop(monkeypatch: 
     assert len(bus.written) == begun
 
 
-def test_a_suspicion_of_a_drive_that_was_taken_off_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detaching_a_drive_forgets_a_suspicion_about_its_identity(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     sim["device"] = GOODRIVE
     check = bus.bus._writer.identity_check
-    for _ in range(2):  # the second one would be proof
+    for _ in range(2):  # without the detach, the second suspicion would be proof
         with pytest.raises(CheckAgain):
             check.check_before_stop(drive, drive.control, 5)
         bus.bus.detach(drive)
@@ -305,10 +305,10 @@ class Mute(Drive):
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_something_is_read_once_before_the_first_stop_and_waits_for_nothing(
+def test_one_register_is_read_before_the_first_stop_without_waiting(
     monkeypatch: pytest.MonkeyPatch, is_lost: bool
 ) -> None:
-    """So that an adapter's echo is known before it could pass for the drive's confirmation."""
+    """The read shows whether the adapter echoes, before an echo could pass for the drive's confirmation."""
     bus = SimulatedBus(monkeypatch, simulated(Mute(1)))
     drive, carry_out = bus.attach(Mute(1)), bus.carry_out
     asked: list[tuple[bool, bool]] = []
@@ -325,15 +325,15 @@ def test_something_is_read_once_before_the_first_stop_and_waits_for_nothing(
     if not is_lost:
         drive.stop()
         assert asked[0] == (True, True)
-    bus.queue = object()  # the port was opened again
+    bus.queue = object()  # as after the port was reopened
     drive.read(drive.speed)
     asked.clear()
     drive.stop()
-    assert asked[0] == (True, True)  # it has answered since
+    assert asked[0] == (True, True)  # no read first, because the drive has answered since
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
-def test_the_check_before_a_stop_counts_if_its_reply_is_unambiguous(
+def test_the_check_before_a_stop_confirms_the_drive_if_its_reply_is_unambiguous(
     monkeypatch: pytest.MonkeyPatch, is_in_step: bool
 ) -> None:
     bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
@@ -350,7 +350,7 @@ def test_the_check_before_a_stop_counts_if_its_reply_is_unambiguous(
 
 
 def test_a_weak_identity_check_never_withholds_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An IBD is recognised by places that its manual does not name."""
+    """The IBD's `identify` reads registers that its manual does not document."""
     bus = SimulatedBus(monkeypatch, simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
 
@@ -411,11 +411,11 @@ def test_an_exception_to_the_identity_check_prevents_no_stop(
     stop = first(line, 0, STOPS[model])
     assert stop is not None
     assert line.seconds - begun < 60
-    assert STOPS[model](writes(line)[0])  # nothing else was written
+    assert STOPS[model](writes(line)[0])  # the stop is the first write
 
 
 @pytest.mark.parametrize("model", MAKE)
-def test_a_stop_and_its_identity_check_wait_for_no_late_reply(
+def test_a_stop_and_its_identity_check_do_not_wait_for_late_replies(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     line, drive, _ = one(monkeypatch, MAKE[model](1))
@@ -460,16 +460,16 @@ def test_two_different_odd_replies_do_not_prove_another_family(monkeypatch: pyte
     assert STOPS["invt-che"](writes(line)[0])
 
 
-def test_a_drive_that_was_ever_silent_proves_no_other_family(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its reply may be the answer to an earlier request."""
+def test_a_drive_that_missed_a_reply_is_never_refused_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its reply may belong to an earlier request."""
     line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     line.bus.peer(drive).c.history.ended[10] = 1
     drive.stop()
-    assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # without a look
+    assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # the stop, without an identity check before
 
 
-def test_a_withheld_stop_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_a_withheld_stop_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     with pytest.raises(
@@ -478,11 +478,11 @@ def test_a_withheld_stop_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> Non
         drive.stop()
     assert line.written == []
     sim["device"] = 0x0101
-    drive.stop()  # it is looked at again
+    drive.stop()  # the identity is checked again
     assert line.written != []
 
 
-OTHERS: Sequence[tuple[Drive, Drive]] = (  # declared, and there: of one framing and baud rate
+OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, actual drive) of one framing and baud rate
     (InvtCHE(1, maximum_frequency=50), YD1000(1)),
     (InnovertIBD(1, confirmed=0), InvtCHE(1)),
     (YD1000(1), InvtCHE(1)),
@@ -491,7 +491,7 @@ OTHERS: Sequence[tuple[Drive, Drive]] = (  # declared, and there: of one framing
 
 
 @pytest.mark.parametrize("pair", OTHERS, ids=lambda pair: f"{pair[0].model} for {pair[1].model}")
-def test_a_withheld_stop_names_the_stop_of_the_other_family(
+def test_the_error_of_a_withheld_stop_names_the_command_for_the_other_family(
     monkeypatch: pytest.MonkeyPatch, pair: tuple[Drive, Drive]
 ) -> None:
     declared, there = pair
@@ -506,7 +506,7 @@ def test_a_withheld_stop_names_the_stop_of_the_other_family(
     assert line.written != []
 
 
-OUT_OF_DATE = [  # a register of `identify`, and a count that the family's own drive may hold for a while
+OUT_OF_DATE = [  # registers of `identify`, each with a raw count that the right drive may temporarily hold
     ("delixi-modbus", "baudrate_setting", 4),
     ("delixi-modbus", "address_setting", 7),
     ("delixi-modbus", "fault", 99),
@@ -532,7 +532,7 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
 
 @pytest.mark.parametrize(("model", "name", "count"), OUT_OF_DATE)
 @pytest.mark.parametrize("how", ["stop", "stop_all", "write"])
-def test_one_odd_value_withholds_a_start_but_no_stop(
+def test_one_unexpected_value_prevents_a_start_but_no_stop(
     monkeypatch: pytest.MonkeyPatch, model: str, name: str, count: int, how: str
 ) -> None:
     line, drive, _ = one(monkeypatch, MAKE[model](1))
@@ -540,7 +540,7 @@ def test_one_odd_value_withholds_a_start_but_no_stop(
     with pytest.raises(WriteForbidden):
         drive.set_frequency(20)
     assert line.written == []
-    shows_only_zeros = model == "delixi-modbus"  # at rest: an output frequency of 0, and nothing else
+    shows_only_zeros = model == "delixi-modbus"  # the only sign of standstill is an output frequency of 0
     if how == "stop":
         with pytest.raises(Unconfirmed, match="look at the motor") if shows_only_zeros else nullcontext():
             drive.stop()
@@ -558,7 +558,7 @@ def test_one_odd_value_withholds_a_start_but_no_stop(
 def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    """Some other makes answer function 04 too, which is all that an ERMAN's identity check asks."""
+    """The ERMAN's identity check only reads with function 04, which some other makes answer too."""
     line, drive, _ = one(monkeypatch, MAKE[model](1))
 
     def refuse(request: Message) -> bytes | None:
@@ -574,7 +574,7 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
 
 
 def test_no_stop_waits_for_a_second_check_of_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor for the first one, of a drive that is known."""
+    """A known drive's stop does not wait for the first check of another drive either."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
     line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
     line.attach(InvtCHE(1, maximum_frequency=50))

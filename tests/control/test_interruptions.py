@@ -26,17 +26,17 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import line as of_a_port
 
-BAUDRATE = 38400  # its silences are short
+BAUDRATE = 38400  # for short silences between frames
 CODE = of_a_port.Line.carry_out.__code__
 
 
 def counts(frame: FrameType) -> bool:
-    """Return True if a signal is raised before this line; not before the last line, which ends the work."""
+    """Return True if an interruption may be raised before this line, which excludes the last line."""
     return frame.f_code is CODE and "discard" not in getline(CODE.co_filename, frame.f_lineno)
 
 
 def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
-    """Call a function and raise before the nth line of its exchanges; return None if it has fewer."""
+    """Call a function with an interruption before the nth line of its exchanges; None if it has fewer."""
     try:
         with interrupted_at(nth, counts):
             call()
@@ -70,7 +70,7 @@ def test_an_interruption_reports_what_may_have_been_sent(verb: str) -> None:
     assert nth > 8
 
 
-def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_exchange_does_not_delay_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float] = []
     with Simulator([Wire([simulated(InvtCHE(1, baudrate=BAUDRATE))], unpaced=True)]) as simulator:
         for nth in count(1):
@@ -89,11 +89,11 @@ def test_an_interrupted_exchange_does_not_hold_the_port_up(monkeypatch: pytest.M
 # ---- interrupted stops and starts ----
 
 
-OF_TWO_WRITES = ("erman-er-g-220", "invt-che")  # START is taken back too, or a jog stopped
+OF_TWO_WRITES = ("erman-er-g-220", "invt-che")  # a stop's second write takes START back, or ends a jog
 
 
 class Restless(Own):
-    """One whose stop reads without a wait, and never sees it stand."""
+    """A drive whose stop reads without waiting, and never sees the motor stand."""
 
     model = "restless"
     title = "OWN 4"
@@ -150,7 +150,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(
 
 
 def test_an_interrupted_stop_ends_a_jog_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The motor's state is no longer read, so it may be jogging."""
+    """The motor's state is not read after an interruption, so the motor may be jogging."""
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.jog()
     begun = len(writes(line))
@@ -168,7 +168,7 @@ def test_an_interrupted_stop_ends_a_jog_too(monkeypatch: pytest.MonkeyPatch) -> 
     assert [request for request, _ in line.frames[-3:]] == sent
 
 
-def test_a_stop_that_reads_without_a_wait_keeps_no_other_one_from_being_repeated(
+def test_a_stop_that_only_reads_does_not_prevent_the_repetition_of_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims: list[Any] = [simulated(Restless(1)), simulated(InvtCHE(2, maximum_frequency=50))]
@@ -187,7 +187,7 @@ def test_a_stop_that_reads_without_a_wait_keeps_no_other_one_from_being_repeated
     assert [request.address for request in writes(line, begun)][:4] == [1, 2, 2, 2]
 
 
-def test_an_interrupted_stop_is_sent_after_its_reads_without_its_waits(
+def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Careful(1)))
@@ -210,7 +210,7 @@ def test_an_interrupted_stop_is_sent_after_its_reads_without_its_waits(
     ]
 
 
-def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_interruption_ends_the_repetition_of_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
 

@@ -1,4 +1,4 @@
-"""The setpoint that the library assumes in a drive, after each possible outcome of a write."""
+"""The setpoint that the library believes the drive holds, after each possible outcome of a write."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_refused_setpoint_keeps_the_known_one(monkeypatch: pytest.MonkeyPatch,
 
 @every_unreadable
 def test_an_unsent_setpoint_keeps_the_known_one(monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
-    """Its turn came too late; a stop that ends it before its turn is told by the core in the same way."""
+    """The write expired in the queue. The core reports a write that a stop cancelled in the same way."""
     bus, drive = told(monkeypatch, make)
     known = drive.commanded
     bus.queue_time = 60.0
@@ -73,7 +73,7 @@ def test_a_setpoint_that_the_drive_refuses_keeps_the_known_one(monkeypatch: pyte
 
 @every_unreadable
 @pytest.mark.parametrize("arrives", [True, False])
-def test_after_a_lost_reply_nothing_is_known_and_no_motor_starts(
+def test_after_a_lost_reply_the_setpoint_is_unknown_and_a_start_is_refused(
     monkeypatch: pytest.MonkeyPatch, make: Make, arrives: bool
 ) -> None:
     bus, drive = told(monkeypatch, make)
@@ -108,13 +108,13 @@ def test_a_clamped_setpoint_is_not_the_requested_one(monkeypatch: pytest.MonkeyP
     assert drive.commanded is None
 
 
-def test_a_stored_setpoint_that_is_held_already_is_known_without_a_write(
+def test_a_setpoint_that_eeprom_already_holds_becomes_known_without_a_write(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
     bus, drive, _ = one(monkeypatch, DelixiModbus(1))
     drive.set_frequency(20)
-    drive.commanded = None  # as for a program that begins anew
+    drive.commanded = None  # as in a new process
     bus.frames.clear()
     drive.set_frequency(20)
     assert bus.written == []
@@ -134,7 +134,7 @@ def test_a_plain_write_sets_the_known_setpoint(monkeypatch: pytest.MonkeyPatch) 
 # ---- writes on several threads ----
 
 
-def test_an_unsent_write_keeps_the_setpoint_of_another_one() -> None:
+def test_an_unsent_write_does_not_undo_the_setpoint_of_another_write() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     take_back = setpoint.begin_write()
@@ -144,11 +144,12 @@ def test_an_unsent_write_keeps_the_setpoint_of_another_one() -> None:
     assert setpoint.value == 30.0
 
 
-def test_a_write_with_an_unknown_end_is_not_restored_by_another_one() -> None:
+def test_an_unsent_write_does_not_restore_a_setpoint_that_a_pending_write_made_unknown() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     take_back = setpoint.begin_write()
-    setpoint.begin_write()  # its reply is lost
+    setpoint.begin_write()  # this write never ends
+
     take_back()
     assert setpoint.value is None
 

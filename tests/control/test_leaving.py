@@ -1,4 +1,4 @@
-"""Drives that join and leave a bus, on any thread: latches, stops that are sent and awaited, the report."""
+"""Drives that are attached and detached on any thread: calls are cancelled, stops are sent and awaited."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningPair]:
     made.bus.close()
 
 
-def test_a_bus_says_whether_it_stops_its_drives_at_the_end(pair: RunningPair) -> None:
+def test_stops_on_exit_says_whether_stop_on_exit_was_called(pair: RunningPair) -> None:
     assert pair.bus.stops_on_exit is False
     pair.bus.stop_on_exit()
     assert pair.bus.stops_on_exit is True
 
 
-def test_leaving_a_bus_starts_its_stops_at_once(pair: RunningPair) -> None:
+def test_leaving_a_bus_starts_its_stops_immediately(pair: RunningPair) -> None:
     pair.bus.stop_on_exit()
     pair.bus.leave()
     until(lambda: pair.turning == [False, False])
@@ -94,12 +94,12 @@ def test_detached_drives_are_stopped_with_stop_on_exit(
     flush(60)
     told = [record.getMessage() for record in caplog.records if record.name == "multidrop.bus"]
     assert len(told) == 1
-    assert told[0].startswith("invt-che@2: failed after 30")  # nothing left for it, nor for all
+    assert told[0].startswith("invt-che@2: failed after 30")  # neither its own stop nor `stop_all` was sent
     pair.line.answers = lambda request: None
 
 
 def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPair) -> None:
-    """Its start is called while its stop is under way, as the stop's first request leaves."""
+    """Its start is called at the moment when the first request of its stop is sent."""
     pair.bus.stop_on_exit()
     first = pair.drives[0]
     permits: list[bool] = []
@@ -126,7 +126,7 @@ def test_detaching_waits_for_other_stops_of_the_drives(
 
 
 @pytest.mark.parametrize("is_cut_short", [False, True])
-def test_a_bus_waits_for_all_stops_unless_they_are_cut_short(
+def test_closing_waits_for_all_stops_unless_a_third_signal_cuts_them_short(
     pair: RunningPair, monkeypatch: pytest.MonkeyPatch, is_cut_short: bool
 ) -> None:
     pair.bus.stop_on_exit()
@@ -146,13 +146,13 @@ def test_a_bus_waits_for_all_stops_unless_they_are_cut_short(
     assert waited == ([] if is_cut_short else [()])
 
 
-def test_a_bus_that_stops_on_exit_is_made_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_argument_stop_on_exit_makes_a_bus_stop_its_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(InvtCHE(1)), stop_on_exit=True)
     assert line.bus.stops_on_exit
     line.bus.close()
 
 
-def test_only_the_main_thread_makes_a_bus_that_stops_on_exit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_with_stop_on_exit_can_only_be_made_on_the_main_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     closed: list[bool] = []
     monkeypatch.setattr(SimulatedBus, "close", lambda self: closed.append(True))
     with ThreadPoolExecutor(1) as threads:
@@ -165,23 +165,23 @@ def test_only_the_main_thread_makes_a_bus_that_stops_on_exit(monkeypatch: pytest
 # ---- one bus at a time ----
 
 
-def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attaching_a_drive_of_another_open_bus_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     other = SimulatedBus(monkeypatch)
     with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
         other.attach(drive)
     assert other.bus.drives == []
-    drive.state()  # its verbs still go over the first
+    drive.state()  # its verbs still use the first bus
     line.bus.detach(drive)
     other.attach(drive)
     other.bus.close()
-    line.attach(drive)  # the other one is closed
+    line.attach(drive)  # the other bus is closed
 
 
-def test_a_drive_is_attached_to_the_next_bus_while_its_last_one_closes(
+def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The first bus closes afterwards, and the drive stays on the next one."""
+    """When the first bus is closed completely, the drive stays on the next bus."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     before = line.bus
     free = before._attached.free
@@ -215,13 +215,13 @@ def test_a_drive_detached_by_another_thread_is_not_detached_twice(
     line.attach(drive)
 
 
-def test_drives_of_a_bus_that_was_closed_are_on_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_a_bus_releases_its_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     line.bus.close()
     assert drive.bus is None
 
 
-def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch)
     together = threading.Barrier(8)
     add, inside, most = line.bus._exchanges.add, set[str](), 0
@@ -230,7 +230,7 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         nonlocal most
         inside.add(drive.name)
         most = max(most, len(inside))
-        sleep(0.001)  # the others may continue
+        sleep(0.001)  # lets the other threads run
         inside.discard(drive.name)
         add(drive)
 
@@ -262,8 +262,8 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- latches ----
 
 
-def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else leaving a `with` block by a signal's exception would take for ever."""
+def test_a_thread_does_not_wait_for_its_own_interrupted_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise leaving a `with` block by a signal's exception would never end."""
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     latches, stop = line.bus._latches, object()
     latches.begin(stop, [drive])
@@ -279,10 +279,10 @@ def test_a_thread_that_was_interrupted_in_a_stop_never_waits_for_it(monkeypatch:
     assert latches.latch(drive).permit().is_good
 
 
-def test_a_drive_attached_after_leaving_is_not_moved(
+def test_a_drive_attached_after_leave_cannot_be_moved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The process is ending and could not stop it; drives that were attached before are not moved either."""
+    """The process is ending and could not stop the drive. The same applies to drives attached before."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.leave()
     line.bus.detach(drive)
@@ -296,8 +296,8 @@ def test_a_drive_attached_after_leaving_is_not_moved(
     assert not sim.motor.energised
 
 
-def test_a_drive_that_was_taken_off_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bus whose drives change for years does not grow."""
+def test_a_detached_drive_is_garbage_collected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The memory of a bus does not grow if its drives change for years."""
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     drive.stop()

@@ -39,11 +39,11 @@ def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
         toy.write(toy.acceleration_time, seconds)
 
 
-# ---- what a port is ----
+# ---- identities of ports ----
 
 
 @pytest.mark.slow
-def test_one_write_a_minute_however_the_port_is_spelt(
+def test_one_write_a_minute_is_allowed_under_any_path_of_the_port(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -67,7 +67,7 @@ def test_one_write_a_minute_however_the_port_is_spelt(
         assert (wear.cell.port, wear.writes) == (device, 1)
 
 
-def test_one_write_a_minute_by_whatever_name_of_a_host(tmp_path: Path) -> None:
+def test_one_write_a_minute_is_allowed_under_any_name_of_the_host(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear")
     with toys("socket://127.0.0.1:0") as sim:
         path = sim.wires[0].path
@@ -77,7 +77,9 @@ def test_one_write_a_minute_by_whatever_name_of_a_host(tmp_path: Path) -> None:
         assert [each.cell.port for each in ledger.wear(0)] == [path.removeprefix("socket://")]
 
 
-def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_adapter_is_identified_by_its_serial_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(port_identity, "BY_ID", tmp_path / "by-id")
     (tmp_path / "by-id").mkdir()
     for name in ("ttyUSB0", "ttyUSB1"):
@@ -90,7 +92,7 @@ def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: p
     cell = LedgerCell(str(link), 1, "m", "r", f"{tmp_path}/ttyUSB0")
     assert ledger.enter(cell, 1000.0, 60.0) == ""
     link.unlink()
-    link.symlink_to("../ttyUSB1")  # it was plugged in again
+    link.symlink_to("../ttyUSB1")  # the adapter was plugged in again, at another device
     moved = LedgerCell(port_identity.of_device(f"{tmp_path}/ttyUSB1"), 1, "m", "r", f"{tmp_path}/ttyUSB1")
     assert "was written 5 s ago" in ledger.enter(moved, 1005.0, 60.0)
 
@@ -114,7 +116,7 @@ def test_a_port_name_is_resolved_to_its_device(name: str, identity: str) -> None
     assert port_identity.of_name(identity) == identity
 
 
-def test_a_port_without_a_device_is_known_by_its_name() -> None:
+def test_a_port_without_a_device_is_identified_by_its_name() -> None:
     line = Line("loop://").open()
     assert line.identity == "loop://"
     line.close()
@@ -123,7 +125,7 @@ def test_a_port_without_a_device_is_known_by_its_name() -> None:
 @pytest.mark.parametrize(
     "old", ["link", "device", "socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001", "socket://hall:1"]
 )
-def test_entries_of_an_older_ledger_count(tmp_path: Path, old: str) -> None:
+def test_entries_of_older_versions_count_towards_the_budget(tmp_path: Path, old: str) -> None:
     (tmp_path / "device").touch()
     (tmp_path / "link").symlink_to("device")
     entered = old if "://" in old else f"{tmp_path}/{old}"
@@ -139,7 +141,7 @@ def test_entries_of_an_older_ledger_count(tmp_path: Path, old: str) -> None:
 
 
 @pytest.mark.parametrize("old", ["link", "socket://10.0.0.7:4001"])
-def test_entries_under_another_port_name_count(tmp_path: Path, old: str) -> None:
+def test_entries_under_another_port_name_count_towards_the_budget(tmp_path: Path, old: str) -> None:
     (tmp_path / "device").touch()
     (tmp_path / "link").symlink_to("device")
     entered = old if "://" in old else f"{tmp_path}/{old}"
@@ -150,12 +152,12 @@ def test_entries_under_another_port_name_count(tmp_path: Path, old: str) -> None
     assert "written 1 times in a year" in ledger.enter(cell, 1001.0, 0.0)
 
 
-# ---- what wears ----
+# ---- writes that wear an EEPROM ----
 
 
 def test_registers_in_ram_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Fan(Drive):
-        """A user's own."""
+        """A user's own drive."""
 
         relay = setting(1, table=COIL)
         speed = setting(2, kept=Kept.RAM)
@@ -171,7 +173,7 @@ def test_registers_in_ram_are_not_counted(tmp_path: Path, monkeypatch: pytest.Mo
     assert ledger.wear(0) == []
     fan.write(fan.latch, 1)
     assert [each.cell.register for each in ledger.wear(0)] == ["latch"]
-    assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # what its owner knows, its class does not
+    assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # `ram` is unknown to the simulation
 
 
 # ---- simulated drives ----
@@ -179,15 +181,15 @@ def test_registers_in_ram_are_not_counted(tmp_path: Path, monkeypatch: pytest.Mo
 with_names = pytest.mark.skipif(sys.platform != "linux", reason="this system has no names for it")
 
 
-def test_a_user_without_a_home_may_stop_and_not_wear_an_eeprom(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A container's user often has neither HOME nor an entry among the system's users."""
+def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container's user often has neither HOME nor an entry in /etc/passwd."""
 
     def home() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_STATE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", home)
-    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)  # root could make it
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)  # root could write it
     toy = simulated(Toy(1))
     toy["status"] = Status(0)
     line = SimulatedBus(monkeypatch, toy)
@@ -200,18 +202,18 @@ def test_a_user_without_a_home_may_stop_and_not_wear_an_eeprom(monkeypatch: pyte
 
 @with_names
 @pytest.mark.parametrize("port", ["pty", "link", "socket://127.0.0.1:0", "socket://0.0.0.0:0"])
-def test_a_simulated_drive_does_not_spend_the_user_s_ledger(tmp_path: Path, port: str) -> None:
+def test_writes_to_a_simulated_drive_are_not_in_the_user_s_ledger(tmp_path: Path, port: str) -> None:
     with toys(str(tmp_path / "link") if port == "link" else port) as sim:
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
-        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):  # as with a real one
+        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):  # as for a real drive
             write(path, 13.0)
     assert Ledger().wear(0) == []
     assert not list(default_path().parent.rglob("*.sqlite"))
 
 
 @with_names
-def test_a_ledger_that_is_named_counts_simulated_drives_too(tmp_path: Path) -> None:
+def test_an_explicit_ledger_counts_simulated_drives_too(tmp_path: Path) -> None:
     with toys() as sim:
         write(sim.wires[0].path, 12.0, Ledger(tmp_path / "wear"))
     assert len(Ledger(tmp_path / "wear").wear(0)) == 1
@@ -219,7 +221,7 @@ def test_a_ledger_that_is_named_counts_simulated_drives_too(tmp_path: Path) -> N
 
 @pytest.mark.slow
 @with_names
-def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Path) -> None:
+def test_a_port_counts_as_simulated_until_its_simulator_is_killed(tmp_path: Path) -> None:
     program = (
         "import time\nfrom multidrop.sim.port import PtyPort\n"
         "from multidrop.drive.line_settings import Settings\n"
@@ -228,7 +230,7 @@ def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Pa
     with BoundProcess([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         device = process.stdout.readline().strip()
-        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # or another test's simulator has the same next
+        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # reserves it: no other test gets it
         try:
             assert is_simulated(device)
         finally:
@@ -249,7 +251,7 @@ def test_a_real_port_is_not_a_simulated_one() -> None:
     os.close(master)
 
 
-def test_a_system_without_such_names_counts_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_that_cannot_mark_simulated_ports_counts_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulated_ports, "_HAS_NAMES", False)
     with toys() as sim:
         write(sim.wires[0].path, 12.0)

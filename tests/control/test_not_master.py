@@ -1,4 +1,4 @@
-"""Calls of a process that is not, or no longer, the master of the line are not sent and say so."""
+"""Calls of a process that is not, or no longer, the master of the line send nothing and raise NotMaster."""
 
 from __future__ import annotations
 
@@ -35,9 +35,7 @@ if sys.platform != "linux":
     pytest.skip("masterships are Linux's", allow_module_level=True)
 
 S = 1_000_000_000
-LISTENING = (
-    256 * 10 / 9600
-)  # s, that the longest frame takes of an RTU line at 9600 baud, and time-outs beside
+LISTENING = 256 * 10 / 9600  # s, the longest RTU frame at 9600 baud; the timeout comes in addition
 
 
 def now_ns() -> int:
@@ -45,19 +43,19 @@ def now_ns() -> int:
 
 
 class Brief(Toy):
-    """Is listened to for half a second, in which its simulator answers on a busy machine too."""
+    """A drive with a timeout that is long enough for its simulator on a busy computer."""
 
     response_timeout = 0.5
 
 
 class Slow(Toy):
-    """Is listened to for longer than a busy machine holds another master up."""
+    """A drive with a timeout that is longer than a busy computer delays another master."""
 
     response_timeout = 1.5
 
 
 class Watched(Brief):
-    """Its stop reads the result."""
+    """A drive whose stop reads the status after its write."""
 
     @verb
     def stop(self) -> Script[None]:
@@ -71,7 +69,7 @@ def halt() -> Script[None]:
 
 
 class Scene:
-    """A bus with a mastership, and one simulated drive that counts what reaches it."""
+    """A bus with a mastership, and one simulated drive that counts the requests it receives."""
 
     def __init__(self, audit: Path) -> None:
         self.audit = audit
@@ -100,7 +98,7 @@ class Scene:
 
 @contextmanager
 def ended(mastership: Mastership) -> Iterator[None]:
-    """End it whatever fails: its timer would kill the process that tests."""
+    """End the mastership even if the test fails, because its timer would kill the test process."""
     try:
         yield
     finally:
@@ -126,21 +124,23 @@ CALLS: dict[str, Callable[[Scene], object]] = {
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_nothing_is_sent_before_it_is_master(scene: Scene, call: Callable[[Scene], object]) -> None:
+def test_before_the_mastership_every_call_raises_and_sends_nothing(
+    scene: Scene, call: Callable[[Scene], object]
+) -> None:
     begun = time.monotonic()
     with pytest.raises(NotMaster) as failure:
         call(scene)
-    assert time.monotonic() - begun < 25  # a stop is not repeated, for 30 s
+    assert time.monotonic() - begun < 25  # a stop is not repeated for 30 s
     assert not failure.value.is_sent
     assert not failure.value.heard
     assert scene.requests == 0
     assert scene.bus.statistics().counters.sent == 0
-    assert not any("sent" in record for record in read_audit(scene.audit))  # a stop was called all the same
+    assert not any("sent" in record for record in read_audit(scene.audit))  # only a stop's call is recorded
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
-def test_nothing_is_sent_after_it_was_master(scene: Scene, call: str) -> None:
+def test_after_the_mastership_every_call_raises_and_sends_nothing(scene: Scene, call: str) -> None:
     scene.become_master()
     scene.drive.read(Toy.output_current)
     before = scene.requests
@@ -159,8 +159,8 @@ def test_a_lost_mastership_is_not_a_failure_of_the_drive(scene: Scene) -> None:
 
 
 @pytest.mark.long
-def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
-    """Without any call, by the clock alone. Half a guard later this process would be killed."""
+def test_a_mastership_whose_deadline_has_passed_sends_nothing(scene: Scene) -> None:
+    """The mastership ends by the clock alone, without a call of `end`."""
     mastership = Mastership(guard_s=8)
     path = scene.simulator.wires[0].path
     scene.bus.close()
@@ -173,7 +173,7 @@ def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
         with pytest.raises(NotMaster):
             deque(reads, maxlen=0)
         assert now_ns() >= until_ns
-        sent = bus.statistics().counters.sent  # one more than was answered, where a reply was late
+        sent = bus.statistics().counters.sent  # one more than were answered if a reply was late
         for _ in range(3):
             with pytest.raises(NotMaster):
                 drive.read(Toy.output_current)
@@ -181,7 +181,9 @@ def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
         assert scene.requests <= sent
 
 
-def test_a_stop_says_that_it_was_not_sent(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_error_of_an_unsent_stop_says_that_the_motor_continues(
+    scene: Scene, caplog: pytest.LogCaptureFixture
+) -> None:
     port = scene.bus.line.port
     sentence = (
         "pump: the stop was NOT sent, and the motor continues as it is: this process is not the master of "
@@ -197,7 +199,7 @@ def test_a_stop_says_that_it_was_not_sent(scene: Scene, caplog: pytest.LogCaptur
     ]
 
 
-def test_a_stop_of_all_says_it_of_each(scene: Scene) -> None:
+def test_stop_all_reports_each_unsent_stop(scene: Scene) -> None:
     other = scene.bus.attach(Brief(2, name="fan"))
     found = scene.bus.stop_all()
     assert {name: stopped.seen for name, stopped in found.items()} == {
@@ -219,7 +221,7 @@ def test_a_failed_read_after_a_start_raises_the_lost_mastership(scene: Scene) ->
 
 
 @pytest.mark.slow
-def test_commands_go_on_when_it_is_master_again(scene: Scene) -> None:
+def test_commands_are_sent_again_after_the_mastership_returns(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()
@@ -234,7 +236,7 @@ def test_commands_go_on_when_it_is_master_again(scene: Scene) -> None:
 
 
 def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, after: int) -> None:
-    """Have the core hold writes back from so many on, before or after a part of the request has left."""
+    """Refuse all writes after the first `after` as NOT_MASTER; `sent_ns` is not 0 if a part was sent."""
     carry_out, writes = scene.bus.line.carry_out, count()
 
     def held_back(exchange: Exchange, **details: Any) -> Completion:
@@ -246,9 +248,7 @@ def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, af
 
 
 @pytest.mark.slow
-def test_a_write_of_which_a_part_has_left_is_unconfirmed(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_partly_sent_write_is_unconfirmed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=1, after=0)
     with pytest.raises(Unconfirmed, match="it is not known whether acceleration_time = 20"):
@@ -258,10 +258,10 @@ def test_a_write_of_which_a_part_has_left_is_unconfirmed(
 
 
 @pytest.mark.slow
-def test_a_script_that_is_held_back_at_its_second_write_says_so(
+def test_a_script_that_loses_mastership_at_its_second_write_raises_not_master(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first write is done and recorded; the second was certainly not sent."""
+    """The first write is done and recorded; the second write was not sent."""
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=0, after=1)
 
@@ -274,10 +274,10 @@ def test_a_script_that_is_held_back_at_its_second_write_says_so(
     assert len([*read_audit(scene.audit)]) == 1
 
 
-def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
+def test_a_sent_stop_is_unconfirmed_if_the_mastership_ends(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was sent, so it is not reported as unsent."""
+    """The stop was sent, so it is not reported as unsent."""
     scene.become_master()
     carry_out = scene.bus.line.carry_out
 
@@ -300,7 +300,7 @@ def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
 
 @pytest.fixture
 def shared() -> Iterator[tuple[int, Bus, Mastership]]:
-    """Return the far end of a line without replies, its bus and its mastership."""
+    """Yield the far end of a line without drives, its bus and its mastership."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -314,7 +314,7 @@ def shared() -> Iterator[tuple[int, Bus, Mastership]]:
 
 
 class Babbler:
-    """Another master, which asks again and again until it falls silent."""
+    """Another master, which sends requests until it is told to stop."""
 
     def __init__(self, far: int) -> None:
         self._far, self._is_over = far, threading.Event()
@@ -338,7 +338,7 @@ def sent_on(far: int) -> bytes:
 
 
 def waits(far: int, bus: Bus, drive: Slow) -> float:
-    """Ask once, and return after how many seconds the request was on the line."""
+    """Read once; return the seconds until the request was on the line."""
 
     def ask() -> None:
         with suppress(NoReply):
@@ -355,11 +355,11 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
 
 
 @pytest.mark.long
-def test_a_line_that_another_may_have_mastered_is_listened_to_first(
+def test_a_new_master_listens_before_its_first_request(
     shared: tuple[int, Bus, Mastership],
 ) -> None:
     far, bus, mastership = shared
-    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # each has no late reply due
+    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # new drives have no late reply due
     listening = LISTENING + Slow.response_timeout
     assert waits(far, bus, drives[0]) >= listening
     assert waits(far, bus, drives[1]) < listening
@@ -371,7 +371,7 @@ def test_a_line_that_another_may_have_mastered_is_listened_to_first(
 
 
 @pytest.mark.long
-def test_another_master_is_reported_before_anything_is_sent(
+def test_bytes_of_another_master_raise_before_anything_is_sent(
     shared: tuple[int, Bus, Mastership], caplog: pytest.LogCaptureFixture
 ) -> None:
     far, bus, _ = shared
@@ -396,17 +396,17 @@ def test_another_master_is_reported_before_anything_is_sent(
     def is_asked() -> bool:
         try:
             drive.read_raw(3, 1, 1, expiry=60)
-        except NotMaster:  # the last of what the other one said was still to be read
+        except NotMaster:  # the last bytes of the other master were not read yet
             return False
         except NoReply:
             return True
         return False
 
-    until(is_asked)  # it has been silent
+    until(is_asked)  # once the other master has been silent
     assert sent_on(far)
 
 
-def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership]) -> None:
+def test_a_stop_is_sent_although_another_master_is_heard(shared: tuple[int, Bus, Mastership]) -> None:
     far, bus, _ = shared
     drive = bus.attach(Slow(1, name="pump"))
     other = Babbler(far)
@@ -420,7 +420,7 @@ def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0", "socket://127.0.0.1:0"])
-def test_a_network_s_port_is_held_back_too(port: str) -> None:
+def test_network_ports_send_nothing_without_mastership(port: str) -> None:
     mastership, sim = Mastership(), simulated(Brief(1))
     mastership.extend(now_ns() + 1000 * S)
     simulator = Simulator([Wire([sim], unpaced=True, port=port)])
@@ -428,7 +428,7 @@ def test_a_network_s_port_is_held_back_too(port: str) -> None:
         drive = bus.attach(Brief(1))
         begun = time.monotonic()
         drive.read(Toy.output_current)
-        # a gateway of Modbus TCP is its line's one master, and hands on no other's bytes
+        # a Modbus TCP gateway is the only master of its line, and forwards no bytes of others
         assert port.startswith("tcp") or time.monotonic() - begun >= LISTENING
         asked = sim.counters.requests
         mastership.end()
@@ -437,7 +437,7 @@ def test_a_network_s_port_is_held_back_too(port: str) -> None:
         assert sim.counters.requests == asked > 0
 
 
-# ---- ports and arguments that cannot be ----
+# ---- invalid ports and arguments ----
 
 
 def test_only_the_master_opens_the_port(scene: Scene) -> None:
@@ -453,12 +453,12 @@ def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
         scene.drive.stop()
     assert scene.bus.line.is_lost
     scene.become_master()
-    scene.drive.stop()  # which opens it again
+    scene.drive.stop()  # which reopens the port
     assert scene.requests > 0
 
 
 @pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])
-def test_a_bridged_port_is_refused(port: str) -> None:
+def test_a_port_handled_by_pyserial_is_refused_with_a_mastership(port: str) -> None:
     with pytest.raises(
         NoSuchPort, match="a line with a mastership needs a port that the core writes to itself"
     ):
@@ -467,12 +467,12 @@ def test_a_bridged_port_is_refused(port: str) -> None:
         Bus.awaiting(port, mastership=Mastership())
 
 
-def test_a_mastership_is_one() -> None:
+def test_mastership_of_another_type_raises_type_error() -> None:
     with pytest.raises(TypeError, match=r"^mastership takes a multidrop\.core\.Mastership, not 0\.7$"):
         Bus("/dev/null", mastership=0.7)  # type: ignore[arg-type]
 
 
-def test_an_unmastered_bus_is_as_before(scene: Scene) -> None:
+def test_a_bus_without_a_mastership_sends_as_usual(scene: Scene) -> None:
     path = scene.simulator.wires[0].path
     scene.bus.close()
     with Bus(path) as bus:

@@ -1,4 +1,4 @@
-"""Verbs and plain writes, step by step: how they end, what is undone, and what is reported and logged."""
+"""Verbs and plain writes, step by step: their results, cancellations, undone commands, errors and logs."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def stubborn(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, Any]:
 
 
 def call_stop_at(line: SimulatedBus, drive: Any, nth: int) -> None:
-    """Have another one's stop called as the nth request from now on leaves."""
+    """Call the drive's stop, as from another thread, when the nth request from now on is sent."""
     begun = len(line.frames)
 
     def note(request: Message) -> bytes | None:
@@ -81,13 +81,13 @@ def call_stop_at(line: SimulatedBus, drive: Any, nth: int) -> None:
     line.answers = note
 
 
-def test_a_verbs_result_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verb_returns_the_result_of_its_script(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive = stubborn(monkeypatch)
     assert drive.start() == 7
 
 
 @pytest.mark.parametrize("model", MAKE)
-def test_commands_return_a_result(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_verbs_without_a_result_return_a_command_result(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     _, drive, _ = one(monkeypatch, MAKE[model](1))
     for result in (drive.set_frequency(20), drive.start(), drive.stop()):
         assert result.ok
@@ -95,7 +95,7 @@ def test_commands_return_a_result(monkeypatch: pytest.MonkeyPatch, model: str) -
     assert isinstance(drive.state(), State)
 
 
-def test_a_start_that_goes_on_after_its_stop_ends_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_script_that_ignores_cancelled_by_stop_ends_anyway(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = stubborn(monkeypatch)
     call_stop_at(line, drive, 1)
     with pytest.raises(
@@ -105,7 +105,9 @@ def test_a_start_that_goes_on_after_its_stop_ends_all_the_same(monkeypatch: pyte
     assert line.written == []
 
 
-def test_a_write_that_a_script_goes_on_to_after_a_stop_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_cancelled_by_a_stop_names_the_write_that_was_not_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     before = len(line.written)
@@ -115,10 +117,10 @@ def test_a_write_that_a_script_goes_on_to_after_a_stop_is_named(monkeypatch: pyt
     assert len(line.written) == before
 
 
-def test_a_resets_word_is_taken_back_after_a_stop_and_recorded(
+def test_a_reset_cancelled_by_a_stop_still_takes_its_command_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Else the reset would stay on, and reset the next fault by itself."""
+    """Otherwise the reset coil would stay on, and reset the next fault by itself."""
     audit = tmp_path / "audit"
     line, drive, _ = one(monkeypatch, ErmanERG220(1), audit=audit)
     line.bus.check_identity(drive)
@@ -145,7 +147,7 @@ def test_a_plain_stop_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     line.bus.close()
 
 
-def test_a_raw_request_is_recorded_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_raw_request_is_recorded_immediately(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     assert line.bus.audit_trouble == ""
     drive.send_raw(6, 0x1000, b"\0\5")
@@ -154,21 +156,21 @@ def test_a_raw_request_is_recorded_at_once(monkeypatch: pytest.MonkeyPatch, tmp_
     line.bus.close()
 
 
-def test_nothing_is_even_read_for_a_write_that_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_read_is_sent_for_an_expired_write(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with written_before(lambda: 0.0), pytest.raises(Expired, match=r"setpoint = 10\.00 %"):
         drive.write(drive.setpoint, 10.0)
     assert line.frames == []
 
 
-def test_the_watchdog_is_logged_at_the_first_check(
+def test_the_watchdog_is_logged_at_the_first_identity_check(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.stop()
     caplog.clear()
-    line.queue = object()  # the port was opened again
+    line.queue = object()  # as after the port was reopened
     drive.set_frequency(20)
     drive.start()
     drive.stop()
@@ -185,7 +187,7 @@ every_directed = pytest.mark.parametrize("model", DIRECTED)
 
 
 def turning(monkeypatch: pytest.MonkeyPatch, model: str) -> tuple[SimulatedBus, Any, MotorDrive]:
-    """A motor that turns forward at 20 Hz; from there its ramp down takes 4 s."""
+    """Return a bus, a drive and its simulation, whose motor turns forward at 20 Hz (ramp down: 4 s)."""
     line, drive, sim = one(monkeypatch, DIRECTED[model](1))
     drive.set_frequency(20)
     drive.start(Direction.FORWARD)
@@ -195,22 +197,22 @@ def turning(monkeypatch: pytest.MonkeyPatch, model: str) -> tuple[SimulatedBus, 
 
 
 @every_directed
-def test_a_start_the_other_way_is_done_once_the_motor_is_seen_to_turn_so(
+def test_a_reversal_returns_once_the_motor_is_seen_to_turn_in_reverse(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     line, drive, sim = turning(monkeypatch, model)
     drive.start(Direction.REVERSE)
     assert drive.state().direction is Direction.REVERSE
-    if model not in ("yd1000", "delta-vfd-el"):  # simulated ones, which show the direction commanded
+    if model not in ("yd1000", "delta-vfd-el"):  # their simulations show the commanded direction
         assert sim.motor.frequency < 0
     begun = line.seconds
-    drive.start(Direction.REVERSE)  # in which it turns already
+    drive.start(Direction.REVERSE)  # the motor already turns in this direction
     assert line.seconds - begun < 1
 
 
 @every_directed
 @pytest.mark.parametrize("options", [{}, {"stop_time": 5}])
-def test_a_start_the_other_way_that_the_drive_ignores_is_unconfirmed(
+def test_a_reversal_that_the_drive_ignores_is_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, model: str, options: dict[str, float]
 ) -> None:
     line, drive, sim = turning(monkeypatch, model)
@@ -223,7 +225,7 @@ def test_a_start_the_other_way_that_the_drive_ignores_is_unconfirmed(
     assert line.seconds - begun < (25 if options else 250)
 
 
-def test_a_trip_while_the_motor_changes_its_direction_ends_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trip_during_a_reversal_raises_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = turning(monkeypatch, "invt-che")
     begun = line.seconds
 
@@ -259,8 +261,8 @@ def test_refusals_are_logged(monkeypatch: pytest.MonkeyPatch, caplog: pytest.Log
     assert line.written == []
 
 
-def test_an_unseen_effect_is_reported_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reset cuts its own reply off, and then the drive does not say what its record of faults is."""
+def test_a_reset_whose_effect_cannot_be_read_is_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reply to the reset is lost, and so are the replies to reads of the fault record."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     sim.trip(4)
     line.bus.check_identity(drive)
@@ -274,7 +276,7 @@ def test_an_unseen_effect_is_reported_as_such(monkeypatch: pytest.MonkeyPatch) -
         drive.reset_fault()
 
 
-def test_a_write_that_its_budget_holds_back_says_that_it_may_be_sent_later(
+def test_a_write_refused_to_save_eeprom_is_marked_as_budget(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "wear")
@@ -289,7 +291,7 @@ def test_a_write_that_its_budget_holds_back_says_that_it_may_be_sent_later(
     assert not refusal.value.is_budget
 
 
-def test_the_end_of_a_stop_is_logged_with_its_reason() -> None:
+def test_the_text_of_a_stop_s_result_has_its_reason() -> None:
     assert str(Stopped("fan", Seen.STOPPED, 2.04)) == "fan: stopped after 2.0 s"
     assert str(Stopped("fan", Seen.SENT, 30.0, "no reply")) == "fan: sent but unknown after 30.0 s: no reply"
 
@@ -297,7 +299,7 @@ def test_the_end_of_a_stop_is_logged_with_its_reason() -> None:
 # ---- lost ports and drives ----
 
 
-def test_a_port_that_is_lost_after_a_confirmed_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_lost_after_a_confirmed_start_raises_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
 
@@ -311,7 +313,7 @@ def test_a_port_that_is_lost_after_a_confirmed_start(monkeypatch: pytest.MonkeyP
         drive.start()
 
 
-def test_a_port_that_is_lost_when_a_write_is_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_lost_during_read_back_makes_the_write_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
 
@@ -327,7 +329,9 @@ def test_a_port_that_is_lost_when_a_write_is_read_back(monkeypatch: pytest.Monke
         assert outcome.value
 
 
-def test_a_drive_that_is_taken_off_while_it_is_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_detached_during_read_back_makes_the_write_unconfirmed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
     Meanwhile(line, 1, lambda: line.bus.detach(drive))

@@ -31,7 +31,7 @@ from multidrop.sim import simulated
 
 
 def steps(line: SimulatedBus) -> list[int]:
-    """Return the counts that were written."""
+    """Return the raw counts of the setpoints that were written."""
     return [int(frame[12:17].replace(" ", ""), 16) for frame in line.written]
 
 
@@ -57,7 +57,7 @@ def test_a_ramp_waits_between_its_steps_but_not_after_the_last(
     assert line.seconds - written_at[-1] < 0.5
 
 
-def test_a_ramp_may_be_as_steep_as_the_drive_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_may_be_as_fast_as_the_drive_s_own_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -65,7 +65,7 @@ def test_a_ramp_may_be_as_steep_as_the_drive_s_own(monkeypatch: pytest.MonkeyPat
     assert steps(line) == [1800, 2000]
 
 
-def test_steps_that_are_no_whole_counts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rounding_errors_of_ramp_steps_do_not_accumulate(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -73,7 +73,7 @@ def test_steps_that_are_no_whole_counts_add_up(monkeypatch: pytest.MonkeyPatch) 
     assert steps(line) == [1033, 1067, 1100]
 
 
-def test_a_ramp_of_percents_goes_on_from_the_hertz_that_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_converts_a_setpoint_in_percent_to_hertz(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=80))
     drive.set_frequency(20)
     line.frames.clear()
@@ -82,7 +82,7 @@ def test_a_ramp_of_percents_goes_on_from_the_hertz_that_they_are(monkeypatch: py
 
 
 class Ramped(Toy):
-    """Its setpoint is a plain setting in RAM; without an acceleration, it has no slope of its own."""
+    """A drive whose setpoint is a plain setting in RAM, and whose own ramp follows from two settings."""
 
     model = "ramped"
     maximum_frequency = setting(0x20, "Hz", step=0.1, kept=Kept.RAM)
@@ -91,7 +91,7 @@ class Ramped(Toy):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write no setpoint that the drive already has."""
+        """Write the setpoint unless the drive already has it."""
         if (yield from read(self.frequency)) != hz:
             yield from self._hold(self.frequency, hz)
 
@@ -102,8 +102,8 @@ def ramped(monkeypatch: pytest.MonkeyPatch, family: type[Drive], **options: floa
     return line, line.attach(family(1, **options)), sim
 
 
-def test_a_ramp_reads_an_unknown_setpoint_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if the last step, which is checked first, writes no setpoint."""
+def test_a_ramp_starts_from_the_setpoint_that_it_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ramp also works if `set_frequency` writes nothing because the setpoint is already reached."""
     line, drive, _ = ramped(monkeypatch, Ramped)
     ramp(drive, 2.0, rate=1.0, every=1.0)
     assert steps(line) == [100, 200]
@@ -113,14 +113,14 @@ def test_a_ramp_reads_an_unknown_setpoint_first(monkeypatch: pytest.MonkeyPatch)
         ramp(drive, 60.0, rate=1.0)
     assert steps(line) == [100, 200]
     asked = len(line.frames)
-    line.loses = lambda request: len(line.frames) > asked + 3  # what its check reads, and no more
+    line.loses = lambda request: len(line.frames) > asked + 3  # only the check's reads are answered
     with pytest.raises(NoReply):
         ramp(drive, 3.0, rate=1.0)
     assert steps(line) == [100, 200]
 
 
 @pytest.mark.parametrize(("most", "seconds"), [(50, 0), (0, 10)])
-def test_a_drive_without_a_slope_of_its_own_needs_a_rate(
+def test_a_ramp_needs_a_rate_if_the_drive_s_own_rate_is_zero_or_infinite(
     monkeypatch: pytest.MonkeyPatch, most: int, seconds: int
 ) -> None:
     line, drive, sim = ramped(monkeypatch, Ramped)
@@ -135,7 +135,7 @@ def test_a_drive_without_a_slope_of_its_own_needs_a_rate(
 
 
 class Nameless(Ramped):
-    """A drive whose family cannot be verified."""
+    """A drive whose family has no `identify`."""
 
     model = "nameless"
     identify = Drive.identify
@@ -155,7 +155,7 @@ def test_a_ramp_of_an_unconfirmed_drive_is_refused(monkeypatch: pytest.MonkeyPat
 
 
 def che(monkeypatch: pytest.MonkeyPatch, count: int) -> tuple[SimulatedBus, list[Any], list[Any]]:
-    """Return a line of drives that have their setpoints, and their simulations."""
+    """Return a simulated bus, its drives, whose setpoints are written, and their simulations."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in range(1, count + 1)]
     line = SimulatedBus(monkeypatch, *sims)
     drives = [line.attach(sim.drive) for sim in sims]
@@ -165,7 +165,7 @@ def che(monkeypatch: pytest.MonkeyPatch, count: int) -> tuple[SimulatedBus, list
 
 
 @pytest.mark.parametrize("gap", [0, 0.5])
-def test_starts_may_follow_at_once(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
+def test_staggered_starts_keep_the_gap_which_may_be_zero(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
     line, drives, sims = che(monkeypatch, 2)
     begun = line.seconds
     start_staggered(drives, gap)
@@ -174,8 +174,10 @@ def test_starts_may_follow_at_once(monkeypatch: pytest.MonkeyPatch, gap: float) 
 
 
 @pytest.mark.parametrize("gap", [4.0, 25.0])
-def test_drives_that_wait_for_their_start_are_read(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
-    """Else those that cannot say their setpoint would be refused: they may have lost it with their power."""
+def test_drives_waiting_for_a_staggered_start_are_read_regularly(
+    monkeypatch: pytest.MonkeyPatch, gap: float
+) -> None:
+    """Otherwise a start would be refused: after a silence, a setpoint that cannot be read counts as lost."""
     sims: list[Any] = [simulated(InnovertIBD(address, maximum_frequency=50)) for address in range(1, 6)]
     line = SimulatedBus(monkeypatch, *sims)
     drives = [line.attach(sim.drive) for sim in sims]
@@ -209,12 +211,12 @@ def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
     assert {request.address for request, _ in line.frames if is_write(request)} == {1}
     assert not any(sim.motor.goal for sim in sims)
     with pytest.raises(WriteForbidden, match="multidrop stop PORT invt-goodrive 2"):
-        drives[1].stop(seconds=1)  # which would run it
+        drives[1].stop(seconds=1)  # this stop would run the motor
     assert {request.address for request, _ in line.frames if is_write(request)} == {1}
 
 
 class NotedCalls:
-    """The stops that were called, with the seconds that each was given."""
+    """Records the stops that are called: the drive's address, and `seconds`."""
 
     def __init__(self, drives: list[Any]) -> None:
         self.calls: list[tuple[int, float | None]] = []
@@ -224,7 +226,7 @@ class NotedCalls:
 
 
 class NotedStop:
-    """One of them."""
+    """One recorded stop."""
 
     def __init__(
         self, noted: NotedCalls, address: int, verb: str, make: object, seconds: float | None
@@ -239,14 +241,16 @@ class NotedStop:
             act(self._seconds)
 
     def interrupted(self, interruption: BaseException) -> None:
-        """No step is left to send."""
+        """Do nothing: there is nothing to send."""
 
     def result(self) -> None:
-        """It stands."""
+        """Return None: the motor has stopped."""
 
 
-def test_started_drives_are_stopped_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that is silent keeps its own stop up, and no other's."""
+def test_a_failed_staggered_start_stops_the_started_drives_in_parallel(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The stop of a silent drive does not delay the stops of the others."""
     _, drives, sims = che(monkeypatch, 3)
     sims[2].trip(4)
     noted = NotedCalls(drives)
@@ -269,7 +273,7 @@ class NoThread(threading.Thread):
         raise RuntimeError("can't start new thread")
 
 
-def test_without_threads_each_is_sent_its_stop_before_any_is_waited_for(
+def test_without_threads_all_started_drives_are_sent_a_stop_before_waiting(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, drives, sims = che(monkeypatch, 2)
@@ -281,7 +285,7 @@ def test_without_threads_each_is_sent_its_stop_before_any_is_waited_for(
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (2, None)]
 
 
-def test_an_interruption_of_stops_without_threads_has_each_sent_once_more(
+def test_interrupted_stops_without_threads_are_each_sent_once_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, drives, sims = che(monkeypatch, 2)
@@ -302,7 +306,7 @@ def test_an_interruption_of_stops_without_threads_has_each_sent_once_more(
 # ---- setpoints and limits of a ramp ----
 
 
-def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
+def test_a_failed_staggered_start_stops_the_drives_it_started(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
@@ -333,7 +337,7 @@ def test_an_invalid_gap_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None
     assert line.frames == []
 
 
-def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -371,7 +375,9 @@ def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(monkeypatch: pytest.Monkey
     assert len(line.written) == 1
 
 
-def test_a_ramp_reads_the_drives_limit_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_above_the_drive_s_limit_is_refused_before_its_first_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -380,8 +386,8 @@ def test_a_ramp_reads_the_drives_limit_first(monkeypatch: pytest.MonkeyPatch) ->
     assert line.written == []
 
 
-def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It cannot be read: from the one of set_frequency it would be a jump."""
+def test_a_ramp_starts_from_a_setpoint_of_a_plain_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The setpoint cannot be read; starting from the older one of `set_frequency` would be a jump."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     drive.write(drive.frequency, 10.0)
@@ -390,7 +396,7 @@ def test_a_ramp_goes_on_from_a_setpoint_that_was_plainly_written(monkeypatch: py
     assert [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written] == [12.0, 14.0]
 
 
-def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_is_refused_after_an_unconfirmed_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     line.loses = is_write
@@ -401,7 +407,7 @@ def test_a_ramp_goes_on_from_no_setpoint_that_is_in_doubt(monkeypatch: pytest.Mo
             act()
 
 
-def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_is_refused_after_a_broadcast_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     line.bus.broadcast(drive.frequency, 0)
@@ -410,7 +416,7 @@ def test_a_ramp_goes_on_from_no_setpoint_before_a_broadcast(monkeypatch: pytest.
 
 
 class ShareToy(Toy):
-    """Its setpoint is a share of a frequency that its class does not state."""
+    """A drive whose setpoint is a percentage of a maximum that its class does not state."""
 
     share = setting(0x16, "%", step=0.01, span=(0, 100), kept=Kept.RAM)
     setpoint_name = "share"
@@ -430,7 +436,7 @@ def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused(monkeypatch: py
 
 
 class AliasToy(Toy):
-    """Its setpoint is kept in EEPROM, and written to an address that is not."""
+    """A drive whose setpoint is kept in EEPROM, but is written at an alias address in RAM."""
 
     frequency = setting(0x15, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, ram_address=0x115)
 
@@ -439,7 +445,7 @@ class AliasToy(Toy):
         yield from self._hold(self.frequency, hz)
 
 
-def test_a_ramp_by_an_alias_in_ram_wears_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_ramp_through_a_ram_alias_writes_no_eeprom(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line = SimulatedBus(monkeypatch, simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
     toy = line.attach(AliasToy(1))
     ramp(toy, 10, rate=8.0)
@@ -461,7 +467,7 @@ def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPa
     assert line.frames == []
 
 
-def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_of_a_setpoint_in_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1))
     with pytest.raises(WriteForbidden, match="EEPROM"):
         ramp(drive, 20.0)
@@ -469,7 +475,7 @@ def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 class KeptToy(Toy):
-    """Its setpoint is declared a command, and yet kept in EEPROM."""
+    """A drive whose setpoint is declared as a command, but is kept in EEPROM."""
 
     frequency = command(0x2000, "Hz", step=0.01, span=(0, 50), kept=Kept.EEPROM, moves=False)
 

@@ -66,7 +66,7 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
     assert not sim.motor.energised
 
 
-def test_a_stop_may_be_written_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plain_write_may_stop_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = one(monkeypatch, InvtCHE(1))
     assert drive.write(drive.control, CHEControl.STOP) is CHEControl.STOP
 
@@ -108,12 +108,12 @@ def test_writes_against_a_rule_are_refused_and_not_sent(
     register = drive.register(name)
     with pytest.raises(WriteForbidden, match=sentence) as refusal:
         drive.write(register, value)
-    assert isinstance(refusal.value, ValueError)  # a mistake of the caller's
+    assert isinstance(refusal.value, ValueError)  # so that it also counts as the caller's mistake
     assert (refusal.value.register, bool(refusal.value.rule), bool(refusal.value.place)) == (name, True, True)
     assert line.written == []
 
 
-def test_registers_that_change_at_rest_are_refused_while_the_motor_turns(
+def test_writes_allowed_only_at_rest_are_refused_while_the_motor_turns(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
@@ -131,14 +131,14 @@ def test_registers_that_change_at_rest_are_refused_while_the_motor_turns(
     assert sim["maximum_frequency"] == 90
 
 
-def test_raw_goes_past_every_rule_and_is_called_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     assert drive.send_raw(6, 0x0000, b"\x00\x01") == b"\x00\x01"
     assert line.written == ["01 06 00 00 00 01 48 0A"]
     line.loses = lambda request: True
     with pytest.raises(Unconfirmed, match="raw request 01 06 00 00 00 01"):
         drive.send_raw(6, 0x0000, b"\x00\x01")
-    assert len(line.written) == 2  # once each
+    assert len(line.written) == 2  # each call sent the request once
 
 
 # ---- identity ----
@@ -158,20 +158,22 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     line.sleep(1)
     drive.set_frequency(25)
     assert looks == []
-    line.queue = object()  # the port was opened anew: who knows what is on it
+    line.queue = object()  # as after the port was reopened, with perhaps other drives
     line.sleep(1)
     drive.set_frequency(30)
     assert looks == ["look"]
 
 
-def test_an_ambiguous_ibd_needs_its_owners_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ibd_that_cannot_be_identified_needs_its_owner_s_confirmation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for confirmed in (0, 1):
         line, drive, sim = one(monkeypatch, InnovertIBD(1, confirmed=confirmed))
         sim["address_setting"] = 0
         if confirmed:
             drive.set_frequency(20)
             assert line.written == ["01 06 20 01 07 D0 D0 66"]
-            assert sim.counters.requests > 1  # a read went before: it tells whether the adapter echoes
+            assert sim.counters.requests > 1  # a read came first, which shows whether the adapter echoes
             assert line.frames[0][0].function == 3
         else:
             with pytest.raises(WriteForbidden, match="confirmed = 1"):
@@ -182,7 +184,9 @@ def test_an_ambiguous_ibd_needs_its_owners_confirmation(monkeypatch: pytest.Monk
 # ---- outcomes ----
 
 
-def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_is_done_taken_as_another_value_refused_or_unconfirmed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     outcome = drive.try_write(drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)
@@ -198,16 +202,14 @@ def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None
     assert str(outcome).startswith("innovert-ibd@1: frequency = 25.00 Hz: unconfirmed: innovert-ibd@1: ")
     with pytest.raises(Unconfirmed, match="no reply"):
         assert outcome.value
-    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE  # it was looked up
+    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE  # read back
     line.deafens = line.loses
     outcome = drive.try_write(drive.acceleration_time, 30.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)
 
 
 @every_family
-def test_only_a_stop_is_sent_before_an_earlier_answer_has_come(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drive, _ = one(monkeypatch, MAKE[model](1))
     insisted: list[bool] = []
     carry_out = line.carry_out
@@ -231,7 +233,7 @@ def test_the_first_check_logs_the_watchdog_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
-    assert not line.frames  # attached, and nothing was sent
+    assert not line.frames  # attaching sends nothing
     with caplog.at_level("INFO", "multidrop"):
         drive.set_frequency(20)
         drive.start()
@@ -240,7 +242,7 @@ def test_the_first_check_logs_the_watchdog_once(
     assert told == [f"{drive.name}: {off}"]
 
 
-def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_is_reported_with_the_family_s_meaning(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     line.bus.check_identity(drive)
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
@@ -252,7 +254,7 @@ def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.Monke
     assert len(line.written) == 1
 
 
-def test_a_drive_that_refuses_to_read_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_watchdog_that_cannot_be_read_is_described_by_the_family(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
     line.answers = lambda request: refusal if request.function == 3 else None
@@ -269,14 +271,14 @@ def test_an_expired_write_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Expired, match="control = FORWARD was not sent"):
         drive.start()
     assert line.written == written
-    drive.stop()  # is never too late
+    drive.stop()  # never expires
     assert len(line.written) == len(written) + 1
 
 
 class Tidy(Drive):
     """A user's drive whose start reads the motor's state, whatever the result of its write."""
 
-    current = reading(0x0F, "A")  # read before the first write
+    current = reading(0x0F, "A")  # the register that is read before the first write
     speed = reading(0x10, "rpm")
     run = setting(0x20)
 
@@ -290,7 +292,7 @@ class Tidy(Drive):
 
 @pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
 def test_an_unsent_write_is_not_unconfirmed(monkeypatch: pytest.MonkeyPatch, result: Failure) -> None:
-    """Nor is it by a look that fails afterwards."""
+    """It is not reported as unconfirmed even if a later read of the script fails."""
     line = SimulatedBus(monkeypatch, simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
     carry_out = line.carry_out
@@ -311,8 +313,8 @@ def test_an_unsent_write_is_not_unconfirmed(monkeypatch: pytest.MonkeyPatch, res
 # ---- faults on the way ----
 
 
-def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """DriveException would say that it did not start."""
+def test_an_exception_to_a_read_after_a_start_raises_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raising DriveException would mean that the drive refused the start."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     busy = build_reply(Framing.RTU, Message(1, 3, exception=6))
@@ -323,7 +325,7 @@ def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.Mon
     assert sim.motor.energised
 
 
-def test_noise_at_the_start_spoils_only_the_identity_check(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_succeeds_although_its_first_reads_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     spoilt: list[Message] = []
@@ -341,7 +343,7 @@ def test_noise_at_the_start_spoils_only_the_identity_check(monkeypatch: pytest.M
     assert sim.motor.energised
 
 
-def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trip_during_a_start_raises_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     control = sim.obeys["control"]
@@ -357,8 +359,10 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
     assert drive.state().condition is Condition.STOPPED
 
 
-def test_a_power_cycle_in_mid_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The drive has forgotten its setpoint: it stays off, and the next start says so."""
+def test_after_a_power_cycle_a_start_is_refused_until_a_setpoint_is_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The drive loses its setpoint: it stays off, and the next start is refused."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(40)
     drive.start()
@@ -366,7 +370,7 @@ def test_a_power_cycle_in_mid_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     sim.pass_time(line.seconds)
     assert 0 < sim.motor.frequency < 40
     sim.now = line.seconds
-    sim._restart()  # all but the EEPROM is gone
+    sim._restart()  # keeps only the EEPROM
     line.sleep(5)
     sent = len(line.written)
     assert drive.state().condition is Condition.STOPPED
@@ -379,8 +383,8 @@ def test_a_power_cycle_in_mid_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sim.motor.energised
 
 
-def test_two_clients_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another client changes the setpoint between ours and our start: no start at its setpoint."""
+def test_a_start_is_refused_if_another_client_changed_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another client changes the setpoint between our write and our start: the start is refused."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     sim["frequency"] = 60.0
@@ -409,24 +413,24 @@ def test_a_clamped_setpoint_is_reported_with_the_value_taken(monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_a_setpoint_loop_to_an_eeprom_is_stopped_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_setpoint_loop_to_eeprom_is_refused_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, DelixiModbus(1))
     drive.set_frequency(10.0)
-    for step in range(60):  # a minute at 1 Hz
+    for step in range(60):  # once a second for a minute
         with pytest.raises(WriteForbidden, match=r"once in 60 s at most; change it less often: .*P00\.02"):
             drive.set_frequency(10.1 + 0.1 * (step % 9))
         line.sleep(1.0 - 0.04)
     assert sim.counters.eeprom_writes["frequency"] == 1
     for _ in range(100):
-        drive.set_frequency(10.0)  # as it is: never written
+        drive.set_frequency(10.0)  # the held value is not written again
     line.sleep(60)
     drive.set_frequency(12.0)
     assert sim.counters.eeprom_writes["frequency"] == 2
 
 
-def test_the_budget_of_a_year(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_writes_beyond_the_yearly_budget_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=20))
-    for step in range(20):  # unknown storage: budgeted, and not held to once a minute
+    for step in range(20):  # unknown memory: the yearly budget applies, but not the interval of a minute
         drive.set_frequency(10 + step)
     with pytest.raises(WriteForbidden, match=r'written 20 times in a year.*ram = \["frequency"\].*b\.007'):
         drive.set_frequency(45)
@@ -449,7 +453,7 @@ def test_a_register_declared_as_ram_is_not_counted(monkeypatch: pytest.MonkeyPat
 
 def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     class Mine(InvtCHE):
-        """A CHE whose owner has its manual."""
+        """A CHE with a parameter declared by its owner."""
 
         acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
@@ -476,8 +480,8 @@ def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> No
     assert line.written == []
 
 
-def test_coils_have_no_value_that_is_written_twice() -> None:
-    """A pulse is not harmless: only what stops, or takes a command back, may be repeated."""
+def test_harmless_counts_only_stop_or_take_a_command_back() -> None:
+    """Only raw counts that stop, or take a command back, are harmless, because they may be repeated."""
     for family in MODELS.values():
         for register in family.registers.values():
             if register.harmless is None:
@@ -491,9 +495,9 @@ def test_coils_have_no_value_that_is_written_twice() -> None:
                 assert {part for name in names for part in name.split("|")} <= allowed
 
 
-def test_a_user_s_family_is_identified_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_to_a_silent_drive_without_identify_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     class Mine(Drive):
-        """A family that cannot say who it is."""
+        """A family without `identify`."""
 
         speed = setting(5, "rpm", kept=Kept.RAM)
 
@@ -506,7 +510,7 @@ def test_a_user_s_family_is_identified_too(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_an_identity_check_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     class Sleepy(Toy):
-        """It says who it is a while after it was asked for the first time."""
+        """A family whose `identify` waits between two reads."""
 
         @verb
         def identify(self) -> Script[None]:
@@ -523,7 +527,7 @@ def test_an_identity_check_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_identity_check_that_writes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     class Meddler(Toy):
-        """Its author used a write as a read."""
+        """A family whose `identify` writes by mistake."""
 
         @verb
         def identify(self) -> Script[None]:
@@ -536,11 +540,11 @@ def test_an_identity_check_that_writes_is_refused(monkeypatch: pytest.MonkeyPatc
     assert line.frames == []
 
 
-def test_registers_that_change_at_rest_need_a_readable_state(
+def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Mute(Drive):
-        """A family that has no state."""
+        """A family without a state."""
 
         speed = reading(1, "rpm")
         ratio = setting(2, kept=Kept.RAM, while_running=False)

@@ -31,7 +31,7 @@ def word(request: Message) -> int:
 
 
 def erman(message: Message) -> bool:
-    """Coils 3 to 8 and 10 to 12 are reserved, and so are most registers; 0001H is never written."""
+    """Return True for an allowed write: no reserved coil (3 to 8, 10 to 12) or register, and not 0001H."""
     if message.function == 5:
         return message.start in (0, 1, 2, 9)
     return message.function == 6 and message.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
@@ -45,7 +45,7 @@ def che(message: Message) -> bool:
 
 
 def ibd(message: Message) -> bool:
-    """No direction without a word of its owner's, never the toggle; a reset without run."""
+    """Return True for an allowed write: a control word of the list, three parameters within their limits."""
     if message.start == 0x2000:
         return message.function == 6 and word(message) in (0, 1, 2, 3, 0x10)
     return message.function == 6 and (
@@ -54,7 +54,7 @@ def ibd(message: Message) -> bool:
 
 
 def delixi(message: Message) -> bool:
-    """Bits 2, 3 and 6 to 15 are reserved, bits 4 and 5 together are the toggle; run has its direction."""
+    """Return True for an allowed write: reserved bits are 0, no toggle (bits 4 and 5), run with direction."""
     if message.start == 0x2000:
         return message.function == 6 and word(message) in (0, 1, 0x12, 0x22, 0x13, 0x23)
     return message.function == 6 and message.start == 2
@@ -69,7 +69,7 @@ def native(message: Message) -> bool:
 
 
 def yd(message: Message) -> bool:
-    """Bits 5 and 4 are reserved; bit 15 stays; a reset goes alone; some parameters are the panel's."""
+    """Return True for an allowed write: bits 4 and 5 are 0, bit 15 is 1, resets are alone, no panel setting."""
     if message.start == 0x1000:
         control = word(message)
         resets = control & 0x2000 and control & 0x0500
@@ -113,7 +113,7 @@ numbers = st.one_of(
 
 @st.composite
 def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[SimulatedBus, Any], object]]:
-    """One public call, with any arguments, and its name."""
+    """Draw a public call with random arguments; return its name and a function that makes it."""
     family = type(MAKE[model](1))
     name = draw(
         st.sampled_from(
@@ -182,7 +182,7 @@ def test_no_sequence_of_calls_sends_a_forbidden_frame(
 
 
 def play(line: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
-    """A setpoint, and then any calls with any replies lost."""
+    """Write a setpoint, then make random calls, with random replies lost."""
     drive = line.attach(sim.drive)
     drive.set_frequency(20)
     line.frames.clear()
@@ -213,7 +213,7 @@ def play(line: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
 
 
 def resets(model: str, message: Message) -> bool:
-    """A reset is a pulse: once in a call."""
+    """Return True for a write that resets a fault, which a call may send only once."""
     if message.address == 0:
         return False
     return {

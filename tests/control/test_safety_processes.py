@@ -44,10 +44,10 @@ with Bus(sys.argv[1], expiry=60) as bus:
     print("running", flush=True)
     {then}
 """
-ENDINGS = {  # what the client does after its start, the signal that it is sent, and its status then
+ENDINGS = {  # code that the client runs after its start, the signal that it is sent, its exit status
     "SIGTERM": ("time.sleep(60)", signal.SIGTERM, -signal.SIGTERM),
     "SIGINT": ("time.sleep(60)", signal.SIGINT, 1),
-    "SIGHUP": ("time.sleep(60)", signal.SIGHUP, -signal.SIGHUP),  # its terminal was closed
+    "SIGHUP": ("time.sleep(60)", signal.SIGHUP, -signal.SIGHUP),  # as when its terminal is closed
     "leaving": ("pass", None, 0),
     "error": ("raise RuntimeError", None, 1),
     "exit": ("sys.exit(3)", None, 3),
@@ -68,7 +68,7 @@ def pump() -> Iterator[tuple[MotorDrive, str]]:
     ("opted", "ending"),
     [*(("stop", ending) for ending in ENDINGS), *usually(*(("leave", ending) for ending in ENDINGS))],
 )
-def test_leaving_stops_only_when_it_was_asked_for(ending: str, opted: str) -> None:
+def test_motors_are_stopped_at_exit_only_with_stop_on_exit(ending: str, opted: str) -> None:
     then, number, status = ENDINGS[ending]
     with pump() as (sim, port):
         words = [sys.executable, "-c", CLIENT.format(then=then), port, opted]
@@ -84,7 +84,7 @@ def test_leaving_stops_only_when_it_was_asked_for(ending: str, opted: str) -> No
         assert client.returncode in (status, -int(number or 0))
         written = [write.raw for write in sim.counters.writes if write.name == "control"]
         assert written[:2] == ([1, 5] if opted == "stop" else [1])
-        assert set(written[2:]) <= {5, 8}  # again if a reply was late; 8 ends a jog if it still turned
+        assert set(written[2:]) <= {5, 8}  # repeated if a reply was late; 8 ends a jog
         assert sim.motor.energised == (opted == "leave")
 
 
@@ -99,14 +99,14 @@ def test_stop_on_exit_is_over_when_the_bus_is_closed() -> None:
         assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
         written = [write.raw for write in sim.counters.writes]
         assert written[0] == 5
-        assert set(written) <= {5, 8}  # again if a reply was late on a busy machine
+        assert set(written) <= {5, 8}  # repeated if a reply was late on a busy computer
 
 
 # ---- the ledger ----
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 
-# It pauses: two that never do would keep SQLite's lock from each other for longer than it waits.
+# The program pauses: without pauses, one of the two processes could hold SQLite's lock for too long.
 ENTRANT = """
 import sys, time
 from multidrop.control.eeprom_ledger import LedgerCell, Ledger
@@ -130,13 +130,13 @@ def test_two_processes_share_one_budget(tmp_path: Path) -> None:
     assert (wear.cell, wear.writes) == (CELL, 30)
 
 
-def test_a_ledger_remembers(tmp_path: Path) -> None:
+def test_a_ledger_keeps_its_entries_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "wear.sqlite"
     assert Ledger(path).wear(0) == []
     assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""
     assert "was written 59 s ago" in Ledger(path).enter(CELL, 1059.0, 60.0)
     assert Ledger(path).enter(CELL, 1060.0, 60.0) == ""
-    assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""  # the clock was set back: counted all the same
+    assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""  # counted although the clock was set back
     other = LedgerCell("/dev/ttyUSB0", 2, "delixi-modbus", "frequency")
     assert Ledger(path).enter(other, 1061.0, 60.0) == ""
     assert [(each.cell.address, each.writes, each.this_year) for each in Ledger(path).wear(1061.0)] == [
@@ -150,7 +150,7 @@ def test_the_budget_spends_10_000_cycles_in_ten_years() -> None:
     assert BUDGET * 10 == 10_000
 
 
-def test_an_invalid_ledger_file_is_one_sentence(tmp_path: Path) -> None:
+def test_an_invalid_ledger_file_raises_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     path.write_text("this is no database, and long enough to be looked at as one" * 20)
     with pytest.raises(OSError, match=r"the ledger of EEPROM writes .* cannot be kept"):
@@ -169,7 +169,7 @@ for number in range(200):
 
 
 @pytest.mark.slow
-def test_processes_do_not_mix_their_lines(tmp_path: Path) -> None:
+def test_processes_that_share_an_audit_log_do_not_mix_their_lines(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), name]) for name in "ab"]
     assert [writer.wait() for writer in writers] == [0, 0]
@@ -179,7 +179,7 @@ def test_processes_do_not_mix_their_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn_at", range(0, 120, 7))
-def test_a_truncated_line_leaves_the_others(tmp_path: Path, torn_at: int) -> None:
+def test_a_truncated_line_of_the_audit_log_damages_no_other(tmp_path: Path, torn_at: int) -> None:
     path = tmp_path / "audit.jsonl"
     log = AuditLog(path)
     log.add(0, {"write": "first"})
@@ -200,7 +200,7 @@ def test_a_truncated_line_leaves_the_others(tmp_path: Path, torn_at: int) -> Non
 
 @contextmanager
 def echoing(hears: Any = None) -> Iterator[str]:
-    """A port on which everything that is sent comes back, and a drive answers if there is one."""
+    """Yield a port that echoes all that is sent; `hears` returns a drive's reply to a request."""
     ours, theirs = os.openpty()
     path = os.ttyname(theirs)
     done = threading.Event()
@@ -236,11 +236,11 @@ def test_an_echo_without_a_drive_confirms_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_the_echo_is_not_the_drive_s_answer_to_a_write() -> None:
-    """The drive answers two reads and has died by the time of the write: only the echo comes."""
+def test_an_echo_is_not_taken_for_the_reply_to_a_write() -> None:
+    """The drive answers two reads, then dies: the write is answered only by its echo."""
     read = {
         bytes.fromhex("01 03 30 16 00 01 6A CE"): bytes.fromhex("01 03 02 01 01 78 14"),
-        checksums.rtu("010330000002"): checksums.rtu("01030400000000"),  # whose replies those are
+        checksums.rtu("010330000002"): checksums.rtu("01030400000000"),  # the two reads, each with its reply
     }
 
     def hears(request: bytes) -> bytes:
@@ -266,7 +266,7 @@ DRIVES = (
 
 
 def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
-    """From now on each write is answered by its echo, and reads are not answered."""
+    """From now on, answer each write with its echo, and no read at all."""
     line.deafens = lambda request: True
     line.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None
 
@@ -288,23 +288,23 @@ def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
 def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
     monkeypatch: pytest.MonkeyPatch, family: type[Drive]
 ) -> None:
-    """It cannot be read back."""
+    """The setpoint cannot be read back, so the echo is the only reply."""
     line, drive, _ = one(monkeypatch, family(1))
     drive.set_frequency(20)
     dies_and_echoes(line, drive)
     for write in (lambda: drive.write(drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
-        assert drive.commanded is None  # neither a start nor a ramp trusts it
+        assert drive.commanded is None  # so that no start or ramp relies on it
 
 
-def test_an_echo_that_shows_at_the_next_read_confirmed_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo(monkeypatch: pytest.MonkeyPatch) -> None:
     """The drive missed the write, and answers the read after it."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     drive.set_frequency(20)
 
     def echo(request: Message) -> bytes | None:
-        line.has_echo |= not is_write(request)  # the core sees it before a reply that is no copy
+        line.has_echo |= not is_write(request)  # the core detects the echo when a read's reply follows it
         return build_request(drive.framing, request) if is_write(request) else None
 
     line.answers = echo
@@ -325,10 +325,10 @@ def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
 
-def test_confirmations_through_a_known_echo_are_believed(
+def test_confirmations_are_accepted_if_the_echo_is_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """There the core distinguishes the drive's copy from the adapter's."""
+    """If the echo is known, the core can distinguish the drive's reply from the echo."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     line.has_echo = True
     drive.set_frequency(20)

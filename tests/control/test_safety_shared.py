@@ -1,8 +1,8 @@
 """A second client on the same line, whose frames collide with ours: sent frames and results.
 
-A drive cannot distinguish the requests of two clients, and a client cannot distinguish the replies to its
-reads from those to the other's. So reads on such a line are not reliable, but commands are: no start and no
-pulse is sent twice, no motor starts without a call, and the results of commands are true.
+A drive cannot distinguish the requests of two clients, and a client cannot distinguish replies to its own
+reads from replies to the other client's reads. So reads on such a line are not reliable, but commands are: no
+start and no pulse is sent twice, no motor starts without a call, and the results of commands are true.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ Collision = Callable[[random.Random, Sequence[bytes]], bytes]
 
 
 def interleaved(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """Return the characters of both in alternation."""
+    """Return a collision: the characters of both frames in alternation."""
     columns = zip_longest(*chance.sample(said, len(said)))
     return bytes(character for column in columns for character in column if character is not None)
 
 
 def overlaid(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """Return both at once: a 0 wins, because it starts a character and the bias is weak."""
+    """Return a collision of simultaneous frames: a 0 bit wins over a 1, which is driven only weakly."""
     shorter, longer = sorted(said, key=len)
     at = chance.randint(0, len(longer) - len(shorter))
     middle = bytes(one & other for one, other in zip(shorter, longer[at:], strict=False))
@@ -52,14 +52,14 @@ def overlaid(chance: random.Random, said: Sequence[bytes]) -> bytes:
 
 
 def cut_off(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """Return the first until the other is louder."""
+    """Return a collision: the start of one frame, then the rest of the other."""
     first, second = chance.sample(said, 2)
     at = chance.randint(0, len(first))
     return first[:at] + second[chance.randint(0, at) if at else 0 :]
 
 
 def one_after_another(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """Return both whole, without a silence between them."""
+    """Return both frames complete, without a silence between them."""
     return b"".join(chance.sample(said, len(said)))
 
 
@@ -83,7 +83,7 @@ class SharedPair:
             tty.setraw(fd)
         for fd in self._sides:
             os.set_blocking(fd, False)
-        self._spoke = self._our_side  # the last client that spoke
+        self._spoke = self._our_side  # the client that sent last
         self.sent = b""
         self.collisions = 0
         self.holds: Callable[[bytes], bool] = lambda said: False
@@ -121,7 +121,7 @@ class SharedPair:
         self._spoke = next((side for side in self._sides[:2] if side in said), self._spoke)
         for listener in sorted(self._sides, key=lambda side: side == self._spoke):
             if listener == self._spoke and self._drives in said:
-                sleep(SLOT)  # ptys are slow: else the sender acts before the other client hears the reply
+                sleep(SLOT)  # ptys are slow: the other client must receive the reply first
             others = [each for speaker, each in said.items() if speaker != listener]
             received = self._mixed(others)
             if received:
@@ -151,12 +151,12 @@ def shared(drives: str, baudrate: int, seed: int) -> Iterator[SharedPair]:
 
 
 RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
-ROUNDS, MOST_ROUNDS = 3, 60  # as many as it takes until both have talked at once
+ROUNDS, MOST_ROUNDS = 3, 60  # least and greatest number of rounds; they end after a collision
 
 
 @contextmanager
 def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[ReceivedRequests]]]:
-    """Our drive 1, the pair of ports, and the requests that drives 1 and 2 receive."""
+    """Yield our drive 1, the pair of ports, and the requests that drives 1 and 2 receive."""
     ours = MAKE[model](1)
     received = []
     for drive in (ours, MAKE[model](2)):
@@ -174,7 +174,7 @@ def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[R
 
 
 def requests(pair: SharedPair) -> list[Message]:
-    """Return the whole requests that left our port."""
+    """Return the requests that were sent on our port."""
     found, sent = [], pair.sent
     while sent:
         used, message = parse_request(Framing.RTU, sent)
@@ -185,7 +185,7 @@ def requests(pair: SharedPair) -> list[Message]:
 
 
 def attempt(act: Callable[[], object]) -> BusError | None:
-    """Return the failure, or None."""
+    """Call `act`; return the BusError that it raised, or None."""
     try:
         act()
     except BusError as failure:
@@ -194,7 +194,7 @@ def attempt(act: Callable[[], object]) -> BusError | None:
 
 
 def set_frequency(drive: Any, hz: float) -> None:
-    """Set it as often as it takes on a machine that has much else to do."""
+    """Set the frequency, and repeat this until it succeeds, because the computer may be busy."""
     until(lambda: attempt(lambda: drive.set_frequency(hz)) is None)
 
 
@@ -202,7 +202,7 @@ def set_frequency(drive: Any, hz: float) -> None:
 
 
 class Stranger:
-    """The other client: it reads both drives and writes the second's setpoint, and never starts anything."""
+    """The other client. It reads both drives and writes the second drive's setpoint, but starts no motor."""
 
     def __init__(self, port: str, model: str, seed: int) -> None:
         self.exchanges = 0
@@ -239,7 +239,7 @@ class Stranger:
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("model", RTU_FAMILIES)
-def test_starts_and_stops_while_another_client_talks(model: str) -> None:
+def test_starts_and_stops_are_correct_while_another_client_sends(model: str) -> None:
     with shared_line(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)
         stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))
@@ -257,7 +257,7 @@ def test_starts_and_stops_while_another_client_talks(model: str) -> None:
             until(lambda: attempt(drive.stop) is None)
             until(lambda: not first.sim.motor.energised)
         assert second.starts == []
-        until(lambda: stranger.exchanges)  # its reads may take their time-outs beside ours
+        until(lambda: stranger.exchanges)  # its reads may time out because of ours
         assert pair.collisions
 
 
@@ -267,9 +267,9 @@ def starts(pair: SharedPair, model: str) -> list[Message]:
     ]
 
 
-# ---- at the worst moment: ours is lost, and this is heard within our time-out ----
+# ---- at the worst moment: our request is lost, and another frame arrives within our timeout ----
 
-PATIENCE = 0.1  # s, with a machine that has much else to do
+PATIENCE = 0.1  # s, shortest timeout, for a busy computer
 
 
 @pytest.fixture
@@ -298,7 +298,7 @@ PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
 
 
 def running(drive: Any, received: ReceivedRequests) -> None:
-    """Pressed on the keypad."""
+    """Set a frequency, and start the motor at the drive's keypad."""
     set_frequency(drive, 20)
     received.sim.motor.run(1)
 
@@ -343,8 +343,8 @@ def test_another_clients_frames_confirm_no_stop(says: str) -> None:
 
 
 @patient
-def test_the_same_stop_of_another_client_is_one_too() -> None:
-    """It looks like the drive's confirmation of our stop, and the motor stops anyway."""
+def test_another_client_s_equal_stop_confirms_ours() -> None:
+    """The other client's stop looks like the confirmation of ours, which is right: the motor stops."""
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])
         pair.says = rtu(STOP)
@@ -357,7 +357,7 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 def test_another_clients_equal_request_is_not_our_echo_for_long(verb: str) -> None:
-    """Ours is lost and theirs answered, as if an adapter echoed: the stop is confirmed all the same."""
+    """Our read is lost, and theirs looks like its echo; a later stop is confirmed nevertheless."""
     look = rtu("01 03 10 01 00 01")
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])
@@ -367,7 +367,8 @@ def test_another_clients_equal_request_is_not_our_echo_for_long(verb: str) -> No
         pair.holds = lambda said: False
         getattr(drive, verb)()
         commands = [request for request in received[0].writes if request.start == 0x1000]
-        assert len(commands) <= 8  # a stop is repeated until its motor stands: on a busy machine more often
+        assert len(commands) <= 8  # a stop is repeated until the motor stands
+
         assert not received[0].sim.motor.energised
 
 

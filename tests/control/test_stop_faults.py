@@ -1,4 +1,4 @@
-"""Stops while the system fails: signals at any line, no memory, no descriptors, a locked ledger."""
+"""Stops while the system fails: signals at any line, no memory, no file descriptors, a locked ledger."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def writes_to(line: SimulatedBus, address: int) -> int:
 # ---- signals ----
 
 HOME = str(Path(multidrop.__file__).parent)
-# The interpreter handles a signal that comes in the first opcodes of a stop in one of those behind them: none
-# of these calls anything, and the `try` of the stop follows at once.
+# The first opcodes of a stop, before its `try`, call nothing. So the interpreter handles a signal that
+# arrives during them only at a later opcode, within the `try`.
 FIRST_OPCODES = 6
 
 
@@ -80,7 +80,10 @@ def is_ours(frame: FrameType) -> bool:
 def check_failing(
     monkeypatch: pytest.MonkeyPatch, nth: int, failure: type[BaseException], all_of_them: bool
 ) -> bool:
-    """Raise this at an opcode of a stop; return True if it has one. No motor may turn, no state leak."""
+    """Raise `failure` at the nth opcode of a stop; check that motors stop and that no state is left behind.
+
+    Return False if the stop has fewer opcodes.
+    """
     line, drives, sims = running(monkeypatch, 2 if all_of_them else 1)
     begun_before = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
     stop, told, place = line.bus.stop_all if all_of_them else drives[0].stop, "", []
@@ -91,7 +94,7 @@ def check_failing(
     try:
         with calling_at(nth, is_ours, fail) as place:
             stop()
-    except failure as raised:  # it lives on, and so do all frames of the stop
+    except failure as raised:  # keeps all frames of the stop alive during the checks
         told = "".join(getattr(raised, "__notes__", ()))
         assert not line.bus._latches._stops, place
         assert not line.bus.stops_under_way(), place
@@ -126,14 +129,14 @@ def test_a_stop_that_fails_at_any_opcode_is_sent_and_leaves_nothing_behind(
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast", "stop_all"])
-def test_a_stop_that_a_signal_s_handler_calls_ends_the_start_that_it_interrupts(
+def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(
     monkeypatch: pytest.MonkeyPatch, verb: str
 ) -> None:
-    """From the first opcode at which the interpreter can handle a signal within the call."""
+    """The handler is called at each opcode from the first at which the interpreter may handle a signal."""
     line, (drive,), (sim,) = running(monkeypatch)
     drive.stop()
     stop = line.bus.stop_all if verb == "stop_all" else getattr(drive, verb)
-    start, first = drive.start, 9  # the opcodes before read how many stops were called
+    start, first = drive.start, 9  # earlier opcodes read the number of stops called
     for nth in chain(range(first, first + 80, 4), count(first + 80, 499)):
         with calling_at(nth, is_ours, stop) as place, suppress(CancelledByStop, Unconfirmed):
             start()
@@ -145,10 +148,10 @@ def test_a_stop_that_a_signal_s_handler_calls_ends_the_start_that_it_interrupts(
 
 
 @pytest.mark.parametrize("failure", [SystemExit, KeyboardInterrupt, GeneratorExit])
-def test_a_script_that_ends_the_program_leaves_no_other_motor_running(
+def test_a_script_that_raises_system_exit_leaves_no_other_motor_running(
     monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
 ) -> None:
-    """Not even if the other one's first stops are lost: it is raised when all stops are over."""
+    """SystemExit is raised only when all stops are over, even if the other motor's first stops are lost."""
 
     class Ending(Fan):
         model = "ending"
@@ -172,24 +175,24 @@ def test_a_script_that_ends_the_program_leaves_no_other_motor_running(
 
 
 def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[Any]) -> None:
-    """Stop all motors, and start them again, until the last one's fault ends that."""
+    """Stop all motors, then start them again; the start fails at the last drive, which has a fault."""
     line.bus.stop_all()
     sims[-1].trip(4)
     start_staggered(drives, 2.0)
 
 
 @pytest.mark.long
-def test_a_failed_staggered_start_that_is_interrupted_stops_each_all_the_same(
+def test_an_interrupted_stop_after_a_failed_staggered_start_stops_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class OwnThread(threading.Thread):
-        """A thread that does its work at once."""
+        """A thread that does its work in `start`."""
 
         def start(self) -> None:
             self.run()
 
         def join(self, timeout: float | None = None) -> None:
-            """Return at once."""
+            """Return immediately."""
 
     monkeypatch.setattr(threading, "Thread", OwnThread)
 
@@ -204,7 +207,7 @@ def test_a_failed_staggered_start_that_is_interrupted_stops_each_all_the_same(
         assert not any(sim.motor.goal for sim in sims), nth
 
 
-def test_a_failed_staggered_start_stops_each_though_the_stop_of_one_raises_anything(
+def test_a_failed_staggered_start_stops_all_although_one_stop_raises(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class NoThread(threading.Thread):
@@ -253,7 +256,7 @@ def test_a_stop_is_repeated_after_the_system_had_no_resources(
 
 
 class NoRoom:
-    """Stands in for the class of stops: the system has no room for the first of them."""
+    """Replaces StopAttempt: creating one raises `fault` the first `times` times."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, times: int, fault: Exception) -> None:
         self.left = times
@@ -282,7 +285,9 @@ def test_a_stop_is_created_once_the_system_has_resources(
     assert not sims[0].motor.energised
 
 
-def test_a_stop_that_can_never_be_made_raises_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_cannot_be_created_raises_memory_error_after_30_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drives, _ = running(monkeypatch)
     begun, before = line.seconds, len(line.written)
     NoRoom(monkeypatch, 1000, NO_MEMORY)
@@ -292,7 +297,7 @@ def test_a_stop_that_can_never_be_made_raises_why(monkeypatch: pytest.MonkeyPatc
     assert len(line.written) == before
 
 
-def test_a_stop_that_never_gets_resources_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_without_system_resources_ends_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = running(monkeypatch)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -310,7 +315,7 @@ def test_a_stop_that_never_gets_resources_ends_and_says_so(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("seconds", [Decimal(12), Fraction(12), 10**400], ids=["decimal", "fraction", "huge"])
-def test_a_stop_takes_any_number_as_its_time(monkeypatch: pytest.MonkeyPatch, seconds: Any) -> None:
+def test_a_stop_accepts_any_number_type_for_seconds(monkeypatch: pytest.MonkeyPatch, seconds: Any) -> None:
     line, drives, sims = running(monkeypatch)
     deaf_until = line.seconds + (20 if seconds == 12 else 2 * LEAST_S)
     line.deafens = lambda request: clock.now_ns() < deaf_until * 1e9
@@ -323,11 +328,11 @@ def test_a_stop_takes_any_number_as_its_time(monkeypatch: pytest.MonkeyPatch, se
         assert not sims[0].motor.energised
 
 
-# ---- a ledger that others hold, or cannot keep ----
+# ---- a ledger that is locked or cannot be written ----
 
 
 @pytest.mark.slow
-def test_a_locked_ledger_is_tried_once_for_a_stop_however_often_it_was_sent(
+def test_a_locked_ledger_is_tried_only_once_for_a_repeated_stop(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     ledger = Ledger(tmp_path / "wear")
@@ -347,7 +352,7 @@ def test_a_locked_ledger_is_tried_once_for_a_stop_however_often_it_was_sent(
         line.bus.stop_all()
         line.bus._records.flush(60)
     flush(60)
-    assert 1 <= asked <= 2  # once for each drive's end at most; the thread may count both at once
+    assert 1 <= asked <= 2  # once when each drive's stop ends, or once for both
     assert "stops were not counted: " in caplog.text
     before, asked_before = len(line.written), asked
     line.bus.stop_all()
@@ -411,7 +416,7 @@ def _unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def running_family(monkeypatch: pytest.MonkeyPatch, family: str) -> tuple[SimulatedBus, Drive, MotorDrive]:
-    """Return a bus whose motor turns."""
+    """Return a simulated bus, its drive, and the simulation, whose motor turns."""
     line, drive, sim = one(monkeypatch, FAMILIES[family](1))
     sim.motor.acceleration_time = sim.motor.deceleration_time = 1.0
     drive.set_frequency(20)
@@ -423,7 +428,7 @@ def running_family(monkeypatch: pytest.MonkeyPatch, family: str) -> tuple[Simula
 
 
 def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int) -> None:
-    """Stop the motor again and again, with this failure at a later line each time until it is too late."""
+    """Stop the motor with this failure at every `step`-th line of the stop in turn; check that it stops."""
     for nth in count(1, step):
         line, drive, sim = running_family(monkeypatch, family)
         told = ""
@@ -438,17 +443,17 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
         sim.pass_time(line.seconds + 60)
         assert not sim.motor.energised, place
         assert not line.bus.stops_under_way(), place
-        line.bus.part()  # waits for no stop that is over
+        line.bus.part()  # does not wait, because the stop is over
     assert nth > 80
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # as a script ends
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # raised when the script ends
 @pytest.mark.usefixtures("_unbounded")
 @pytest.mark.parametrize("step", [37, pytest.param(11, marks=pytest.mark.long)])
 @pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
-def test_a_motor_stops_although_its_stop_failed_at_some_line(
+def test_a_motor_is_stopped_although_its_stop_fails_at_any_line(
     monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
 ) -> None:
-    """Steps are prime, so that loops are met in different places; 1 tries each line, in a quarter hour."""
+    """Steps are prime, so that they hit different lines of loops. Step 1 takes a quarter of an hour."""
     check_stops(monkeypatch, family, failure, step)

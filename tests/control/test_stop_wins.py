@@ -44,13 +44,13 @@ from multidrop.errors import BusError
 from multidrop.poller import Poller
 
 EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
-EXPIRY = 60.0  # s: a busy machine is slow
+EXPIRY = 60.0  # s; long, because a busy computer is slow
 DRIVES = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Signalled(Exception):
-    """A signal's effect that would have ended the process."""
+    """Raised by the signal handlers of the test, instead of ending the process."""
 
 
 def _signalled(number: int, frame: object) -> None:
@@ -58,9 +58,9 @@ def _signalled(number: int, frame: object) -> None:
 
 
 class Stops(RuleBasedStateMachine):
-    """One line of two drives of one family, and all that may happen to it.
+    """A state machine: one line with two drives of one family, and the rules that start and stop them.
 
-    An episode is what happens from one stop to the next.
+    An episode is the time from one stop to the next.
     """
 
     kind = ""
@@ -82,7 +82,7 @@ class Stops(RuleBasedStateMachine):
     # ---- the client ----
 
     def _open(self) -> None:
-        """A new client that has written its setpoints, and a mark on the wire."""
+        """Open a new client, write the setpoints, and put a mark on the wire."""
         self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
         self.drives = [
@@ -109,7 +109,7 @@ class Stops(RuleBasedStateMachine):
         self._mark()
 
     def _mark(self, drive: Drive | None = None) -> None:
-        """Start an episode: put a read on the wire behind all earlier frames."""
+        """Start an episode: send a read, which marks the end of all earlier frames in the log."""
         drive = drive or self.drives[0]
         self.line.troubles.clear()
         begun = len(self.line.log)
@@ -123,11 +123,11 @@ class Stops(RuleBasedStateMachine):
     def _close(self) -> None:
         (self.poller or self.bus).close()
 
-    # ---- what happens ----
+    # ---- rules ----
 
     @rule(troubles=st.lists(st.sampled_from(["mute", "deaf", "late", 1, 2, 3, 4, 6, 0x11, ""]), max_size=6))
     def have_trouble(self, troubles: list[str | int]) -> None:
-        """With the next requests."""
+        """Set the faults that happen to the next requests."""
         self.line.troubles[:] = troubles
 
     @precondition(lambda self: len(self.threads) < 3 and not self.staggered)
@@ -137,9 +137,9 @@ class Stops(RuleBasedStateMachine):
         after=st.integers(0, 12),
     )
     def start_and_hold(self, number: int, name: str, after: int) -> None:
-        """Start a motor in a thread; after `after` requests, replies are held until a stop is called.
+        """Start a motor in a thread; after `after` requests, hold replies until a stop is called.
 
-        A staggered start that fails is a stop too, and ends the starts of this episode.
+        A staggered start that fails also stops drives, so it ends the starts of this episode.
         """
         self.staggered = name == "staggered"
         self.line.hold(after)
@@ -161,7 +161,7 @@ class Stops(RuleBasedStateMachine):
         signals=st.lists(st.sampled_from(SIGNALS), min_size=1, max_size=2),
     )
     def stop(self, how: str, verbs: list[tuple[int, int]], signals: list[signal.Signals]) -> None:
-        """Call a stop, and release the held requests at that moment."""
+        """Call a stop, and release the held replies at that moment."""
         if how in ("leave", "signal") and not self.on_exit:
             how = "stop_all"
         stopped = {number for number, _ in verbs} if how == "verb" else set(range(DRIVES))
@@ -193,12 +193,12 @@ class Stops(RuleBasedStateMachine):
             self._mark()
 
     def _release(self) -> None:
-        """Wait a moment after the stop was called, which gives a wrong frame more time to appear."""
+        """Wait a moment, so that a wrong frame would have time to appear, and release the held replies."""
         time.sleep(0.005)
         self.far.release(self.line)
 
     def _signal(self, signals: list[signal.Signals]) -> None:
-        """The second one comes when the first one's stops are on the wire."""
+        """Raise the first signal; send the second one once stops of the first are on the wire."""
 
         def again() -> None:
             while not self._received("stops") and not over.is_set():
@@ -211,7 +211,7 @@ class Stops(RuleBasedStateMachine):
         try:
             second.start()
             signal.raise_signal(signals[0])
-            while True:  # it is held until the stops are over
+            while True:  # the signal's effect is delayed until the stops are over
                 time.sleep(0.01)
         except Signalled:
             over.set()
@@ -220,7 +220,7 @@ class Stops(RuleBasedStateMachine):
         second.join()
 
     def _is_deaf_to_signals(self) -> bool:
-        """The second one may come after the first one's effect."""
+        """Ignore further signals; return False if another signal arrived meanwhile."""
         try:
             for number in SIGNALS:
                 signal.signal(number, signal.SIG_IGN)
@@ -240,7 +240,8 @@ class Stops(RuleBasedStateMachine):
             self.bus.detach(self.drives[0])
         else:
             self._close()
-            releasing.join()  # a client cannot distinguish it from the reply to the request before
+            releasing.join()  # a held reply must not reach the next client, which could misattribute it
+
             self._open()
         self._mark(self.drives[1])
         for thread in (releasing, *self.threads):
@@ -270,21 +271,21 @@ class Stops(RuleBasedStateMachine):
         back = [each for each in self.line.log if each.connection == self.line.connection]
         assert [str(each) for each in back if each.what == "moves"] == []
         assert failures or not self.responders[0].runs
-        for drive in self.responders:  # there may have been no way to stop them
+        for drive in self.responders:  # resets them, because some may not have been stopped
             drive.switch_on()
         self._open()
 
     @precondition(lambda self: not self.threads and not self.polling)
     @rule(number=st.integers(0, DRIVES - 1))
     def start(self, number: int) -> None:
-        """After a stop a motor can be started again."""
+        """Check that after a stop a motor can be started again."""
         if self.responders[number].runs:
             return
         self.line.troubles.clear()
         self.drives[number].start()
         assert self.responders[number].runs
 
-    # ---- judging ----
+    # ---- checks ----
 
     def _thread(
         self, call: Callable[[], object], failures: list[BaseException] | None = None
@@ -303,7 +304,7 @@ class Stops(RuleBasedStateMachine):
         return thread
 
     def _received(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
-        """Return the places in the log of such frames of this episode, or from `begun` on."""
+        """Return the log's indices of frames of kind `what`, from `begun` or from the episode's start on."""
         begun = self.begun if begun is None else begun
         return [
             at
@@ -355,7 +356,7 @@ class Stops(RuleBasedStateMachine):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_nothing_moves_after_a_stop(kind: str) -> None:
+def test_no_call_from_before_a_stop_moves_a_motor_after_it(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
     run_state_machine_as_test(
         machine,
@@ -371,8 +372,8 @@ def test_nothing_moves_after_a_stop(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_a_stop_in_the_middle_of_a_start(kind: str) -> None:
-    """At each of its first exchanges: the machine's own steps, but none left to chance."""
+def test_a_stop_during_a_start_wins_at_each_of_its_first_exchanges(kind: str) -> None:
+    """The stop is called at each of the first exchanges of the start, with the machine's rules in order."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)
     try:
@@ -385,7 +386,7 @@ def test_a_stop_in_the_middle_of_a_start(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
-    """Otherwise the tests above would pass without any start."""
+    """Without this test, the tests above could pass although no start is ever sent."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)
     try:

@@ -1,4 +1,4 @@
-"""A stop wins against earlier calls, locked ledgers, hung logs and lines on which no drive answers."""
+"""A stop is sent despite earlier calls, locked ledgers, hung logs and lines on which no drive answers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
 }
 
 
-# Each family with two acts, and each act with two families; the rest takes long.
+# The short run has each family with two acts, and each act with two families.
 EACH_AND_EACH = [
     pytest.param(model, act, marks=pytest.mark.long if (number + nth) % 3 else ())
     for number, model in enumerate(MAKE)
@@ -62,7 +62,7 @@ EACH_AND_EACH = [
 def test_a_stop_at_any_frame_of_a_start_wins(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, act: str
 ) -> None:
-    """At every frame; a start that was sent is followed by the stop, and never reported as unsent."""
+    """A start that was sent is followed by the stop, and is never reported as unsent."""
     for frames in range(1, 100):
         line, drive, meanwhile, begun, failure = started_while(
             monkeypatch, tmp_path, model, frames, ACTS[act]
@@ -83,7 +83,7 @@ def test_a_stop_at_any_frame_of_a_start_wins(
 
 @pytest.mark.parametrize("verb_name", ["coast", "emergency_stop"])
 @every_family
-def test_coast_and_emergency_stop_win_too(
+def test_coast_and_emergency_stop_cancel_a_start_too(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, verb_name: str
 ) -> None:
     if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
@@ -120,7 +120,7 @@ def test_a_start_during_a_stop_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> N
     assert not sim.motor.energised
 
 
-def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_cancels_a_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     begun = len(line.frames)
@@ -134,8 +134,8 @@ def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     assert after == []
 
 
-def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also between two starts: the second one does not follow it."""
+def test_stop_all_cancels_a_staggered_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stop between two starts prevents the second start."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
     drives = [line.attach(sim.drive) for sim in sims]
@@ -153,7 +153,7 @@ def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPat
     assert not any(sim.motor.energised for sim in sims)
 
 
-def test_no_moving_call_is_sent_after_closing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_call_moves_a_motor_after_the_bus_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     line.bus.close()
@@ -170,21 +170,21 @@ def test_no_moving_call_is_sent_after_closing(monkeypatch: pytest.MonkeyPatch) -
     assert writes(line, begun) == []
 
 
-# ---- until it stands ----
+# ---- repeated until the motor stands ----
 
 
 @every_family
 @pytest.mark.parametrize("seconds", [None, 12.0])
-def test_the_stop_of_a_silent_drive_leaves_its_neighbours_more_than_half_of_the_line(
+def test_the_stop_of_a_silent_drive_leaves_others_more_than_half_of_the_line(
     monkeypatch: pytest.MonkeyPatch, model: str, seconds: float | None
 ) -> None:
-    """Except its first frames, which are not delayed; its total time stays the same."""
+    """Only the first frames of the stop are not delayed. The total time of the stop stays the same."""
     line, drive, _ = one(monkeypatch, MAKE[model](1))
     line.bus.check_identity(drive)
     sent: list[float] = []
 
     def note(request: Message) -> bool:
-        sent.append(line.seconds)  # its reply is waited for from now on
+        sent.append(line.seconds)  # time at which the wait for its reply starts
         return True
 
     line.deafens = note
@@ -223,7 +223,7 @@ def test_a_stop_ends_after_its_time_and_reports_its_progress(
     assert 100 <= line.seconds - begun < 102
     sent = len(writes(line))
     with pytest.raises(Unconfirmed):
-        drive.stop(seconds=0)  # once only
+        drive.stop(seconds=0)  # sent only once
     assert len(writes(line)) == sent + 1
 
 
@@ -232,7 +232,7 @@ SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5
 
 @pytest.mark.parametrize("seconds", SENSELESS, ids=map(repr, SENSELESS))
 @pytest.mark.parametrize("stops", ["stop", "coast", "stop_all"])
-def test_a_stop_with_an_invalid_time_is_sent_as_one_without(
+def test_an_invalid_stop_time_is_ignored_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stops: str, seconds: Any
 ) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
@@ -250,7 +250,9 @@ def test_a_stop_with_an_invalid_time_is_sent_as_one_without(
     assert "is not a time for a stop: it is repeated for 30 s at least, as without one" in caplog.text
 
 
-def test_a_stop_that_is_called_wrongly_is_sent_before_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_with_wrong_arguments_is_sent_before_type_error_is_raised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     stop: Any = drive.stop
     for wrong, options in (((5,), {}), ((), {"second": 5}), ((drive, 1), {"seconds": -1})):
@@ -267,7 +269,7 @@ def test_a_stop_that_is_called_wrongly_is_sent_before_it_says_so(monkeypatch: py
 
 
 class Patient(Own):
-    """One whose stop waits for as long as its ramp takes, whatever the drive says."""
+    """A drive whose stop always waits for the duration of its ramp before it reads."""
 
     model = "patient"
     title = "OWN 2"
@@ -280,7 +282,7 @@ class Patient(Own):
         yield from read(self.speed)
 
 
-def test_a_stops_waits_end_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
@@ -290,7 +292,7 @@ def test_a_stops_waits_end_with_its_time(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(line.written) == 1
 
 
-def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_stops_repeating_after_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
     line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
@@ -308,10 +310,10 @@ def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
     }
 
 
-def test_a_stop_that_waits_for_its_drive_delays_no_other(
+def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The other motor runs out and is read in the meantime."""
+    """The other motor ramps down and is read in the meantime."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
@@ -348,7 +350,7 @@ def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again(
 def test_only_later_writes_of_a_stop_wait_for_late_replies(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is confirmed thus on a line with late answers; the stops of others wait for no first write."""
+    """Waiting lets a stop be confirmed on a line with late replies, without delaying others' first writes."""
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
     carry_out, waits = line.carry_out, list[float]()
@@ -382,7 +384,7 @@ def test_the_repetition_and_the_end_of_a_stop_are_logged_once(
     assert ends[0].startswith("invt-che@1: stopped after 2")
 
 
-def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
+def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
@@ -424,7 +426,7 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
     line.bus.tended(tended)
     with pytest.raises(LineError):
         drive.read(drive.status)
-    opened.clear()  # a read opens it too
+    opened.clear()  # a read has reopened the port too
     with pytest.raises(LineError):
         drive.stop(seconds=1)
     drive.stop()
@@ -433,7 +435,7 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
     assert all(later - earlier >= 0.5 for earlier, later in pairwise(opened))
 
 
-def test_a_stop_on_a_port_that_was_closed_is_an_error_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_on_a_closed_port_raises_immediately(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
 
     def closed(request: Message) -> bytes | None:
@@ -467,13 +469,13 @@ def test_an_unwritable_ledger_prevents_no_stop(
 def test_a_stop_whose_reply_is_lost_is_sent_again_before_anything_is_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Although the value could be read back."""
+    """Although the value could be read back, the stop is sent again first."""
     line = SimulatedBus(monkeypatch, simulated(Own(1)))
     drive = line.attach(Own(1))
     lost: list[Message] = []
 
     def loses(request: Message) -> bool:
-        """The first two replies to a stop."""
+        """Lose the replies to the first two writes."""
         if is_write(request) and len(lost) < 2:
             lost.append(request)
         return is_write(request) and lost[-1] is request
@@ -482,11 +484,11 @@ def test_a_stop_whose_reply_is_lost_is_sent_again_before_anything_is_read(
     drive.stop()
     assert len(lost) == 2
     asked = [is_write(request) for request, _ in line.frames]
-    sent = asked.index(True)  # its identity is read before
+    sent = asked.index(True)  # reads of the identity come first
     assert asked[sent : sent + 3] == [True, True, True]
 
 
-def test_a_spent_budget_prevents_no_stop_and_it_is_counted(
+def test_a_stop_is_sent_and_counted_although_the_eeprom_budget_is_spent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
@@ -516,9 +518,9 @@ def test_a_write_cancelled_by_a_stop_is_not_counted(monkeypatch: pytest.MonkeyPa
     assert frames > 2
 
 
-def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_stops_other_drives_if_a_script_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken(Own):
-        """Its author made a mistake."""
+        """A drive whose stop fails before it sends anything."""
 
         @verb
         def stop(self) -> Script[None]:
@@ -527,7 +529,7 @@ def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.Monk
             yield
 
     class Breaks(Own):
-        """After its stop was sent."""
+        """A drive whose stop fails after it was sent."""
 
         @verb
         def stop(self) -> Script[None]:
@@ -560,7 +562,7 @@ def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: 
 
 
 class Hanging(logging.Handler):
-    """A handler whose disk hangs."""
+    """A log handler that hangs, as on a hung disk."""
 
     def __init__(self, hang: Callable[[], None]) -> None:
         super().__init__()
@@ -571,7 +573,7 @@ class Hanging(logging.Handler):
 
 
 def test_a_hung_log_prevents_no_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Nor does a locked ledger: one drive's records do not delay another's."""
+    """A locked ledger prevents no stop either, and one drive's records do not delay another drive's stop."""
     line = SimulatedBus(monkeypatch, *(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
     first, second = (line.attach(Own(address)) for address in (1, 2))
     hangs, released = threading.Event(), threading.Event()
@@ -602,7 +604,7 @@ def test_a_hung_log_prevents_no_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def noting(line: SimulatedBus) -> list[str]:
-    """Record the report at each request; a repeated text is recorded once."""
+    """Return a list that gets the texts of `stops_under_way` at each request, without repetitions."""
     told: list[str] = []
 
     def note(request: Message) -> bool:

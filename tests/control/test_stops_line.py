@@ -29,7 +29,7 @@ every_family = pytest.mark.parametrize("model", MAKE)
 
 
 class Delayed(LateWire):
-    """Every reply comes so late, and in order."""
+    """A wire that delays every reply by `delay` seconds."""
 
     delay = 0.0
 
@@ -50,14 +50,14 @@ def line(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests, Delayed]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", usually(*MAKE))
-def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
-    """Each answer comes after the next question: the look before the stop has another's."""
+def test_a_constantly_delayed_line_does_not_prevent_a_stop(model: str) -> None:
+    """Each reply arrives after the next request, so the read before the stop gets an earlier read's reply."""
     with line(model) as (_, drive, received, wire):
         received.sim.motor.run(1)
         wire.delay = 0.6
         with suppress(BusError):
             drive.read(next(register for register in drive.registers.values() if register.readable))
-        with suppress(Unconfirmed):  # whether the motor stands may never be seen
+        with suppress(Unconfirmed):  # the standstill may not be seen
             drive.stop(seconds=1)
         until(lambda: received.writes and not received.sim.motor.energised)
 
@@ -80,7 +80,7 @@ def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseExc
 def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
     monkeypatch: pytest.MonkeyPatch, ending: str, what: str
 ) -> None:
-    """Never as if nothing had been sent."""
+    """It is never reported as unsent."""
     monkeypatch.setattr(exchanges, "READ_ATTEMPTS", 1)
     with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)
@@ -110,8 +110,8 @@ def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
 
 
 @every_family
-def test_a_stop_of_another_thread_ends_a_start_that_is_waiting_in_its_looks(model: str) -> None:
-    """The start's look is not answered until the stop has been."""
+def test_a_stop_of_another_thread_cancels_a_start_that_waits_for_a_reply(model: str) -> None:
+    """The start's read is not answered until the stop was answered."""
     with line(model) as (_, drive, received, _):
         drive.set_frequency(20)
         looked, stopped = threading.Event(), threading.Event()
@@ -140,7 +140,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
         with pytest.raises(Unconfirmed, match="no reply"):
             drive.start()
         assert len(received.starts) == 1
-        assert received.sim.motor.energised  # the caller was told that it may be
+        assert received.sim.motor.energised  # as the error Unconfirmed said that it may
 
 
 @pytest.mark.long
@@ -212,12 +212,12 @@ class Pulled:
 def stands(drive: Any) -> bool:
     try:
         return bool(drive.state().condition is Condition.STOPPED)
-    except BusError:  # a busy machine may be late with the reply
+    except BusError:  # a busy computer may reply late
         return False
 
 
 @pytest.mark.parametrize("ending", ["close", "stop", "stop_all", "write"])
-def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
+def test_a_stop_reopens_a_lost_port(tmp_path: Path, ending: str) -> None:
     pulled = Pulled(tmp_path / "port")
     drive: Any = pulled.drive
     with ExitStack() as stack:
@@ -228,7 +228,7 @@ def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
         pulled.until_lost(bus)
         with pytest.raises(LineError):
             drive.state()
-        with pytest.raises(LineError):  # nobody opens it
+        with pytest.raises(LineError):  # while the adapter is unplugged
             bus.line.regain()
         with pulled.plugged_in():
             with pytest.raises(LineError):
@@ -250,10 +250,10 @@ def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
 
 
 @pytest.mark.parametrize("opener", ["the poller", "the stop"])
-def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
+def test_closing_a_poller_with_a_lost_port_stops_its_motors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opener: str
 ) -> None:
-    """Whoever opens it again."""
+    """Whether the poller or the stop reopens the port."""
     if opener == "the stop":
         monkeypatch.setattr(Reopening, "_attempt", lambda reopening: None)
     pulled = Pulled(tmp_path / "port")
@@ -275,11 +275,11 @@ def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
             monkeypatch.setattr(clock, "sleep", waits.append)
             with pytest.raises(LineError, match="it is closed"):
                 drive.stop()
-            assert sum(waits) == 0  # it never comes back
+            assert sum(waits) == 0  # no waits, because a closed port does not come back
 
 
 @pytest.mark.slow
-def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
+def test_other_commands_are_not_sent_while_a_stop_is_repeated() -> None:
     with line("invt-che") as (_, drive, received, _):
         drive.set_frequency(20)
         received.loses = lambda request: True
@@ -293,7 +293,7 @@ def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
 
 
 def test_an_unsent_stop_is_not_recorded_as_sent(tmp_path: Path) -> None:
-    """It is repeated while the poller, which opens the port again, has not done so."""
+    """The stop is repeated while it waits for the poller to reopen the port."""
     audit = tmp_path / "audit.jsonl"
     wire = Wire([simulated(MAKE["invt-che"](1))], unpaced=True)
     with Simulator([wire]), Bus(wire.path, audit=audit) as bus:

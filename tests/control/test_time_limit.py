@@ -36,7 +36,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 @pytest.fixture
 def line(monkeypatch: pytest.MonkeyPatch) -> SimulatedBus:
     found, _, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    found.bus.drives[0].set_frequency(10)  # its identity is known from then on
+    found.bus.drives[0].set_frequency(10)  # so that later calls need no identity check
     return found
 
 
@@ -49,7 +49,7 @@ def written(line: SimulatedBus) -> list[str]:
     return [text for request, text in line.frames if request.function in (5, 6, 15, 16)]
 
 
-def test_a_call_in_time_is_sent(line: SimulatedBus) -> None:
+def test_a_call_within_its_time_limit_is_sent(line: SimulatedBus) -> None:
     before = len(written(line))
     with within(line, 0.5):
         line.sleep(0.4)
@@ -58,8 +58,8 @@ def test_a_call_in_time_is_sent(line: SimulatedBus) -> None:
 
 
 @pytest.mark.parametrize("seconds", [0, 0.5, 0.9])
-def test_a_call_delayed_past_its_limit_is_not_sent(line: SimulatedBus, seconds: float) -> None:
-    """The bus alone would send it: it has a second from the call on."""
+def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, seconds: float) -> None:
+    """Without the limit it would be sent, because the bus's own expiry is 1 s."""
     before = len(written(line))
     with within(line, seconds):
         line.sleep(0.45)
@@ -70,9 +70,7 @@ def test_a_call_delayed_past_its_limit_is_not_sent(line: SimulatedBus, seconds: 
 
 
 @pytest.mark.parametrize("slept_before", [0, 3600])
-def test_the_machine_s_sleep_within_the_block_counts_and_no_other(
-    line: SimulatedBus, slept_before: float
-) -> None:
+def test_only_sleep_of_the_computer_within_the_block_counts(line: SimulatedBus, slept_before: float) -> None:
     line.slept += slept_before
     before = len(written(line))
     with within(line, 0.5):
@@ -84,7 +82,7 @@ def test_the_machine_s_sleep_within_the_block_counts_and_no_other(
 
 
 class Slow(Drive):
-    """A drive whose state is read for a long time before its start and in between."""
+    """A drive whose start waits `before` seconds before its first write, and `between` before its second."""
 
     model = "slow"
     title = "SLOW 1"
@@ -104,10 +102,10 @@ class Slow(Drive):
 
 
 @pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
-def test_no_verb_starts_after_the_limit_and_none_is_cut_off(
+def test_no_verb_starts_after_the_limit_but_a_started_verb_continues(
     monkeypatch: pytest.MonkeyPatch, before: float, between: float, sent: int
 ) -> None:
-    """A bus alone counts no time that a script waits by itself."""
+    """Unlike the limit, the bus's own expiry does not count the time that a script waits."""
     line = SimulatedBus(monkeypatch, simulated(Slow(1)))
     drive = line.bus.attach(Slow(1, confirmed=1))
     drive.before, drive.between = before, between
@@ -116,7 +114,7 @@ def test_no_verb_starts_after_the_limit_and_none_is_cut_off(
     assert len(written(line)) == sent
 
 
-def test_an_inner_limit_is_never_longer_and_ends_with_its_block(line: SimulatedBus) -> None:
+def test_an_inner_limit_cannot_extend_the_outer_one_and_ends_with_its_block(line: SimulatedBus) -> None:
     with within(line, 0.2), within(line, 60):
         line.sleep(0.3)
         with pytest.raises(Expired):
@@ -130,14 +128,14 @@ def test_a_shorter_expiry_of_the_bus_applies(line: SimulatedBus) -> None:
         line.bus.drives[0].set_frequency(20)
 
 
-def test_a_limit_that_is_not_a_number_is_past(line: SimulatedBus) -> None:
+def test_a_limit_that_returns_nan_expires_immediately(line: SimulatedBus) -> None:
     before = len(written(line))
     with written_before(lambda: float("nan")), pytest.raises(Expired):
         line.bus.drives[0].set_frequency(20)
     assert len(written(line)) == before
 
 
-def test_a_stop_is_sent_whenever_it_is(line: SimulatedBus) -> None:
+def test_a_stop_is_sent_after_the_time_limit(line: SimulatedBus) -> None:
     before = len(written(line))
     with within(line, 0):
         line.sleep(5)
@@ -145,13 +143,13 @@ def test_a_stop_is_sent_whenever_it_is(line: SimulatedBus) -> None:
     assert len(written(line)) > before
 
 
-def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBus) -> None:
-    """Whoever notes a stop before it is called, and looks at the note in `limit`, misses none."""
+def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus) -> None:
+    """So a `limit` that checks whether a stop was announced misses no stop."""
     drive = line.bus.drives[0]
     before = len(written(line))
 
     def limit() -> float:
-        drive.stop()  # at the latest moment
+        drive.stop()  # the latest possible moment for a stop to cancel the call
         return inf
 
     with written_before(limit), pytest.raises(CancelledByStop):
@@ -191,7 +189,7 @@ def check_not_sent(
 
 
 class Looking(Own):
-    """A drive whose start reads it twenty times."""
+    """A drive whose start reads twenty times before it writes."""
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
@@ -202,13 +200,13 @@ class Looking(Own):
 
 
 class Resting(Own):
-    """One that is given rests of five seconds."""
+    """A drive that needs 5 s between two requests."""
 
     least_interval = 5.0
 
 
 @pytest.mark.parametrize("model", MAKE)
-def test_a_start_delayed_in_its_checks_is_not_sent(
+def test_a_start_delayed_during_its_checks_is_not_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
 ) -> None:
     """The process is suspended at each read, as by Ctrl-Z."""
@@ -216,7 +214,7 @@ def test_a_start_delayed_in_its_checks_is_not_sent(
 
 
 @pytest.mark.parametrize("model", MAKE)
-def test_a_start_whose_machine_slept_is_not_sent(
+def test_a_start_is_not_sent_if_the_computer_slept_during_its_checks(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
 ) -> None:
     """CLOCK_MONOTONIC does not advance during sleep, so by that clock the start is not late."""
@@ -229,7 +227,7 @@ def test_a_start_whose_machine_slept_is_not_sent(
 
 def test_slow_reads_do_not_expire_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     class Sleepy(Own):
-        """It is waited for."""
+        """A drive whose start waits and reads twenty times."""
 
         @verb
         def start(self, direction: Direction | None = None) -> Script[None]:
@@ -245,10 +243,10 @@ def test_slow_reads_do_not_expire_a_start(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize(("more", "is_sent"), [(0.25, True), (0.35, False)])
-def test_reads_may_take_as_long_as_their_silences_and_characters(
+def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(
     monkeypatch: pytest.MonkeyPatch, more: float, is_sent: bool
 ) -> None:
-    """Twice the silence of 100 ms, and 64 characters, beside the time-out: twenty that take more are late."""
+    """A read may take its timeout, two silences of 100 ms and 64 characters; twenty longer reads are late."""
     line = SimulatedBus(monkeypatch, simulated(Looking(1)))
     drive = line.attach(Looking(1, confirmed=1, silence=0.1))
     line.bus.check_identity(drive)
@@ -262,7 +260,7 @@ def test_reads_may_take_as_long_as_their_silences_and_characters(
 
 
 @pytest.mark.parametrize(("waits", "is_sent"), [(5.9, True), (6.1, False)])
-def test_the_rest_of_a_drive_makes_no_write_late(
+def test_the_least_interval_of_a_drive_does_not_count_towards_expiry(
     monkeypatch: pytest.MonkeyPatch, waits: float, is_sent: bool
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Resting(1)))
@@ -284,7 +282,7 @@ def test_slow_writes_do_not_expire_a_verb(monkeypatch: pytest.MonkeyPatch) -> No
     before = len(writes(line))
     ramp(drive, 51, rate=0.5, every=1)
     assert len(writes(line)) - before == 100
-    assert 100 * EXCHANGE_TIME > 1.0  # the expiry of a call
+    assert 100 * EXCHANGE_TIME > 1.0  # so that one call's expiry would be exceeded
 
 
 @table("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])
@@ -317,14 +315,14 @@ with Bus(sys.argv[1], expiry=600) as bus:
 
 @pytest.mark.long
 @pytest.mark.parametrize("sleeps", [True, False])
-def test_a_start_is_not_sent_when_the_machine_wakes(tmp_path: Path, sleeps: bool) -> None:
+def test_a_start_is_not_sent_when_the_computer_wakes(tmp_path: Path, sleeps: bool) -> None:
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.deceleration_time = 0.2
     answer, begun, slept = sim.answer, tmp_path / "begun", tmp_path / "slept"
 
     def answer_and_sleep(request: Message, now: float) -> Message | None:
-        if sleeps and begun.exists():  # at the first look of the start
+        if sleeps and begun.exists():  # at the first read of the start
             slept.touch()
         return answer(request, now)
 

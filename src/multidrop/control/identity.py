@@ -106,7 +106,7 @@ class IdentityCheck:
         self._known: dict[Drive, _Confirmed] = {}  # confirmed drives
         self._stoppable: dict[
             Drive, tuple[object, set[float]]
-        ] = {}  # open port, and raw counts of stops allowed
+        ] = {}  # the port, and raw counts of allowed stops
         self._doubted: dict[Drive, tuple[object, str]] = {}  # the open port, and why it may be another make
         self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
 

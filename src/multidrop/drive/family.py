@@ -396,7 +396,7 @@ class Drive(RegisterAccess):
             raise NotVerified(self.name, what, f"the drive holds {register.format(held)}")
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Raise WriteForbidden if the drive's setpoint is unknown, 0, or differs from the one written last."""
+        """Raise WriteForbidden if the drive's setpoint is unknown, 0, or not the one written last."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
