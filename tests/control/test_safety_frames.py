@@ -69,7 +69,7 @@ def native(message: Message) -> bool:
 
 
 def yd(message: Message) -> bool:
-    """Return True for an allowed write: bits 4 and 5 are 0, bit 15 is 1, resets are alone, no panel setting."""
+    """Return True for an allowed write: bits 4 and 5 are 0, bit 15 is 1, resets are alone, no panel value."""
     if message.start == 0x1000:
         control = word(message)
         resets = control & 0x2000 and control & 0x0500

@@ -228,7 +228,7 @@ def test_parts_and_their_whole_word_may_share_an_address() -> None:
     assert [len(register.reach) for register in fan.registers.values()] == [1, 1, 1, 1]
 
 
-def test_all_mistakes_are_reported_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     mistakes = mistakes_in(
         speed=reading(1, "rpm", step=0),
         level=reading(0xFFFF, "m", number_format=NumberFormat.F32),

@@ -1,4 +1,4 @@
-"""Plants that are adopted while another one is polled, on a clock that the test sets."""
+"""`Poller.adopt`: another plant is adopted during polling, on a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def fans(every: float | None = 0.1) -> tuple[PolledDrive, ...]:
 
 
 def clocked(*lines: PlantLine) -> ClockedLines:
-    """A plant on wires of toys, and a wire to which no line goes yet."""
+    """Return a polled plant with simulated wires for its lines, and for lines that may be added later."""
     names = {*(each.name for each in lines), "hall", "yard", "roof"}
     return ClockedLines.of_lines({f"port of {name}": toys() for name in names}, plant(*lines))
 
@@ -96,18 +96,18 @@ OTHERS = (
 
 @pytest.mark.long
 @pytest.mark.parametrize("every", usually(None, 0.1, 0.08), ids=str)
-def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
-    """Its exchanges leave at the very nanoseconds at which they leave without any adoption."""
+def test_adopting_other_lines_does_not_shift_an_unchanged_line_s_requests(every: float | None) -> None:
+    """Its requests are sent at exactly the same times as without an adoption."""
 
     def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
         with clocked(hall(*pumps(every)), yard(*fans(every))) as made:
             rows = made.run(5)
             for others in OTHERS * 2:
-                if adopts:  # loaded again: its drives are other objects
+                if adopts:  # an equal plant with new drive objects
                     adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(*pumps(every)), *o)))
                 rows += made.run(1.7)
                 if adopts:
-                    made.finish(adopting)  # on a busy machine its thread may start after that time
+                    made.finish(adopting)  # its thread may start late on a busy computer
             rows += made.run(2)
         return [(row.monotonic_ns, row.register, row.status) for row in rows if row.drive.startswith("pump")]
 
@@ -117,7 +117,7 @@ def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
     assert beside[: len(alone)] == alone
 
 
-def test_unchanged_drives_stay_the_same_objects() -> None:
+def test_adopting_an_equal_plant_keeps_drive_objects_and_ports() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         before = made.poller.plant
@@ -159,7 +159,7 @@ def test_rates_and_registers_change_on_the_open_port() -> None:
 
 
 @pytest.mark.slow
-def test_drives_come_go_and_move_to_another_address() -> None:
+def test_adoption_adds_removes_and_readdresses_drives() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         stays = made.poller.bus("hall").drives[0]
@@ -181,7 +181,7 @@ def test_drives_come_go_and_move_to_another_address() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_becomes_one_of_another_family() -> None:
+def test_a_drive_can_change_to_another_family() -> None:
     drives = [InnovertIBD(7, name="pump"), InvtCHE(7, name="pump")]
     registers = [drive.readings()[:4] for drive in drives]
     wires = {"port of hall": wire(drives[0], Toy(1))}
@@ -218,7 +218,7 @@ def test_a_line_with_a_new_name_keeps_its_port() -> None:
 
 
 @pytest.mark.long
-def test_lines_come_and_go() -> None:
+def test_adoption_adds_and_removes_lines() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         assert made.poller.adopt(plant(yard(*fans()))) == {}
@@ -234,7 +234,7 @@ def test_lines_come_and_go() -> None:
         assert sorted(made.opened) == ["port of hall", "port of hall", "port of yard"]
 
 
-def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
+def test_every_slot_of_a_removed_line_has_a_row() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         rows = made.run(2.05)
         made.poller.remove_line("yard")
@@ -246,7 +246,7 @@ def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
 
 
 @pytest.mark.slow
-def test_one_line_is_added_and_removed() -> None:
+def test_a_line_is_added_polled_and_removed() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         made.poller.add_line(yard(*fans()))
@@ -266,7 +266,7 @@ def test_one_line_is_added_and_removed() -> None:
         }
 
 
-def test_all_lines_may_go_and_others_come() -> None:
+def test_all_lines_can_be_replaced_by_others() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         assert made.poller.adopt(plant()) == {}
@@ -277,7 +277,7 @@ def test_all_lines_may_go_and_others_come() -> None:
 
 
 @pytest.mark.slow
-def test_a_plant_is_adopted_before_the_polling_too() -> None:
+def test_a_plant_can_be_adopted_before_polling_starts() -> None:
     made = clocked(hall(*pumps()))
     made.poller.adopt(plant(hall(toy("pump-1", 1, 0.2)), yard(*fans())))
     with made:
@@ -289,7 +289,7 @@ def test_a_plant_is_adopted_before_the_polling_too() -> None:
 
 
 def calls_to_add_one_to(count: int) -> int:
-    """Return the calls in the adoption of so many lines and one more."""
+    """Return the number of function calls in `adoption` when one line is added to `count` lines."""
     lines = [hall(toy(f"pump-{number}", 1), name=f"hall-{number}") for number in range(count)]
     calls = 0
 
@@ -299,7 +299,7 @@ def calls_to_add_one_to(count: int) -> int:
 
     with clocked(*lines) as made:
         sys.setprofile(note)
-        threading.setprofile(note)  # of the thread that adopts
+        threading.setprofile(note)  # for the thread that adopts
         try:
             made.poller.adopt(plant(*lines, yard(*fans())))
         finally:
@@ -310,12 +310,12 @@ def calls_to_add_one_to(count: int) -> int:
 
 
 @pytest.mark.slow
-def test_a_line_is_compared_with_each_of_the_others_once() -> None:
+def test_the_cost_of_adding_a_line_grows_linearly_with_the_lines() -> None:
     assert calls_to_add_one_to(24) < 2 * calls_to_add_one_to(12)
 
 
 def test_learnt_timing_survives_a_reopened_port() -> None:
-    """A reply that is late may come on the port as it is opened next."""
+    """A late reply may still arrive after the port is reopened."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
         made.run(2)
@@ -330,8 +330,8 @@ def test_learnt_timing_survives_a_reopened_port() -> None:
         assert_rate(made.run(5), "pump-1", 5, 0.1)
 
 
-def test_a_drive_inherits_late_replies_of_the_one_before_at_its_address() -> None:
-    """Queued requests are carried out before the next drive comes, so that it inherits their late replies."""
+def test_a_drive_inherits_the_late_replies_due_at_its_address() -> None:
+    """Queued requests are sent before the next drive is added, which then knows of their late replies."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)
@@ -349,7 +349,7 @@ def test_a_drive_inherits_late_replies_of_the_one_before_at_its_address() -> Non
         assert new.late_until_ns == before.late_until_ns > 0
 
 
-# ---- ports that are not there ----
+# ---- ports that are absent ----
 
 
 @pytest.mark.slow
@@ -421,7 +421,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
 
 @pytest.mark.long
 @table("mistake", broken())
-def test_a_broken_plant_changes_nothing(mistake: str) -> None:
+def test_adopting_an_invalid_plant_changes_nothing(mistake: str) -> None:
     wrong, sentence = broken()[mistake]
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
@@ -437,14 +437,14 @@ def test_a_broken_plant_changes_nothing(mistake: str) -> None:
         assert sorted(made.opened) == ["port of hall", "port of yard"]
 
 
-def test_all_mistakes_are_reported_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     pump, _ = pumps()
     with clocked(hall(*pumps())) as made, pytest.raises(PlantError) as found:
         made.poller.adopt(plant(hall(pump, toy("pump-1", 1)), hall(toy("v", 3))))
     assert len(found.value.mistakes) == 4
 
 
-def test_a_name_that_no_port_can_have_changes_nothing() -> None:
+def test_adopting_an_invalid_port_name_changes_nothing() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         with pytest.raises(NoSuchPort, match="it needs a host and a port number"):
@@ -452,7 +452,7 @@ def test_a_name_that_no_port_can_have_changes_nothing() -> None:
         assert list(made.poller.buses) == ["hall"]
 
 
-def test_an_audit_log_that_cannot_be_opened_changes_nothing() -> None:
+def test_an_unopenable_audit_log_raises_and_changes_nothing() -> None:
     with clocked(hall(*pumps())) as made:
         made.poller._lines._audit = "/proc/none/audit"
         with pytest.raises(OSError, match="No such file"):
@@ -461,7 +461,7 @@ def test_an_audit_log_that_cannot_be_opened_changes_nothing() -> None:
         assert_rate(made.run(5), "pump-1", 5, 0.1)
 
 
-def test_another_poller_s_drives_are_left_to_it() -> None:
+def test_adopting_drives_of_another_open_poller_raises() -> None:
     with clocked(hall(*pumps())) as made:
         sentence = "it is on another bus: detach it there first, or make another"
         with clocked(hall(*pumps())) as other, pytest.raises(PlantError, match=sentence):
@@ -469,7 +469,7 @@ def test_another_poller_s_drives_are_left_to_it() -> None:
         assert list(made.poller.buses) == ["hall"]
 
 
-def test_more_names_than_a_batch_can_number() -> None:
+def test_adopting_more_names_than_a_batch_can_number_raises() -> None:
     with clocked(hall(*pumps())) as made:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
@@ -502,8 +502,8 @@ def test_adopt_rejects_other_types() -> None:
 # ---- batches ----
 
 
-def test_rows_of_a_reused_name_are_distinguished_by_time() -> None:
-    """Drives of two addresses, and of two lines, exchange their names; each has a value of its own."""
+def test_polled_since_distinguishes_rows_of_a_reused_name() -> None:
+    """Drives at different addresses and on different lines exchange names; each has its own value."""
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
 
     def named(*names: str) -> Plant:
@@ -554,7 +554,7 @@ def test_statistics_of_a_reused_name_start_at_zero() -> None:
 
 
 @pytest.mark.slow
-def test_a_name_s_code_stays_the_same() -> None:
+def test_a_name_keeps_its_code_in_all_batches() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         meant: dict[int, str] = {}
@@ -572,7 +572,7 @@ def test_a_name_s_code_stays_the_same() -> None:
         assert {"pump-1", "fan-1", "vent-1", "pump-2"} <= set(meant.values())
 
 
-# ---- for ever ----
+# ---- many adoptions ----
 
 
 @pytest.mark.long
@@ -610,8 +610,8 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
         assert all(now <= then + 2 for now, then in zip(after, before, strict=True)), (before, after)
 
 
-def test_joining_drives_are_polled_in_the_best_order() -> None:
-    """The order is that of a line polled with them from the start: settings are changed as seldom."""
+def test_joining_drives_are_polled_with_the_fewest_changes_of_settings() -> None:
+    """The order is the same as if they had been polled from the start, with as few changes of baud rate."""
 
     def drives() -> list[PolledDrive]:
         rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}

@@ -1,4 +1,4 @@
-"""Plants adopted during polling, on simulated lines: motors, calls, leftovers."""
+"""`Poller.adopt` during polling, on simulated lines: motors, pending calls and stops, memory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
 
 
 class Quick(Toy):
-    """Answers soon, if at all."""
+    """A drive with a short timeout."""
 
     response_timeout = 0.05
 
@@ -93,7 +93,7 @@ def runs(drive: SimulatedDrive) -> bool:
 # ---- motors ----
 
 
-def test_motors_go_on_when_their_line_goes(both: TwoLines) -> None:
+def test_motors_keep_running_when_their_line_is_removed(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.bus("yard").drives[0].start()
         poller.adopt(plant(both.hall()))
@@ -101,7 +101,7 @@ def test_motors_go_on_when_their_line_goes(both: TwoLines) -> None:
     assert runs(both.fans[1])
 
 
-def test_stop_on_exit_stops_drives_before_they_leave(both: TwoLines) -> None:
+def test_with_stop_on_exit_drives_are_stopped_before_their_removal(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for bus in poller.buses.values():
@@ -113,13 +113,13 @@ def test_stop_on_exit_stops_drives_before_they_leave(both: TwoLines) -> None:
         assert not runs(both.fans[1])
         assert not runs(both.fans[2])
         poller.adopt(plant(both.hall(1), both.yard()))
-        poller.bus("yard").drives[0].start()  # on a line that came since
+        poller.bus("yard").drives[0].start()  # on the line that was just added
     assert not runs(both.pumps[1])
     assert not runs(both.fans[1])
 
 
-def test_a_leaving_drive_is_not_started_after_its_stop(both: TwoLines) -> None:
-    """No later stop would reach it."""
+def test_a_leaving_drive_cannot_be_started_after_its_stop(both: TwoLines) -> None:
+    """No later stop would be sent to the leaving drive."""
     with Poller(plant(both.hall())) as poller:
         poller.stop_on_exit()
         bus = poller.bus("hall")
@@ -137,7 +137,7 @@ def test_a_leaving_drive_is_not_started_after_its_stop(both: TwoLines) -> None:
         assert not runs(both.pumps[2])
 
 
-def test_a_line_that_is_being_opened_has_its_drives_stopped_at_exit_too(
+def test_drives_of_a_line_that_is_still_opening_are_stopped_at_exit(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opening, go_on = threading.Event(), threading.Event()
@@ -162,7 +162,7 @@ def test_a_line_that_is_being_opened_has_its_drives_stopped_at_exit_too(
 
 
 class Other(Quick):
-    """Another family, whose start is the first family's stop."""
+    """A drive of another family, for which the first family's stop would be a start."""
 
     model = "other"
 
@@ -184,7 +184,7 @@ def test_a_drive_of_a_changed_family_gets_no_stop_of_the_old_family(both: TwoLin
         assert writes == []
         assert runs(both.pumps[1])
         assert runs(both.fans[1])
-    assert not runs(both.pumps[1])  # the new one's stop, at exit
+    assert not runs(both.pumps[1])  # stopped at exit by the stop of the new family
     assert not runs(both.fans[1])
 
 
@@ -198,15 +198,15 @@ def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
     vars(sim)["write"] = noted
 
 
-# ---- calls under way ----
+# ---- pending calls ----
 
 
 def _held_up(
     bus: Bus, monkeypatch: pytest.MonkeyPatch, of: Drive | None = None
 ) -> tuple[threading.Event, threading.Event]:
-    """Hold up each step of stops, of any drive or of this one.
+    """Block all steps of stops: of all drives, or only of the drive `of`.
 
-    Return an event for the first opening, and one that lets all continue.
+    Return an event that is set when the first step is blocked, and an event that ends the blocking.
     """
     begun, go_on = threading.Event(), threading.Event()
     step = bus._stopper.do
@@ -221,7 +221,7 @@ def _held_up(
     return begun, go_on
 
 
-def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_removing_a_line_waits_for_its_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         bus.drives[0].start()
@@ -247,7 +247,9 @@ def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pyt
         assert list(poller.buses) == ["hall"]
 
 
-def test_a_drive_leaves_beside_another_s_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_can_be_removed_during_another_drive_s_stop(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Poller(plant(both.hall())) as poller:
         pump_1, _ = poller.bus("hall").drives
         begun, go_on = _held_up(poller.bus("hall"), monkeypatch)
@@ -265,10 +267,10 @@ def test_a_drive_leaves_beside_another_s_stop(both: TwoLines, monkeypatch: pytes
         assert poller.bus("hall").drives == [pump_1]
 
 
-def test_drives_stay_attached_while_another_s_stop_is_awaited(
+def test_replaced_drives_stay_attached_until_all_stops_are_over(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both are exchanged for others of the same names: until then the old ones can be stopped."""
+    """Both drives are replaced by others with the same names; until then the old drives can be stopped."""
     exchanged = [polled(Quick(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
     with Poller(plant(both.hall())) as poller:
         bus = poller.bus("hall")
@@ -303,10 +305,10 @@ def test_drives_stay_attached_while_another_s_stop_is_awaited(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_circle", [False, True])
-def test_a_drive_is_on_its_line_until_the_next_one_may_have_its_name(
+def test_a_drive_stays_attached_until_another_line_releases_the_new_name(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
-    """Its motor can be stopped while a stop on another line, from which that name goes, is waited for."""
+    """Its motor can be stopped while the adoption waits for a stop on the line that has the name now."""
     hall, yard = both.hall(1), both.yard(1)
     names = ("fan-1", "pump-1" if is_circle else "fan-2")
     anew = [
@@ -345,7 +347,7 @@ def test_a_drive_is_on_its_line_until_the_next_one_may_have_its_name(
             until(lambda name=name: samples(poller, name) > 3)  # type: ignore[misc]
 
 
-def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
+def test_a_stop_on_a_leaving_line_does_not_delay_changes_of_other_lines(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
@@ -371,8 +373,8 @@ def test_a_stop_on_a_line_that_goes_holds_no_other_line_up(
         assert list(poller.buses) == ["hall"]
 
 
-def test_two_removals_of_a_line_remove_it_once(both: TwoLines) -> None:
-    """Two callers wait for its stops, and one of them removes it."""
+def test_two_concurrent_removals_remove_a_line_once(both: TwoLines) -> None:
+    """Two callers wait for the line's stops; only one of them removes the line."""
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         both_wait, part = threading.Barrier(2), bus.part
@@ -380,7 +382,7 @@ def test_two_removals_of_a_line_remove_it_once(both: TwoLines) -> None:
         def wait_and_part() -> None:
             with suppress(threading.BrokenBarrierError):
                 both_wait.wait(PATIENCE)
-            both_wait.abort()  # it is waited for once more when the line goes
+            both_wait.abort()  # the removal itself waits once more, alone
             part()
 
         vars(bus)["part"] = wait_and_part
@@ -408,7 +410,7 @@ def test_calls_on_removed_lines_and_drives_raise(both: TwoLines) -> None:
     assert not runs(both.fans[1])
 
 
-def test_a_read_that_waits_for_a_line_that_goes_fails(both: TwoLines) -> None:
+def test_a_pending_read_on_a_removed_line_raises(both: TwoLines) -> None:
     both.fans[1].deaf_until = float("inf")
     slow = polled(SlowToy(1, name="fan-1"), [], None)
     with Poller(plant(both.hall(), line(both.yard().port, slow, name="yard"))) as poller:
@@ -429,7 +431,7 @@ def test_a_read_that_waits_for_a_line_that_goes_fails(both: TwoLines) -> None:
 
 
 class SlowToy(Toy):
-    """Answers within a minute, or never."""
+    """A drive with a timeout of a minute."""
 
     response_timeout = 60.0
     response_delay = 15.0
@@ -468,8 +470,8 @@ def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.Monke
 # ---- the network ----
 
 
-def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All are requested before the first is made, and none sleeps when it is closed."""
+def test_connections_are_made_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All connections are requested before the first is made, and closing them takes no time."""
     with TwoLines("socket://127.0.0.1:0") as both:
         lines = both.hall(), both.yard()
         all_asked = threading.Barrier(2)
@@ -491,7 +493,7 @@ def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> N
             until_sampled(poller, "fan-1")
 
 
-def test_a_slow_port_delays_no_other_port(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_port_does_not_delay_other_ports(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     open_bus = Bus.__init__
 
@@ -519,7 +521,7 @@ def test_a_slow_port_delays_no_other_port(both: TwoLines, monkeypatch: pytest.Mo
     }
 
 
-def test_an_exchanged_drive_can_be_stopped_while_a_port_opens_slowly(
+def test_a_replaced_drive_can_be_stopped_while_a_port_opens_slowly(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opening, go_on = threading.Event(), threading.Event()
@@ -560,7 +562,7 @@ def until_sampled(poller: Poller, drive: str) -> None:
 
 
 class Dawdling(dict[object, object]):
-    """Lets other threads change it while a caller iterates over its values."""
+    """A dict that another thread changes while a caller iterates over its values."""
 
     def __init__(self, of: dict[object, object], change: Callable[[], object]) -> None:
         super().__init__(of)
@@ -579,7 +581,7 @@ class Dawdling(dict[object, object]):
 
 
 @pytest.mark.slow
-def test_a_summary_is_of_the_plant_before_or_after(both: TwoLines) -> None:
+def test_a_summary_during_an_adoption_shows_the_old_or_the_new_plant(both: TwoLines) -> None:
     with Poller(plant(both.hall())) as poller:
         (polled_line,) = poller._lines
         maker = polled_line._maker
@@ -589,13 +591,13 @@ def test_a_summary_is_of_the_plant_before_or_after(both: TwoLines) -> None:
         assert [drive.name for drive in poller.bus("hall").drives] == ["pump-1"]
 
 
-# ---- for ever ----
+# ---- many adoptions ----
 
 
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_hundred_adoptions_leave_no_leftovers(both: TwoLines) -> None:
-    """With threads that read by hand, look at statistics and take batches; every value is its own."""
+    """Other threads read drives, take statistics and batches; every value is of the right drive."""
     held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
     sims = [*both.pumps.values(), *both.fans.values()]
     for value, sim in zip(held_by.values(), sims, strict=True):
@@ -616,7 +618,7 @@ def test_a_hundred_adoptions_leave_no_leftovers(both: TwoLines) -> None:
             poller.summary(), poller.statistics(), poller.plant, repr(poller)
 
         def read_one() -> None:
-            with suppress(NoReply):  # on a busy machine
+            with suppress(NoReply):  # possible on a busy computer
                 pump.read(CURRENT)
 
         def read_all() -> None:

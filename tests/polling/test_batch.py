@@ -1,4 +1,4 @@
-"""Batches: read row by row or by iteration, and passed to users of Arrow."""
+"""Batches: read row by row, as columns, and by Arrow libraries."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from multidrop.polling.batch import Batch, Row
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 
-def test_rows_for_people() -> None:
+def test_a_batch_yields_its_rows_repeatedly() -> None:
     batch = example()
     assert len(batch) == 5
     assert list(batch) == EXAMPLE
-    assert list(batch) == EXAMPLE  # and again
+    assert list(batch) == EXAMPLE  # iterating again gives the same rows
 
 
-def test_empty_batch() -> None:
+def test_an_empty_batch_has_no_rows() -> None:
     batch = Batch(Columns(4), Names(["pump-1"]), Names())
     assert (len(batch), list(batch)) == (0, [])
     assert pa.record_batch(batch).num_rows == 0
 
 
 @pytest.mark.parametrize("places", [[], [0], [4, 1], [0, 1, 2, 3, 4], [2, 2] * 9])
-def test_some_of_its_rows(places: list[int]) -> None:
+def test_at_returns_the_rows_at_the_given_indices(places: list[int]) -> None:
     wanted = [EXAMPLE[place] for place in places]
     found = example().at(places)
     assert list(found) == wanted
     assert rows_of(pa.record_batch(found)) == wanted
 
 
-def test_pyarrow_takes_it() -> None:
+def test_pyarrow_reads_a_batch() -> None:
     found = pa.record_batch(example())
     found.validate(full=True)
     assert found.schema.equals(SCHEMA)
@@ -54,20 +54,20 @@ def test_pyarrow_takes_it() -> None:
 
 
 @pytest.mark.slow
-def test_pyarrow_takes_it_as_a_stream_and_its_schema_alone() -> None:
+def test_pyarrow_reads_a_batch_as_a_stream_and_its_schema() -> None:
     table = pa.table(example())
     assert table.schema.equals(SCHEMA)
     assert rows_of(table) == EXAMPLE
     assert pa.schema(example()).equals(SCHEMA)
 
 
-def test_capsules_stay_valid_when_the_batch_is_gone() -> None:
+def test_arrow_data_stays_valid_after_the_batch_is_deleted() -> None:
     kept = [pa.record_batch(counting(100, start)) for start in range(0, 2000, 100)]
     values = [row.value for part in kept for row in rows_of(part)]
     assert values == [None if at % 10 == 9 else at for at in range(2000)]
 
 
-def test_numbers_are_not_copied() -> None:
+def test_arrow_shares_the_batch_s_memory() -> None:
     columns = Columns(1)
     assert add_rows(columns, block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
     taken = pa.record_batch(Batch(columns, Names("a"), Names("b")))
@@ -76,7 +76,7 @@ def test_numbers_are_not_copied() -> None:
 
 
 @pytest.mark.slow
-def test_polars_takes_it() -> None:
+def test_polars_reads_a_batch() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = polars.DataFrame(example())
     assert frame.schema["time"] == polars.Datetime("ns", "UTC")
@@ -84,7 +84,7 @@ def test_polars_takes_it() -> None:
     assert [Row(*row) for row in frame.with_columns(time=times).iter_rows()] == EXAMPLE
 
 
-def test_pandas_takes_it() -> None:
+def test_pandas_reads_a_batch() -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     frame = pandas.DataFrame.from_arrow(example())
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
@@ -94,8 +94,8 @@ def test_pandas_takes_it() -> None:
     assert list(frame["value"].dropna()) == [49.99, 0.3]
 
 
-def test_pandas_by_pyarrow_has_the_same_times() -> None:
-    """This is the way before pandas 3.0."""
+def test_pandas_through_pyarrow_has_the_same_times() -> None:
+    """Before pandas 3.0, this was the only way to read a batch with pandas."""
     pytest.importorskip("pandas", reason="needs pandas")
     frame = pa.table(example()).to_pandas()
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
@@ -104,7 +104,7 @@ def test_pandas_by_pyarrow_has_the_same_times() -> None:
 
 @pytest.mark.parametrize("library", ["pandas", "numpy"])
 def test_a_consumer_without_time_types_gets_advice(library: str) -> None:
-    """pandas' constructor does not know Arrow's interface, and goes through rows one by one."""
+    """The constructors of pandas and NumPy ignore Arrow's interface and would read row by row."""
     taker = pytest.importorskip(library, reason=f"needs {library}")
     take = taker.DataFrame if library == "pandas" else taker.asarray
     with pytest.raises(TypeError, match=r"use batch\.to_pandas\(\)"):
@@ -112,7 +112,7 @@ def test_a_consumer_without_time_types_gets_advice(library: str) -> None:
     assert list(example()) == EXAMPLE
 
 
-def test_duckdb_takes_it() -> None:
+def test_duckdb_reads_a_batch() -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     batch = example()
     with duckdb.connect() as database:
@@ -123,7 +123,7 @@ def test_duckdb_takes_it() -> None:
     assert [Row(*row) for row in found] == EXAMPLE
 
 
-def test_numpy_takes_it_with_nan_for_misses() -> None:
+def test_numpy_reads_a_batch_with_nan_for_misses() -> None:
     numpy = pytest.importorskip("numpy", reason="needs NumPy")
     taken = nanoarrow.Array(example())
     values = taken.child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())
@@ -133,7 +133,7 @@ def test_numpy_takes_it_with_nan_for_misses() -> None:
     assert list(monotonic) == [row.monotonic_ns for row in EXAMPLE]
 
 
-def test_every_status_can_be_spelt() -> None:
+def test_every_status_code_has_its_text() -> None:
     columns = Columns(300)
     for reason in Status:
         if reason is not Status.OK:
@@ -148,7 +148,7 @@ def test_every_status_can_be_spelt() -> None:
     assert all(statuses)
 
 
-# ---- columns as they lie in memory ----
+# ---- columns as memoryviews ----
 
 
 def test_columns_have_the_rows_and_the_names_of_their_codes() -> None:
@@ -166,7 +166,7 @@ def test_columns_have_the_rows_and_the_names_of_their_codes() -> None:
     assert bytes(columns.valid) == bytes([sum(1 << at for at in samples)])
 
 
-def test_columns_have_the_types_that_are_promised() -> None:
+def test_columns_have_the_documented_types() -> None:
     columns = counting(20).columns()
     formats = {"time": "q", "monotonic_ns": "q", "uncertainty_ns": "q", "value": "d"}
     formats |= dict.fromkeys(("drive", "register", "status"), "H") | {"valid": "B"}
@@ -192,7 +192,7 @@ def test_columns_outlive_their_batch() -> None:
     assert [list(view) for view in kept] == [[at] for at in range(200)]
 
 
-def test_names_that_come_later_leave_the_codes_as_they_were() -> None:
+def test_later_names_do_not_change_earlier_codes() -> None:
     names = Names(["a"])
     first = Batch(Columns(1), names, names).columns()
     assert names.number("b") == 1
@@ -219,7 +219,7 @@ def test_a_for_loop_gets_batches_until_the_poller_is_closed(poller: Poller) -> N
     assert rows > 50
 
 
-async def test_an_async_loop_gets_every_row_also_beside_a_cancelled_one(poller: Poller) -> None:
+async def test_an_async_loop_gets_every_row_after_another_loop_was_cancelled(poller: Poller) -> None:
     found: list[Row] = []
 
     async def collect() -> None:
@@ -258,7 +258,7 @@ def test_a_drive_is_added_with_names_of_its_registers(poller: Poller) -> None:
     assert any(row.drive == "fan" for batch in poller.batches(0.5) for row in batch)
 
 
-def test_a_plant_of_keyword_arguments() -> None:
+def test_a_plant_can_be_built_without_a_file() -> None:
     fan = Toy(2, name="fan")
     made = Plant([PlantLine("hall", "/dev/ttyUSB0", drives=[PolledDrive(fan, every=0.5)])])
     assert made == Plant(

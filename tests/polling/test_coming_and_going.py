@@ -1,4 +1,4 @@
-"""Drives that join and leave a running poller, and a bus."""
+"""Drives that are added to and removed from a running poller, and a bus."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 ROOT = Path(__file__).parents[2]
 CURRENT = Toy.registers["output_current"]
 EVERY_S = 0.02
-QUEUED = round(AHEAD_NS / 1e9 / EVERY_S) + 2  # at most, of one drive when another is removed
+QUEUED = round(AHEAD_NS / 1e9 / EVERY_S) + 2  # limit of queued requests of one drive
 
 
 def pump(address: int, name: str = "", every: float | None = None) -> PolledDrive:
@@ -34,13 +34,13 @@ def pump(address: int, name: str = "", every: float | None = None) -> PolledDriv
 
 @pytest.fixture
 def port() -> Iterator[str]:
-    """A line on which the addresses 1 and 2 answer."""
+    """Return the port of a line on which the addresses 1 and 2 answer."""
     with Simulator([Wire([EncodedDrive(Toy(1)), EncodedDrive(Toy(2))], unpaced=True)]) as sim:
         yield sim.wires[0].path
 
 
 class Seen:
-    """A poller's rows so far, by drive."""
+    """Collects a poller's rows, by drive."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
@@ -60,7 +60,7 @@ class Seen:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [None, EVERY_S])
-def test_a_drive_is_added_and_removed_while_the_others_are_polled(port: str, every: float | None) -> None:
+def test_a_drive_is_added_and_removed_while_others_are_polled(port: str, every: float | None) -> None:
     second = pump(2, every=every)
     with Poller(plant(line(port, pump(1, every=every)))) as poller:
         seen = Seen(poller)
@@ -73,14 +73,14 @@ def test_a_drive_is_added_and_removed_while_the_others_are_polled(port: str, eve
             assert "pump-2" not in poller.summary()["lines"]["line"]["drives"]
             first = len(seen.of("pump-1"))
             until(lambda first=first: len(seen.of("pump-1")) > first + QUEUED)
-            settled_ns = time.monotonic_ns()  # rows of before may still come
+            settled_ns = time.monotonic_ns()  # rows of earlier requests may still arrive
             until(lambda first=first: len(seen.of("pump-1")) > first + 2 * QUEUED)
             assert seen.last_asked_ns["pump-2"] < settled_ns
     assert {*seen.of("pump-1")} == {proof(Toy(1), CURRENT)}
     assert {*seen.of("pump-2")} == {proof(Toy(2), CURRENT)}
 
 
-def test_a_line_may_be_left_by_all_and_joined_again(port: str) -> None:
+def test_polling_continues_after_all_drives_left_and_one_was_added(port: str) -> None:
     first = pump(1)
     with Poller(plant(line(port, first))) as poller:
         seen = Seen(poller)
@@ -93,7 +93,7 @@ def test_a_line_may_be_left_by_all_and_joined_again(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_silent_drive_that_leaves_takes_its_rest_along(port: str) -> None:
+def test_removing_a_silent_drive_does_not_disturb_the_others(port: str) -> None:
     with Poller(plant(line(port, pump(1), pump(3, "dead")))) as poller:
         seen = Seen(poller)
         until(lambda: "not asked: drive is silent" in (seen.of("dead") and ()) or len(seen.statuses) > 1)
@@ -126,7 +126,7 @@ def test_an_unpolled_drive_does_not_disturb_others(port: str) -> None:
         assert seen.of("pump-3") == []
 
 
-def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
+def test_calls_of_a_detached_drive_raise_and_send_nothing(port: str) -> None:
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
         assert ours.read(CURRENT) == proof(Toy(1), CURRENT)
@@ -138,12 +138,12 @@ def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
             with pytest.raises(ValueError, match="pump-1 is not attached to this bus"):
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
-        assert bus.peer(again) is peer  # which knows of answers that may come late
+        assert bus.peer(again) is peer  # the peer knows of late replies
         assert peer.proofs is proofs  # the core may be reading one of them
 
 
 @pytest.mark.slow
-def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: str) -> None:
+def test_a_drive_attached_at_a_used_address_expects_late_replies(port: str) -> None:
     with Bus(port) as bus:
         gone = bus.attach(Toy, address=9)
         with pytest.raises(NoReply):
@@ -155,7 +155,7 @@ def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: s
         assert bus.peer(new).late_until_ns == due_ns
 
 
-def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_drive_is_detached_during_stop_all(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
         begun, go_on = threading.Event(), threading.Event()
@@ -183,8 +183,8 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_many_threads_do_all_of_it_at_once() -> None:
-    """A short run of the program that takes ten minutes with 64 lines."""
+def test_many_threads_can_read_poll_and_change_lines_concurrently() -> None:
+    """A short run of the benchmark many_at_once, which normally takes ten minutes with 64 lines."""
     program = [
         sys.executable,
         "-m",
@@ -200,7 +200,7 @@ def test_many_threads_do_all_of_it_at_once() -> None:
 
 
 def test_statistics_can_be_read_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader does not fail when a drive leaves during its read."""
+    """Reading statistics does not fail if a drive is removed meanwhile."""
     with Bus(port) as bus:
         ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
         counters = bus.peer(ours[0]).counters
@@ -232,7 +232,7 @@ poll = ["output_frequency"]
 
 
 @pytest.mark.slow
-def test_an_added_drive_is_polled_beside_the_others(tmp_path: Path) -> None:
+def test_a_drive_attached_to_the_bus_can_also_be_polled(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     with Simulator([Wire([simulated(YD1000(1)), simulated(YD1000(9))])]) as simulator:
         path.write_text(PLANT.format(port=simulator.wires[0].path))

@@ -31,11 +31,11 @@ CURRENT = Toy.registers["output_current"]
 
 
 class Ill(Exception):
-    """Raised by code under test."""
+    """The exception that tests inject."""
 
 
 class Two:
-    """A poller of two lines, each with a drive of the line's name, and its rows."""
+    """A poller of two lines, "ill" and "well", each with a drive of the same name."""
 
     def __init__(self, simulator: Simulator, every: float | None) -> None:
         drives = (Toy(1, name="ill"), Toy(1, name="well"))
@@ -66,7 +66,7 @@ class Two:
         return found
 
     def fails(self, *details: object) -> None:
-        """Fail in place of a method of the line "ill"."""
+        """Raise Ill, in place of a method of the line "ill"."""
         raise Ill("of this line")
 
 
@@ -88,12 +88,12 @@ def _retried_soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def of_line(name: str, method: Callable[..., Any], failure: BaseException) -> Callable[..., Any]:
-    """Return the method, which fails for the parts of this line."""
+    """Return `method`, changed so that it raises `failure` for objects of this line."""
 
     def act(self: Any, *details: Any, **more: Any) -> Any:
         drives = getattr(self, "_present", None) or {job.owner for job in self._schedule.jobs}
         if any(drive.name == name for drive in drives):
-            raise type(failure)(*failure.args)  # another one: each raising adds to its traceback
+            raise type(failure)(*failure.args)  # a new exception, because raising adds to its traceback
         return method(self, *details, **more)
 
     return act
@@ -109,7 +109,7 @@ def of_line(name: str, method: Callable[..., Any], failure: BaseException) -> Ca
     ],
 )
 @pytest.mark.parametrize("failure", [Ill("of this line"), MemoryError(), SystemExit(1)], ids=repr)
-def test_a_failure_on_one_line_is_that_lines_alone(
+def test_a_failure_on_one_line_does_not_affect_other_lines(
     two: Two,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -117,7 +117,7 @@ def test_a_failure_on_one_line_is_that_lines_alone(
     method: str,
     failure: BaseException,
 ) -> None:
-    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # only looks before the retry make misses
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # misses are only added until the retry
         monkeypatch.setattr(polled_line, name, 400_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
@@ -134,7 +134,9 @@ def test_a_failure_on_one_line_is_that_lines_alone(
     assert two.poller.failure is None
 
 
-def test_a_line_that_failed_is_sound_again_after_a_while(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_without_further_failures_is_no_longer_listed_as_failing(
+    two: Two, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(PortQueue, "keep_busy", of_line("ill", PortQueue.keep_busy, Ill()))
         two.until(("ill", FAILED))
@@ -158,7 +160,7 @@ def test_a_failing_line_is_retried_at_growing_intervals(
 def test_requests_queued_when_a_line_failed_are_carried_out(
     two: Two, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A failure right after requests were queued: their number is not known to the poller."""
+    """If it fails right after queueing requests, the poller does not know how many are queued."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
 
@@ -201,24 +203,24 @@ def test_a_brief_lack_of_memory_does_not_end_polling(two: Two, monkeypatch: pyte
 
 @pytest.fixture
 def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
-    """A poller whose own thread fails for good."""
+    """A poller whose thread has ended with a failure."""
     two.until(("ill", "ok"), ("well", "ok"))
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     monkeypatch.setattr(RowQueue, "await_calls", two.fails)
     two.poller._call_thread()
     until(lambda: two.poller.failure and not two.poller._thread.is_alive())
     flush(PATIENCE)
-    two.poller._is_failure_raised = True  # of the fixture's own end
+    two.poller._is_failure_raised = True  # so that closing it in the fixture does not raise
     return two
 
 
-def test_a_poller_that_failed_says_so_wherever_it_is_asked(
+def test_every_call_of_a_failed_poller_raises_polling_failed(
     failed: Two, caplog: pytest.LogCaptureFixture
 ) -> None:
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
-    with pytest.raises(PollingFailed) as raised:  # the rows that wait come first
+    with pytest.raises(PollingFailed) as raised:  # after the rows that are still queued
         rows.extend(row for batch in poller.batches() for row in batch)
     assert rows
     assert isinstance(raised.value.__cause__, Ill)
@@ -237,11 +239,13 @@ def test_a_poller_that_failed_says_so_wherever_it_is_asked(
 
 
 @patient
-def test_a_poller_that_failed_polls_nothing_more_and_commands_go_on(failed: Two) -> None:
+def test_a_failed_poller_stops_polling_but_sends_commands(failed: Two) -> None:
     exchanges = failed.poller.statistics()["ill"].counters.exchanges
     bus = failed.poller.bus("ill")
     bus.drives[0].read(CURRENT)
-    assert failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2  # one was under way
+    assert (
+        failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2
+    )  # the read, and one in flight
 
 
 def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,7 +269,7 @@ def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.M
 # ---- the other threads ----
 
 
-def test_a_failure_as_a_port_is_opened_again_is_logged_and_tried_again(
+def test_a_failed_reopening_of_a_port_is_logged_and_retried(
     two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(polled_line, "REOPEN_NS", 10_000_000)
@@ -286,7 +290,7 @@ def test_a_failure_as_a_port_is_opened_again_is_logged_and_tried_again(
     assert "not opened again\nTraceback" in caplog.text
 
 
-def test_a_library_that_fails_in_its_own_way_is_a_lost_port(
+def test_an_unexpected_exception_from_pyserial_counts_as_a_lost_port(
     two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(polled_line, "REOPEN_NS", 10_000_000)
@@ -299,7 +303,7 @@ def test_a_library_that_fails_in_its_own_way_is_a_lost_port(
 
 
 @pytest.mark.parametrize("method", ["_take", "_hand_over"])
-def test_a_bridge_that_fails_is_a_lost_port(
+def test_a_failed_bridge_counts_as_a_lost_port(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
 ) -> None:
     port = serial.serial_for_url("loop://", timeout=0)
@@ -315,7 +319,9 @@ def test_a_bridge_that_fails_is_a_lost_port(
     until(lambda: "of the bridge" in caplog.text)
 
 
-def test_a_log_handler_that_exits_ends_no_log(two: Two, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_log_handler_that_raises_system_exit_does_not_end_logging(
+    two: Two, caplog: pytest.LogCaptureFixture
+) -> None:
     class Exiting(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             raise SystemExit
@@ -336,7 +342,7 @@ def test_a_log_handler_that_exits_ends_no_log(two: Two, caplog: pytest.LogCaptur
 
 
 async def wait(batch: object) -> None:
-    """A call would return without running it."""
+    """Do nothing: a call only creates a coroutine."""
 
 
 def give(batch: object) -> Iterator[object]:
@@ -349,13 +355,13 @@ async def give_later(batch: object) -> Any:
 
 class Waiting:
     async def __call__(self, batch: object) -> None:
-        """The same as an object."""
+        """Do nothing, like `wait`."""
 
 
 @pytest.mark.parametrize(
     "function", [wait, give, give_later, Waiting(), partial(wait), partial(partial(give))]
 )
-def test_a_function_that_a_call_does_not_carry_out_is_refused(two: Two, function: Any) -> None:
+def test_on_batch_rejects_async_and_generator_functions(two: Two, function: Any) -> None:
     with pytest.raises(TypeError, match="is async or a generator: a call would not run it"):
         two.poller.on_batch(function)
 
@@ -372,8 +378,10 @@ def test_a_wrapped_async_callback_fails_with_its_first_batch(
         two.poller.close()
 
 
-def test_own_classes_may_fail_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A user's class whose method fails only once it is polled."""
+def test_a_user_s_class_that_fails_during_polling_only_affects_its_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A user's class may work when the poller is made, and fail during polling."""
     failing = threading.Event()
 
     class Own(Toy):
@@ -386,7 +394,7 @@ def test_own_classes_may_fail_later(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert issubclass(Own, Drive)
     monkeypatch.setattr(polled_line, "LEARN_NS", 10_000_000)
-    monkeypatch.setattr(polled_line, "MARGIN", -1.0)  # planned again at each look
+    monkeypatch.setattr(polled_line, "MARGIN", -1.0)  # plan again at each update of delays
     with Simulator([Wire([simulated(Toy(1))], unpaced=True) for _ in range(2)]) as simulator:
         ill, well = (wire.path for wire in simulator.wires)
         poller = Poller(

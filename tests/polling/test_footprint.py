@@ -30,6 +30,6 @@ print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1
 @pytest.mark.uncounted
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel tells the memory")
-def test_a_poller_of_31_drives_that_records_takes_30_mb() -> None:
+def test_a_recording_poller_of_31_drives_takes_at_most_30_mb() -> None:
     ran = subprocess.run([sys.executable, "-c", POLLER], capture_output=True, text=True, check=True)
     assert 5.0 < int(ran.stdout) / 1024 <= MOST_MB

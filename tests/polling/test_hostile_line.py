@@ -1,6 +1,6 @@
 """Every fault on a line of every family: no misattribution, a reason for every miss, and recovery.
 
-On the test's own clock, so that a seed reproduces its run. For hours, with new seeds:
+The tests run on a simulated clock, so that a seed reproduces its run. To run for hours, with new seeds:
 `HOSTILE_HOURS=2 pytest -m '' tests/polling/test_hostile_line.py -k hours`.
 """
 
@@ -56,7 +56,7 @@ def resident_kb() -> int:
     return pages * os.sysconf("SC_PAGESIZE") // 1024
 
 
-# One line for each fault, and one fault or two for each line; the rest takes long.
+# The short run has one line for each fault, and one or two faults for each line.
 EACH_ON_EACH = [
     pytest.param(name, kind, marks=pytest.mark.long if (number + nth) % 8 else ())
     for number, name in enumerate(LINES)
@@ -66,7 +66,7 @@ EACH_ON_EACH = [
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "kind"), EACH_ON_EACH)
-def test_a_fault_and_its_end(name: str, kind: str) -> None:
+def test_polling_recovers_from_each_fault_without_misattributed_values(name: str, kind: str) -> None:
     number = LINES[name]
     before = descriptors(), threads()
     story = Story(of_one_variant(number))
@@ -77,11 +77,11 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
 
 @pytest.mark.long
 @table("name", LINES)
-def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
+def test_a_permanent_echo_is_detected_and_removed(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
     with story.clocked:
-        begun = len(story.run(2))  # each drive's first value is read again
+        begun = len(story.run(2))  # without the first two seconds, in which each first value is read twice
         story.run(HEALTHY)
     story.rows += rows_of(story.clocked.poller)
     story.judge()
@@ -91,8 +91,8 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
 @pytest.mark.slow
 @table("echo", [0, 1], ids=["no echo", "an echo"])
 @table("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
-def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) -> None:
-    """The polled register alone may have the value that its request contains."""
+def test_a_delixi_reply_equal_to_its_request_is_not_taken_for_an_echo(register: str, echo: int) -> None:
+    """In Delixi's protocol, a reply with the value 0 equals its request; it must not count as an echo."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [drive.register(register)])
     with ClockedLines(ClockedWire([simulated(drive)], Faults(echo=echo)), [asked]) as clocked:
@@ -101,8 +101,8 @@ def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) ->
     assert {(row.value == 0, row.status) for row in rows} == {(register == "output_frequency", "ok")}
 
 
-def test_a_delixi_drive_that_falls_silent_behind_a_new_echo_does_not_read_0_for_long() -> None:
-    """A cut pair may do both at once: after two values of 0 an echo probe follows."""
+def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
+    """A broken wire may cause both. After two values of 0, a probe checks whether the adapter echoes."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [DelixiNative.output_frequency, DelixiNative.output_current])
     wire = ClockedWire([simulated(drive)], Faults())
@@ -111,7 +111,7 @@ def test_a_delixi_drive_that_falls_silent_behind_a_new_echo_does_not_read_0_for_
         assert {(row.value, row.status) for row in rows} == {(0, "ok")}
         wire.faults = Faults(echo=1)
         wire.drives[0].deaf_until = inf
-        deaf_ns = clocked.now  # a reply may be on its way
+        deaf_ns = clocked.now  # one reply may still be in flight
         rows = clocked.run(HEALTHY)
     assert len(rows) > 4
     assert sum(row.status == "ok" and row.monotonic_ns >= deaf_ns for row in rows) <= 2
@@ -120,22 +120,25 @@ def test_a_delixi_drive_that_falls_silent_behind_a_new_echo_does_not_read_0_for_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
-    """Without rates the core polls without the poller's thread until a fault."""
+def test_polling_recovers_from_a_fault_while_the_core_repeats_the_cycle(kind: str) -> None:
+    """Without rates the core repeats the bus cycle by itself until a fault occurs."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
     story.run_with_fault(KINDS[kind])
     assert story.wire.struck.total()
 
 
 def all_lines() -> Iterator[list[Drive]]:
-    """Each variant alone, and all on one line."""
+    """Yield the drives of each variant alone, and then all variants on one line."""
     yield from map(of_one_variant, LINES.values())
     yield of_all_variants()
 
 
 @pytest.mark.long
-def test_nothing_grows_for_hours() -> None:
-    """All families on one line; given hours, each alone too, with all kinds of faults in turn."""
+def test_resources_do_not_grow_over_hours_of_faults() -> None:
+    """Memory, descriptors and threads stay constant on a line with all families.
+
+    With HOSTILE_HOURS, each variant is also polled alone, with all kinds of faults in turn.
+    """
     hours = float(os.environ.get("HOSTILE_HOURS", "0"))
     end = time.monotonic() + 3600 * hours
     seen: list[tuple[int, int, int]] = []

@@ -1,4 +1,4 @@
-"""Whatever interrupts the opening or closing of a bus, poller or simulator: closing again finishes the job.
+"""A bus, poller or simulator whose opening or closing was interrupted is closed completely by a second close.
 
 KeyboardInterrupt is raised before each bytecode of the main thread in turn, in the package's own files. This
 is harsher than a signal handler, which runs only between some bytecodes.
@@ -25,16 +25,16 @@ from toy import Toy
 from multidrop import Bus, Poller
 from multidrop.sim import EncodedDrive, Simulator, Wire, simulated
 
-# A garbage collection finalizes leftovers of earlier interruptions, and may be interrupted itself.
+# The warnings come from garbage collections, which may be interrupted too.
 pytestmark = [patient, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
 
 CURRENT = Toy.registers["output_current"]
-STRIDE = 31  # bytecodes from one interruption to the next, unless all are wanted
+STRIDE = 31  # number of bytecodes between interruptions, except in the complete run
 
 
 @dataclass
 class Received:
-    """A simulated line, and how many requests came."""
+    """A simulated line, with the path of its port and a drive that counts requests."""
 
     path: str
     drive: Counting
@@ -71,7 +71,7 @@ def made(hall: Received) -> Poller:
 
 
 def ended(poller: Poller, hall: Received) -> None:
-    """Close again, and check for leftovers."""
+    """Close the poller again; check that buses are closed, requests have ended, and the port is free."""
     poller.close()
     assert not any(bus.is_open for bus in poller.buses.values())
     falls_silent(hall)
@@ -84,7 +84,7 @@ STEPS = [STRIDE, pytest.param(1, marks=pytest.mark.slow)]
 
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("end", ["close", "__exit__"])
-def test_a_poller_is_closed_though_its_closing_is_interrupted(hall: Received, step: int, end: str) -> None:
+def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step: int, end: str) -> None:
     places: set[str] = set()
 
     def act(nth: int) -> bool:
@@ -101,7 +101,7 @@ def test_a_poller_is_closed_though_its_closing_is_interrupted(hall: Received, st
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_a_poller_interrupted_at_its_start_is_closed(hall: Received, step: int) -> None:
+def test_a_poller_interrupted_at_its_start_can_be_closed(hall: Received, step: int) -> None:
     places: set[str] = set()
 
     def act(nth: int) -> bool:
@@ -116,7 +116,7 @@ def test_a_poller_interrupted_at_its_start_is_closed(hall: Received, step: int) 
 
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("deed", ["take", "adopt", "set_rate"])
-def test_a_poller_is_closed_whatever_was_interrupted(hall: Received, step: int, deed: str) -> None:
+def test_a_poller_can_be_closed_after_any_interrupted_call(hall: Received, step: int, deed: str) -> None:
     def adopt(nth: int) -> None:
         poller.adopt(plant(line(hall.path, polled(Toy(1, name=f"pump-{nth}"), [CURRENT]))))
 
@@ -132,11 +132,11 @@ def test_a_poller_is_closed_whatever_was_interrupted(hall: Received, step: int, 
 
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("deed", ["open", "close"])
-def test_a_bus_is_closed_though_that_is_interrupted(hall: Received, step: int, deed: str) -> None:
+def test_a_bus_can_be_closed_after_an_interrupted_open_or_close(hall: Received, step: int, deed: str) -> None:
     def act(nth: int) -> bool:
         if deed == "open":
             was = interrupted(lambda: Bus(hall.path), nth, set())
-            gc.collect()  # one that was interrupted on its way to its owner
+            gc.collect()  # closes a bus that was made, but not returned
         else:
             bus = Bus(hall.path)
             bus.attach(Toy, 1).read(CURRENT)
@@ -152,7 +152,7 @@ def test_a_bus_is_closed_though_that_is_interrupted(hall: Received, step: int, d
 
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("deed", ["__enter__", "__exit__"])
-def test_a_simulator_ends_though_that_is_interrupted(step: int, deed: str) -> None:
+def test_a_simulator_can_be_ended_after_an_interrupted_start_or_end(step: int, deed: str) -> None:
     def act(nth: int) -> bool:
         simulator = Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)])
         if deed == "__exit__":
@@ -201,8 +201,8 @@ ENDS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("is_ended", [True, False])
 @pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
-def test_a_poller_that_is_left_open_harms_no_memory(hall: Received, is_ended: bool, end: str) -> None:
-    """The interpreter frees its objects in any order, while the core's thread still runs."""
+def test_a_poller_left_open_at_exit_does_not_corrupt_memory(hall: Received, is_ended: bool, end: str) -> None:
+    """At exit the interpreter frees objects in any order, while the core's thread still runs."""
     path = [each for each in sys.path if each]
     code = LEFT_OPEN.format(path=path, port=hall.path, is_ended=is_ended, end=end)
     env = {**os.environ, "PYTHONMALLOC": "malloc", "MALLOC_PERTURB_": "165"}  # freed memory is overwritten
@@ -215,8 +215,10 @@ def test_a_poller_that_is_left_open_harms_no_memory(hall: Received, is_ended: bo
 
 
 @pytest.mark.parametrize("interrupted", [0, 1, 2])
-def test_no_port_stays_open(monkeypatch: pytest.MonkeyPatch, interrupted: int) -> None:
-    """Neither one that was opened before it, nor one that is opened while it is passed on."""
+def test_an_interrupted_opening_of_several_ports_leaves_none_open(
+    monkeypatch: pytest.MonkeyPatch, interrupted: int
+) -> None:
+    """Neither ports opened before the interruption stay open, nor ports opened while it propagates."""
     wires = [Wire([simulated(Toy(1))], unpaced=True, port=ANY_PORT) for _ in range(3)]
     buses: list[Bus] = []
     open_bus, others_are_open = Bus.__init__, threading.Semaphore(0)

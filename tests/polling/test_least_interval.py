@@ -29,7 +29,7 @@ SLACK = 1e-6
 
 
 class Slow(Picky):
-    """Keeps the times of its requests, and whether any came before the interval after its reply was over."""
+    """Records the times of its requests, and counts those that came too early after its last reply."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(drive)
@@ -74,13 +74,13 @@ def test_a_drive_s_registers_share_its_least_interval(every: float | None, other
     assert sim.early == 0
     assert {row.status for row in rows} == {"ok"}
     assert max(counts) - min(counts) <= 1
-    each = INTERVAL + (0.06 if others else 0.03)  # an exchange takes 30 ms at most
+    each = INTERVAL + (0.06 if others else 0.03)  # s; an exchange takes at most 30 ms
     wanted = 12 / max(each, (every or 0) / 3)
     assert sum(counts) >= 0.9 * wanted
 
 
 @pytest.mark.slow
-def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> None:
+def test_a_drive_with_a_least_interval_hardly_slows_the_other_drives() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
 
     def exchanges(*drives: Drive) -> int:
@@ -90,12 +90,12 @@ def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> 
             return sum(row.drive == other.name for row in clocked.run(10))
 
     alone, together = exchanges(other), exchanges(drive, other)
-    assert together >= 0.75 * alone  # 3 exchanges of 130 ms each take less than a quarter of the line
+    assert together >= 0.75 * alone  # the slow drive's exchanges take less than a quarter
     assert sim.early == 0
 
 
 @pytest.mark.slow
-def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> None:
+def test_a_stop_is_the_first_request_after_the_least_interval() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     drives = [polled(drive, drive.readings()), polled(other, other.readings())]
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), drives) as clocked:
@@ -112,8 +112,8 @@ def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> No
             before = len(sim.times)
             while len(sim.times) == before:
                 clocked.run(0.001)
-            assert len(its_sim.asked) - asked <= 1  # the one that was under way
-            assert sim.times[-1] <= called + INTERVAL + 0.06  # and two exchanges, its own one
+            assert len(its_sim.asked) - asked <= 1  # at most the request in flight
+            assert sim.times[-1] <= called + INTERVAL + 0.06  # plus two exchanges, of which one is its own
     assert sim.early == 0
 
 
@@ -136,7 +136,7 @@ def test_manual_reads_keep_the_least_interval() -> None:
     assert sim.early == 0
 
 
-def test_a_write_is_not_late_because_its_drive_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_least_interval_extends_the_expiry_of_a_write(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = family(1, least_interval=2.0)(1)
     SimulatedBus(monkeypatch, Picky(drive)).attach(drive)
     patient = Call(drive, Latch().permit(), 1.0)
@@ -145,7 +145,7 @@ def test_a_write_is_not_late_because_its_drive_rests(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_the_prediction_knows_it() -> None:
+def test_the_predicted_rate_includes_the_least_interval() -> None:
     drive, sim = slow()
     wanted = planned(drive, [(register, None) for register in drive.readings()])
     found = predict(wanted, lateness=0.0)
@@ -160,8 +160,8 @@ def test_the_prediction_knows_it() -> None:
     assert not hasty.fits
 
 
-def test_jobs_of_one_drive_take_turns_beside_many_others() -> None:
-    """Without a clock: ten thousand turns of a plan."""
+def test_jobs_of_a_drive_with_a_least_interval_take_turns() -> None:
+    """Takes ten thousand turns from a schedule, without a clock."""
     schedule: Schedule[Job] = Schedule()
     jobs = [Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(5)]
     jobs += [Job(drive=2, period_ns=None, duration_ns=10) for _ in range(7)]
@@ -181,7 +181,7 @@ def test_jobs_of_one_drive_take_turns_beside_many_others() -> None:
     assert not [gap for (sooner, _), (later, _) in pairwise(taken) if (gap := later - sooner) != 10]
 
 
-def test_a_stop_that_must_wait_for_its_drive_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_waiting_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(clock, "now_ns", lambda: round(now[0] * 1e9))
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)

@@ -37,19 +37,19 @@ if sys.platform != "linux":
 
 S = 1_000_000_000
 CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
-LONGEST = 256 * 10 / 9600  # s, of a frame
+LONGEST = 256 * 10 / 9600  # s, duration of the longest frame
 NOT_MASTER, OTHER_MASTER = "not sent: not master", "not sent: another master"
 paces = pytest.mark.parametrize("every", usually(0.02, None), ids=["on a grid", "as fast as it goes"])
 
 
 class Quick(Toy):
-    """Answers soon, if at all."""
+    """A drive with a short timeout."""
 
     response_timeout = 0.05
 
 
 class Slow(Toy):
-    """Is listened to for longer than a busy machine holds another master up."""
+    """A drive with a timeout that is longer than a busy computer delays another master."""
 
     response_timeout = 1.5
 
@@ -75,7 +75,7 @@ def hold(mastership: Mastership) -> None:
 
 @contextmanager
 def lines(every: float | None, port: str = "pty") -> Iterator[tuple[list[SimulatedDrive], list[PlantLine]]]:
-    """Two lines with a simulated drive each."""
+    """Yield two simulated drives, each on its own line, and the declarations of the lines."""
     drives = [simulated(Quick(1)) for _ in range(2)]
     with Simulator([Wire([drive], unpaced=True, port=port) for drive in drives]) as simulator:
         paths = [wire.path for wire in simulator.wires]
@@ -100,13 +100,13 @@ class Rows:
         until(lambda: status in self.statuses(drive))
 
     def settle_unpolled(self, drive: str) -> None:
-        """Let it be missed several times."""
+        """Wait for several miss rows of this drive, so that earlier requests have ended."""
         for _ in range(3):
             rows_of(self._poller)
             self.until(drive, NOT_MASTER)
 
     def settle(self, *drives: str) -> None:
-        """Take all that was under way before, until each drive has a value again."""
+        """Take the rows of earlier requests, and wait until each drive has a new value."""
         for drive in drives:
             self.until(drive, "ok")
 
@@ -121,7 +121,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
         hold(mastership)
         rows.settle("pump", "fan")
         mastership.end()
-        rows.settle_unpolled("pump")  # earlier requests have reached their drive by then
+        rows.settle_unpolled("pump")  # by then, the drives have received all earlier requests
         asked = [sim.counters.requests for sim in sims]
         rows_of(poller)
         rows.until("fan", NOT_MASTER)
@@ -138,8 +138,8 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
 
 @pytest.mark.slow
 @paces
-def test_rows_of_a_line_without_its_master_are_few(mastership: Mastership, every: float | None) -> None:
-    """No busy loop runs."""
+def test_without_mastership_a_line_has_few_miss_rows(mastership: Mastership, every: float | None) -> None:
+    """The poller must not run a busy loop while it is not the master."""
     with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
         Rows(poller).until("pump", NOT_MASTER)
         begun = time.monotonic()
@@ -151,7 +151,7 @@ def test_rows_of_a_line_without_its_master_are_few(mastership: Mastership, every
         assert 0 < found <= most
 
 
-def test_a_poller_without_a_mastership_says_nothing_of_others() -> None:
+def test_the_summary_has_no_foreign_bytes_without_a_mastership() -> None:
     with lines(None) as (_, made), Poller(plant(*made)) as poller:
         Rows(poller).settle("pump")
         assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
@@ -162,7 +162,7 @@ def test_a_poller_without_a_mastership_says_nothing_of_others() -> None:
 
 @contextmanager
 def seen_line(mastership: Mastership, every: float | None) -> Iterator[tuple[int, Poller]]:
-    """A polled line of silent drives, and its far end."""
+    """Yield the far end of a polled line without drives, and its poller."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -182,7 +182,7 @@ def wait_for_bytes(far: int) -> bytes:
 
 @pytest.mark.slow
 @paces
-def test_a_line_is_listened_to_before_its_first_request(mastership: Mastership, every: float | None) -> None:
+def test_a_poller_listens_before_its_first_request(mastership: Mastership, every: float | None) -> None:
     hold(mastership)
     begun = time.monotonic()
     with seen_line(mastership, every) as (far, _):
@@ -192,8 +192,8 @@ def test_a_line_is_listened_to_before_its_first_request(mastership: Mastership, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["pty", "tcp://127.0.0.1:0"])
-def test_nothing_is_sent_while_the_master_before_may_still_be_there(port: str) -> None:
-    """The guard is longer than the longest frame and the time-out, which are listened to on ptys alone."""
+def test_nothing_is_sent_during_the_guard_time_of_the_previous_master(port: str) -> None:
+    """Nothing is sent during the guard time, which is longer here than the listening time of serial lines."""
     mastership = Mastership(guard_s=1.0)
     try:
         hold(mastership)
@@ -210,7 +210,7 @@ def test_nothing_is_sent_while_the_master_before_may_still_be_there(port: str) -
 
 @pytest.mark.long
 @paces
-def test_another_master_is_reported_and_polling_starts_after_it(
+def test_another_master_is_reported_and_polling_starts_once_it_is_silent(
     mastership: Mastership, every: float | None
 ) -> None:
     hold(mastership)
@@ -241,7 +241,7 @@ def test_another_master_is_reported_and_polling_starts_after_it(
 
 
 class Listener:
-    """A silent far end that keeps received bytes, by connection."""
+    """A far end that never answers, and keeps the received bytes of each connection."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -279,7 +279,7 @@ def far() -> Iterator[Listener]:
 
 
 @pytest.mark.long
-def test_a_line_that_was_removed_is_closed_and_gets_no_byte(mastership: Mastership, far: Listener) -> None:
+def test_a_removed_line_is_closed_and_receives_no_byte(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
@@ -296,8 +296,8 @@ def test_a_line_that_was_removed_is_closed_and_gets_no_byte(mastership: Mastersh
 
 
 @pytest.mark.slow
-def test_no_port_is_opened_by_who_is_not_the_master(mastership: Mastership, far: Listener) -> None:
-    """Neither at first nor after a loss: that could cut the master's connection."""
+def test_no_port_is_opened_without_mastership(mastership: Mastership, far: Listener) -> None:
+    """The port is not opened at first, nor reopened later, because that could cut the master's connection."""
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall, yard), mastership=mastership) as poller:
         Rows(poller).until("fan", NOT_MASTER)
@@ -310,17 +310,19 @@ def test_no_port_is_opened_by_who_is_not_the_master(mastership: Mastership, far:
         Rows(poller).settle_unpolled("fan")
         assert len(far.received) == 1
         hold(mastership)
-        until(lambda: any(far.received[1:]))  # a busy machine may open it more than once
+        until(lambda: any(far.received[1:]))  # the port may be opened more than once on a busy computer
 
 
 def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
-    """Add the pump's new rows of one register to those that there are."""
+    """Append the pump's new rows of the register `status` to `rows`; return `rows`."""
     rows += [row for row in rows_of(poller) if (row.drive, row.register) == ("pump", "status")]
     return rows
 
 
 @pytest.mark.long
-def test_rows_of_other_lines_go_on_while_lines_come_and_go(mastership: Mastership, far: Listener) -> None:
+def test_other_lines_have_rows_while_lines_are_added_and_removed(
+    mastership: Mastership, far: Listener
+) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
@@ -333,11 +335,11 @@ def test_rows_of_other_lines_go_on_while_lines_come_and_go(mastership: Mastershi
             until(lambda n=n: len(taken_of(poller, rows)) >= 10 * n)
         assert {row.status for row in rows} <= {"ok", *HOST_LATE}
         due = [row.monotonic_ns for row in rows]
-        assert max(later - at for at, later in pairwise(due)) < S  # of 0.02 s each, on a machine that is busy
+        assert max(later - at for at, later in pairwise(due)) < S  # a generous limit for a period of 0.02 s
 
 
 @pytest.mark.slow
-def test_a_name_that_is_taken_or_unknown_is_one_sentence(mastership: Mastership) -> None:
+def test_a_duplicate_or_unknown_line_name_raises_one_sentence(mastership: Mastership) -> None:
     hold(mastership)
     with lines(None) as (_, (hall, yard)), Poller(plant(hall), mastership=mastership) as poller:
         again = line(yard.port, quick("fan", 2, None), name="hall")
@@ -352,7 +354,7 @@ def test_a_name_that_is_taken_or_unknown_is_one_sentence(mastership: Mastership)
 
 
 @pytest.mark.slow
-def test_a_bridged_port_is_refused_and_nothing_changes(mastership: Mastership) -> None:
+def test_a_port_handled_by_pyserial_is_refused_and_changes_nothing(mastership: Mastership) -> None:
     hold(mastership)
     bridged = line("rfc2217://127.0.0.1:1", quick("fan", 1, None), name="yard")
     with pytest.raises(NoSuchPort, match="needs a port that the core writes to itself"):
@@ -366,7 +368,7 @@ def test_a_bridged_port_is_refused_and_nothing_changes(mastership: Mastership) -
         Rows(poller).settle("pump")
 
 
-def test_a_line_is_listened_to_again_after_a_lapse_in_which_nothing_was_asked(mastership: Mastership) -> None:
+def test_a_new_mastership_listens_again_before_its_first_request(mastership: Mastership) -> None:
     hold(mastership)
     wire = Wire([simulated(Quick(1))], unpaced=True)
     with Simulator([wire]), Bus(wire.path, mastership=mastership) as bus:
@@ -379,8 +381,8 @@ def test_a_line_is_listened_to_again_after_a_lapse_in_which_nothing_was_asked(ma
         assert time.monotonic() - begun >= mastership.guard_s
 
 
-def test_many_ports_are_opened_side_by_side_and_closed_at_once(mastership: Mastership) -> None:
-    """pyserial's own sockets sleep for 0.3 s at their closing: 64 sockets for 19 s."""
+def test_many_ports_are_opened_in_parallel_and_closed_quickly(mastership: Mastership) -> None:
+    """pyserial's own sockets sleep for 0.3 s when they are closed, which would take 19 s for 64 sockets."""
     wires = [Wire([simulated(Quick(1))], unpaced=True, port="socket://127.0.0.1:0") for _ in range(64)]
     with Simulator(wires) as simulator:
         declared = [
@@ -393,10 +395,10 @@ def test_many_ports_are_opened_side_by_side_and_closed_at_once(mastership: Maste
         assert time.monotonic() - begun < 15
 
 
-def test_a_line_is_removed_while_another_s_request_under_way_is_waited_for(
+def test_removing_lines_concurrently_waits_for_each_request_in_flight(
     mastership: Mastership, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A gateway that loses its lease has half a second for all of its lines."""
+    """A gateway that loses its lease has only half a second to close all of its lines."""
     end, asked, is_answered = PolledLine.end, threading.Event(), threading.Event()
 
     def waited_for(ending: PolledLine) -> bool:
@@ -422,22 +424,25 @@ def test_a_line_is_removed_while_another_s_request_under_way_is_waited_for(
 
 
 class Busy:
-    """A line with a request under way that is never answered."""
+    """A line with a request in flight that is never answered."""
 
     bus = SimpleNamespace(leave=lambda: None, part=lambda: None)
 
     def leave(self) -> None:
-        """Stop being tended."""
+        """Do nothing."""
 
     def end(self) -> bool:
         return True
 
 
 @pytest.mark.parametrize(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
-def test_a_request_under_way_is_waited_for_until_the_mastership_ends(
+def test_closing_waits_for_a_request_no_longer_than_the_mastership(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
-    """It may have ended already, 0 here: then no timer runs. Half of a guard later the kernel kills."""
+    """The wait is limited, because the kernel kills the process soon after the mastership's end.
+
+    With `left_ns` 0 the process holds no mastership, so no timer runs.
+    """
     now = [1000 * S]
     until_ns = now[0] + left_ns if left_ns else 0
     monkeypatch.setattr(clock, "now_ns", lambda: now[0])

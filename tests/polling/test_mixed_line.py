@@ -1,4 +1,4 @@
-"""All families on one line, with different baud rates and formats: no value goes to the wrong drive."""
+"""All families on one line, with different baud rates and formats: no value is taken for another drive's."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FAST_SECONDS = 2.0
 
 
 class UnreliableWire(LateWire):
-    """Replies are lost, come late or twice."""
+    """A wire on which some replies are lost, late or doubled."""
 
     def __init__(self, drives: list[EncodedDrive]) -> None:
         super().__init__(drives, unpaced=True)
@@ -44,14 +44,14 @@ def fast_wires() -> list[Wire]:
 
 
 def poll(path: str, drives: list[PolledDrive], seconds: float) -> tuple[list[Row], dict[str, Any]]:
-    """All rows, and the summary of the line."""
+    """Poll for `seconds` s; return all rows and the line's summary."""
     with Poller(plant(line(path, *drives))) as poller:
         rows = [row for batch in poller.batches(seconds) for row in batch]
     return rows + rows_of(poller), poller.summary()["lines"]["line"]
 
 
 def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -> None:
-    """Every value is its register's, every missing one has its reason, and none is unaccounted for."""
+    """Check that no value is misattributed, every miss has a valid reason, and the summary is complete."""
     truth = proofs(*drives)
     assert len(set(truth.values())) > len(drives)
     samples = [row for row in rows if row.value is not None]
@@ -62,8 +62,8 @@ def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -
     assert (len(samples), misses) == (summary["samples"], summary["misses"])
 
 
-def test_values_tell_all_registers_apart() -> None:
-    """Raw counts of any two drives differ, so that a misattribution shows."""
+def test_all_polled_registers_hold_different_values() -> None:
+    """The raw counts of any two drives differ, so that other tests can detect a misattributed value."""
     for drives in (real_drives(), fast_drives()):
         asked = [polled(drive, drive.readings()) for drive in drives]
         truth = proofs(*asked)
@@ -78,7 +78,7 @@ def test_values_tell_all_registers_apart() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
+def test_all_variants_on_one_line_are_polled_at_real_baud_rates() -> None:
     drives = []
     for drive in real_drives():
         at_a_rate, *others = drive.readings()
@@ -88,7 +88,7 @@ def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
         rows, summary = poll(path, drives, REAL_SECONDS)
     check(rows, drives, summary)
     assert {row.drive for row in rows if row.value is not None} == {each.drive.name for each in drives}
-    # Each slot of each grid is a row, or counted as left out; the last ones are cut off by the end.
+    # Each slot of a rated register has a row or is counted as skipped, except the last slots.
     on_a_grid = {(each.drive.name, each.polls[-1].register.name) for each in drives}
     kept = sum(1 for row in rows if (row.drive, row.register) in on_a_grid)
     assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)
@@ -96,7 +96,7 @@ def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_late_lost_and_doubled_replies_are_never_taken_for_others() -> None:
+def test_late_lost_and_doubled_replies_are_never_misattributed() -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
     with served(fast_wires) as (path,):
         rows, summary = poll(path, drives, FAST_SECONDS)
@@ -113,7 +113,7 @@ POLLED = bytes((1, 3, 0, 1, 0, 1))  # output_frequency
 
 
 class LossyWire(ClockedWire):
-    """It `loses` so many polled requests."""
+    """A wire that loses the next `loses` polled requests."""
 
     loses = 0
 
@@ -125,7 +125,7 @@ class LossyWire(ClockedWire):
 
 
 class SilentWire(LossyWire):
-    """Its device answers polled reads only."""
+    """A wire whose device only answers polled reads; other requests are counted as `unanswered`."""
 
     unanswered = 0
 
@@ -137,7 +137,7 @@ class SilentWire(LossyWire):
 
 
 class MisprintedToy(Toy):
-    """Its document is wrong about what two registers hold."""
+    """A drive whose `known_counts` are wrong for two registers."""
 
     most_registers = {HOLDING: 1}
 
@@ -147,7 +147,7 @@ class MisprintedToy(Toy):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", [1, 5])
-def test_a_lost_request_does_not_slow_it_for_good(lost: int) -> None:
+def test_a_lost_request_does_not_slow_a_drive_permanently(lost: int) -> None:
     pump = Toy(1, name="pump")
     wire = SilentWire([EncodedDrive(pump)], Faults())
     with ClockedLines(wire, [polled(pump, [Toy.output_frequency], 0.1)]) as lines:
@@ -161,7 +161,7 @@ def test_a_lost_request_does_not_slow_it_for_good(lost: int) -> None:
     assert wire.unanswered == 0
 
 
-def test_a_misprint_does_not_end_the_polling_after_a_lost_request() -> None:
+def test_wrong_known_counts_do_not_end_polling_after_a_lost_request() -> None:
     pump = MisprintedToy(1, name="pump")
     sim = SimulatedDrive(pump)
     sim["mystery"], sim["acceleration_time"] = 1234, 123.4

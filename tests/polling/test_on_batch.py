@@ -19,7 +19,7 @@ CURRENT = Toy.registers["output_current"]
 
 @pytest.fixture
 def poller() -> Iterator[Poller]:
-    """A poller that is not started, of a line with one drive."""
+    """Return a poller of a line with one drive; polling has not started."""
     with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as simulator:
         made = Poller(plant(line(simulator.wires[0].path, polled(Toy(1, name="pump-1"), [CURRENT], 0.01))))
         try:
@@ -28,7 +28,7 @@ def poller() -> Iterator[Poller]:
             made.close()
 
 
-def test_every_row_is_handed_out_once_the_last_ones_before_closing_returns(poller: Poller) -> None:
+def test_on_batch_gets_every_row_once_and_all_before_close_returns(poller: Poller) -> None:
     rows: list[Row] = []
     threads: set[str] = set()
 
@@ -50,7 +50,7 @@ def test_every_row_is_handed_out_once_the_last_ones_before_closing_returns(polle
 
 
 @pytest.mark.slow
-def test_a_slow_function_holds_no_line_up(poller: Poller) -> None:
+def test_a_slow_function_does_not_delay_polling(poller: Poller) -> None:
     go_on, entered = threading.Event(), threading.Event()
     rows: list[Row] = []
 
@@ -70,7 +70,7 @@ def test_a_slow_function_holds_no_line_up(poller: Poller) -> None:
 
 
 @pytest.mark.slow
-def test_a_function_that_fails_is_logged_at_once_and_raised_by_closing(
+def test_a_failure_of_the_function_is_logged_immediately_and_raised_by_close(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:
     calls: list[int] = []
@@ -84,7 +84,7 @@ def test_a_function_that_fails_is_logged_at_once_and_raised_by_closing(
     poller.on_batch(fail, every=0.01)
     until(lambda: bool(caplog.records))
     before = poller.summary()["samples"]
-    until(lambda: poller.summary()["samples"] > before + 20)  # the polling goes on
+    until(lambda: poller.summary()["samples"] > before + 20)  # polling continues
     with pytest.raises(OSError, match="the disk is full"):
         poller.__exit__(None, None, None)
     assert len(calls) == 1
@@ -92,11 +92,11 @@ def test_a_function_that_fails_is_logged_at_once_and_raised_by_closing(
     assert record.getMessage() == "on_batch: the function failed and is no longer called"
     summary = poller.summary()
     left = rows_of(poller)
-    assert calls[0] + len(left) == summary["samples"] + summary["misses"]  # they can still be taken
-    poller.close()  # raises it once
+    assert calls[0] + len(left) == summary["samples"] + summary["misses"]  # `left` has all later rows
+    poller.close()  # the failure is raised only once
 
 
-def test_a_failure_of_the_block_goes_before_the_function_s(
+def test_a_failure_of_the_with_block_takes_precedence_over_the_function_s(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(batch: Batch) -> None:
@@ -113,7 +113,7 @@ def test_a_failure_of_the_block_goes_before_the_function_s(
     poller.close()
 
 
-def test_the_function_itself_may_end_the_polling(poller: Poller) -> None:
+def test_the_function_may_close_the_poller(poller: Poller) -> None:
     rows: list[Row] = []
 
     def end(batch: Batch) -> None:
@@ -128,7 +128,7 @@ def test_the_function_itself_may_end_the_polling(poller: Poller) -> None:
         summary = poller.summary()
         return int(summary["samples"]) + int(summary["misses"])
 
-    until(lambda: len(rows) == counted())  # the last rows are counted after it is closed
+    until(lambda: len(rows) == counted())  # the last rows come after the poller is closed
 
 
 def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
@@ -142,7 +142,7 @@ def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
         taker = threading.Thread(target=take)
         taker.start()
         until(lambda: poller.summary()["samples"] > 20)
-    taker.join(30.0)  # and not after a minute
+    taker.join(30.0)  # long before the `every` of 60 s is over
     assert not taker.is_alive()
     summary = poller.summary()
     assert len(rows) == summary["samples"] + summary["misses"]

@@ -15,11 +15,11 @@ from multidrop.polling.batch import Row
 from multidrop.polling.jobs import JobMaker
 from multidrop.sim import Faults, SimulatedDrive
 
-SOON, LATE = 0.005, 0.06  # s
+SOON, LATE = 0.005, 0.06  # short and long response delay in s
 
 
 class Wide(Toy):
-    """Two registers so far from each other that only much waiting makes one request cheaper than two."""
+    """Two registers so far apart that one request is faster than two only with a long response delay."""
 
     most_registers = {HOLDING: 100}
     readable_gaps = {HOLDING: range(100)}
@@ -40,7 +40,7 @@ def asked_together(rows: list[Row]) -> set[bool]:
 @pytest.mark.slow
 @table(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
 @table("every", [None, 0.75], ids=["in turn", "at a rate"])
-def test_blocks_are_those_of_the_response_delay_that_was_measured(
+def test_blocks_are_planned_again_for_the_measured_response_delay(
     document: float, truth: float, every: float | None
 ) -> None:
     drive = Wide(1, name="pump-1")
@@ -59,10 +59,10 @@ def test_blocks_are_those_of_the_response_delay_that_was_measured(
         for name in NAMES:
             slots = [row.monotonic_ns for row in first + between + after if row.register == name]
             dues = {round((at - slots[0]) / (every * S)) for at in slots}
-            assert dues == set(range(len(dues)))  # of each slot there is one
+            assert dues == set(range(len(dues)))  # each slot has exactly one row
 
 
-def test_other_drives_keep_their_place_in_the_round() -> None:
+def test_replanning_one_drive_keeps_the_polling_order() -> None:
     drives = [Wide(address, name=f"pump-{address}") for address in (1, 2, 3)]
     drives[1].response_delay = LATE
     sims = [SimulatedDrive(Wide(address), response_delay=SOON) for address in (1, 2, 3)]
@@ -76,7 +76,7 @@ def test_other_drives_keep_their_place_in_the_round() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
+def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as clocked:
@@ -91,7 +91,7 @@ def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
 
 @pytest.mark.slow
 def test_blocks_are_kept_unless_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Delays may be those of the host alone, and never the same."""
+    """Measured delays always vary a little, for example because of the host."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
     choose, chosen = JobMaker.plan, []

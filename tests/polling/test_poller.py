@@ -38,7 +38,7 @@ NOT_SENT = {str(Status.NOT_ASKED), str(Status.LATE_ANSWER_DUE)}
 
 
 class Quick(Toy):
-    """Answers at once, if at all."""
+    """A fast drive with a short timeout."""
 
     baudrates = (115_200,)
     response_delay = 0.001
@@ -46,13 +46,13 @@ class Quick(Toy):
 
 
 class Slow(Toy):
-    """At the pace of a real line."""
+    """A drive at a realistic baud rate."""
 
     baudrates = (9600,)
 
 
 class Brisk(Toy):
-    """On a line on which the standard's silence is longer than 3.5 characters."""
+    """A drive at a baud rate at which the standard's silence is longer than 3.5 characters."""
 
     baudrates = (38_400,)
 
@@ -63,7 +63,7 @@ ONE = [Quick.output_current]
 
 
 class Polling:
-    """A poller, and all the rows that came from it so far."""
+    """A poller, and all rows taken from it so far."""
 
     def __init__(self, *lines: PlantLine) -> None:
         self.poller = Poller(plant(*lines))
@@ -86,12 +86,12 @@ class Polling:
         return Counter(row.status for row in self.look() if drive in (None, row.drive))
 
     def until(self, status: str, count: int = 1, drive: str | None = None) -> None:
-        """Wait for so many more rows of a status."""
+        """Wait for `count` more rows with this status."""
         before = self.statuses(drive)[status]
         until(lambda: self.statuses(drive)[status] >= before + count)
 
     def check_summary(self) -> None:
-        """The summary agrees with the rows, line by line and drive by drive."""
+        """Check that the summary's counts of each line and drive equal those of the rows."""
         summary = self.poller.summary()
         misses = Counter(row.status for row in self.rows if row.value is None)
         assert summary["samples"] == sum(1 for row in self.rows if row.value is not None)
@@ -117,7 +117,7 @@ def drive(address: int = 1, name: str = "pump-1") -> Quick:
 
 @pytest.fixture
 def pump() -> SimulatedDrive:
-    """The drive at address 1."""
+    """Return a simulated drive at address 1."""
     found = simulated(drive())
     found["output_current"] = 3.25
     return found
@@ -125,7 +125,7 @@ def pump() -> SimulatedDrive:
 
 @pytest.fixture
 def port(pump: SimulatedDrive) -> Iterator[str]:
-    """A line with that one drive."""
+    """Return the port of a line with only the drive `pump`."""
     with Simulator([Wire([pump], unpaced=True)]) as sim:
         yield sim.wires[0].path
 
@@ -142,12 +142,12 @@ def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
         polling.until("ok", 100)
     for name, every in periods.items():
         mine = [row for row in polling.rows if row.register == name]
-        # A reply that came too late has a row of its own, with the time of its request.
+        # A late reply adds another row with the time of its request, hence the set.
         sent = sorted({row.monotonic_ns for row in mine if row.status not in NOT_SENT})
-        # The n-th is not sent before its slot: none is made up for, and none is early.
+        # The n-th request is not sent before the n-th slot: no request is early, or made up for.
         assert all(at >= before_ns + number * every * 1e9 for number, at in enumerate(sent))
     left_out = polling.poller.summary()["lines"]["line"]["overrun_slots"]
-    # Each slot up to the last row is a row, or counted as left out.
+    # Each slot until the last row has a row, or is counted as skipped.
     times = [row.monotonic_ns for row in polling.rows]
     polled_s = (max(times) - min(times)) / 1e9
     slots = sum((polled_s - 0.5) // every for every in periods.values())
@@ -259,7 +259,7 @@ def test_many_lines_at_once() -> None:
 
 @pytest.mark.long
 def test_a_call_of_one_line_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines with a rate are tended every 50 ms, no matter how often they call."""
+    """Lines with a rate are checked once per interval, no matter how often other lines call."""
     looks: list[int] = []
     is_steady = PolledLine.is_steady
 
@@ -287,7 +287,7 @@ def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDr
         (ours,) = bus.drives
         for hz in (10.0, 20.0, 30.0):
             polling.until("ok")
-            with suppress(Unconfirmed):  # where this machine looked too late at the answer
+            with suppress(Unconfirmed):  # possible if this computer read the reply too late
                 ours.write(Quick.frequency, hz)
             assert pump["frequency"] == hz
         assert ours.read(Quick.output_current) == 3.25
@@ -301,14 +301,14 @@ def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDr
 
 
 def reply_of(address: int, reply: bytes) -> bytes:
-    """The same reply, by another drive."""
+    """Return the same reply with another address."""
     return checksums.rtu(f"{address:02X} {reply[1:-2].hex()}")
 
 
 OTHER = checksums.rtu("02 03 02 12 34")
 NOISE = bytes(at * 151 % 256 for at in range(4096))
 
-FAULTS = {  # the fate of a reply, and the statuses in the rows
+FAULTS = {  # for each fault: the bytes sent instead of the reply, and the statuses of the rows
     "cut off": (lambda reply: reply[:-1], {"reply cut short"}),
     "damaged": (lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]), {"bad checksum"}),
     "twice": (lambda reply: 2 * reply, {"ok"}),
@@ -322,7 +322,7 @@ FAULTS = {  # the fate of a reply, and the statuses in the rows
     "lost": (lambda reply: b"", {"no reply"}),
     "an exception": (lambda reply: checksums.rtu("01 83 02"), {"exception 02"}),
 }
-PIECES = {  # the status of a prefix, if this machine delivered the rest too late
+PIECES = {  # further statuses if this computer delivered the rest of the bytes too late
     "noise before": {"bad checksum", "reply from another address", "reply to another function"},
     "of another drive, then its own": {"reply from another address"},
 }
@@ -331,10 +331,10 @@ PIECES = {  # the status of a prefix, if this machine delivered the rest too lat
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_polled_reply_has_its_status(fault: str, pump: SimulatedDrive) -> None:
     fate, said = FAULTS[fault]
-    # A pty would have no room for so much noise.
+    # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
-        # Since the start: a block that was refused three times is requested only once a minute.
+        # Counts all rows since the start: after three refusals a block is requested only once a minute.
         until(lambda: all(polling.statuses()[status] >= 2 for status in said))
     assert {row.value for row in polling.rows if row.status == "ok"} == ({3.25} if "ok" in said else set())
     assert polling.statuses().keys() <= said | HOST_LATE | PIECES.get(fault, set())
@@ -355,13 +355,13 @@ def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
 
 @pytest.mark.slow
 def test_a_silence_that_is_too_short_for_the_drive() -> None:
-    """It takes a request that comes before its own silence is over for the rest of the frame before."""
+    """The drive takes a request that arrives before its own silence is over for a part of the last frame."""
     strict = simulated(Brisk(1, name="pump-1"))
     strict.needs_silence = True
     hasty = polled(Brisk(1, name="pump-1", silence=400e-6), ONE)
     with Simulator([Wire([strict])]) as sim, Polling(line(sim.wires[0].path, hasty)) as polling:
         polling.until("ok")
-        until(lambda: strict.counters.early > 0)  # a busy machine is late, and not early at once
+        until(lambda: strict.counters.early > 0)  # a busy computer may take a while until a request is early
         polling.until("not asked: late reply due", 2)
         polling.until("ok")
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
@@ -369,14 +369,14 @@ def test_a_silence_that_is_too_short_for_the_drive() -> None:
 
 
 def test_replies_that_come_byte_by_byte(pump: SimulatedDrive) -> None:
-    """From a line at 9600 baud, on which silence is kept: the drive sees no request that is early."""
+    """On a line at 9600 baud, silences are kept: the drive receives no early request."""
     slow = simulated(Slow(1, name="pump-1"))
     asked = polled(Slow(1, name="pump-1"), Slow.readings())
     with Simulator([Wire([slow])]) as sim, Polling(line(sim.wires[0].path, asked)) as polling:
         polling.until("ok", 10 * len(Slow.readings()))
     misses = polling.statuses().total() - polling.statuses()["ok"]
     assert slow.counters.damaged == 0
-    assert slow.counters.early <= misses  # none, but for a request that follows a reply given up too soon
+    assert slow.counters.early <= misses  # only after a reply for which the wait was too short
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
     polling.check_summary()
 
@@ -388,7 +388,7 @@ def test_a_port_that_is_gone_in_the_middle_of_a_reply() -> None:
         os.write(master, b"\x01\x03\x0a\0")
         os.close(master)
         polling.until("port lost", 2 * len(READINGS))
-    os.close(slave)  # while anybody holds it, its number is given to no other line, which this would poll
+    os.close(slave)  # only now, so that no other test's line gets the same pty and is polled
     assert polling.statuses().keys() == {"port lost"}
     polling.check_summary()
 
@@ -403,7 +403,7 @@ def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> N
             wires = [Wire([simulated(each.drive) for each in asked], port=str(link), unpaced=True)]
             with Simulator(wires):
                 targets.add(link.readlink())
-                # A pty's number is not given again while anybody holds it.
+                # Keeps the pty open, so that its number is not used again.
                 stack.callback(os.close, os.open(link, os.O_RDONLY | os.O_NOCTTY))
                 if number == 0:
                     polling = stack.enter_context(Polling(line(str(link), *asked)))
@@ -417,8 +417,8 @@ def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> N
 
 
 def queued_before_a_stop(hall: PolledLine) -> int:
-    """Open the port again as a stop does that comes before the poller; return the slots still queued then."""
-    with hall._lock:  # the poller's thread tends the line before or after this
+    """Reopen the port, as a stop does before the poller; return the number of slots still queued then."""
+    with hall._lock:  # the poller's thread cannot tend the line meanwhile
         core, noted, queued = hall.bus.line.queue, hall._queue._done, len(hall._queue.slots())
         assert core
         until(lambda: core.done >= noted + min(3, queued))
@@ -429,12 +429,12 @@ def queued_before_a_stop(hall: PolledLine) -> int:
 
 @pytest.mark.slow
 def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
-    """The poller may have missed the loss of the port; it repeats the queued requests on the new one."""
+    """The poller may have missed the loss of the port; it sends the queued requests again."""
     every = 0.01
     with Polling(line(port, polled(drive(), ONE, every))) as polling:
         (hall,) = polling.poller._lines
         queued = 0
-        while not queued:  # a busy machine may come back only when all that was queued is carried out
+        while not queued:  # a busy computer may be late, when all queued requests are over
             polling.until("ok", 3)
             queued = queued_before_a_stop(hall)
         polling.until("ok", 100)  # more than was queued ahead
@@ -442,7 +442,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
     assert hall._ended_ns
     slots = (hall._ended_ns - hall.started_ns) / 1e9 // every
     left_out = polling.poller.summary()["lines"]["line"]["overrun_slots"]
-    assert len(polling.rows) + left_out >= slots  # no queued exchange vanished
+    assert len(polling.rows) + left_out >= slots  # no queued request was forgotten
     polling.check_summary()
 
 
@@ -529,7 +529,7 @@ def test_a_plant_without_lines_can_be_polled() -> None:
 
 @pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
 def test_nothing_is_left_behind(port: str, end: str) -> None:
-    Poller(plant(line(port, polled(drive(), ONE)))).close()  # lazily opened descriptors are open now
+    Poller(plant(line(port, polled(drive(), ONE)))).close()  # opens the descriptors that are opened lazily
     before = descriptors(), threads()
     if end == "never entered":
         Poller(plant(line(port, polled(drive(), ONE)))).close()
@@ -546,21 +546,21 @@ def test_nothing_is_left_behind(port: str, end: str) -> None:
 
 
 class Patient(Toy):
-    """Answers within a minute."""
+    """A drive with a timeout of a minute."""
 
     response_timeout = 60.0
     response_delay = 15.0
 
 
 def patient(every: float | None) -> PolledDrive:
-    """Two requests, to two drives."""
+    """Return a polled drive with one register."""
     polls = polled(Patient(1, name="pump-1"), [Patient.fault]).polls
     return PolledDrive(Patient(1, name="pump-1"), tuple(replace(poll, every=every) for poll in polls))
 
 
 @pytest.fixture
 def responder() -> Iterator[tuple[int, str]]:
-    """A line whose other end is the test's: its descriptor, and the path of the port."""
+    """Return the descriptor of the line's far end, which the test serves, and the path of the port."""
     master, slave = os.openpty()
     yield master, os.ttyname(slave)
     os.close(slave)
@@ -582,7 +582,7 @@ def test_closing_waits_for_exchanges_in_flight(
     monkeypatch.setattr(line_set, "ENDING_NS", round(PATIENCE * 1e9))
     with Polling(line(path, patient(every))) as polling:
         assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
-        monkeypatch.setattr(clock, "sleep", answer)  # when it waits for exchanges under way
+        monkeypatch.setattr(clock, "sleep", answer)  # called while closing waits for exchanges in flight
     assert [(row.value, row.status) for row in polling.rows] == [(1.0, "ok")]
     polling.check_summary()
 
@@ -590,7 +590,7 @@ def test_closing_waits_for_exchanges_in_flight(
 def test_a_request_unanswered_at_the_end_has_a_row(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The request that is under way, and a slot behind it that is over; not one that lasts longer."""
+    """The request in flight has a row, and so has a queued slot that is over, but not one that continues."""
     monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
     master, path = responder
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
@@ -606,16 +606,16 @@ def test_a_request_unanswered_at_the_end_has_a_row(
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
 def test_a_slot_that_is_not_over_at_the_end_was_not_missed(responder: tuple[int, str], leaves: str) -> None:
-    """Every healthy run ends so: the next value is due already, or about to be."""
+    """At the end of every run, some slots have started that are not over; they are no misses."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
     second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
     with Polling(line(path, first, second)) as polling:
-        assert os.read(master, 1024)  # the one; the other waits
+        assert os.read(master, 1024)  # the request to pump-1; pump-2's waits
         if leaves == "the drive":
             polling.poller.remove("line", "pump-2")
         os.write(master, checksums.rtu("01 03 02 00 01"))
-    is_asked, _, _ = select.select([master], [], [], 0)  # the other, just before the end
+    is_asked, _, _ = select.select([master], [], [], 0)  # whether pump-2's request was sent before the end
     missed = [("pump-2", "poll ended")] if is_asked else []
     assert [(row.drive, row.status) for row in polling.rows] == [("pump-1", "ok"), *missed]
     polling.check_summary()
@@ -655,7 +655,7 @@ def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
 
 
 def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
-    """Its queue starts empty, whatever happened on the earlier port."""
+    """The queue of the new port starts empty, whatever was queued on the earlier port."""
     sim = simulated(drive())
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as clocked:
         clocked.run(1.0)

@@ -1,4 +1,4 @@
-"""Requests that a drive does not answer as a whole are split, and a value that is invalid is a miss."""
+"""Requests that a drive does not answer as a whole are split, and an invalid value is a miss."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(ev
     assert values(rows) == expected_values(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
-    assert len(asked) <= 5  # log2 of 24, and 24 single requests
+    assert len(asked) <= 5  # blocks between the halvings of 24 registers
     assert all(row.value is not None for row in rows if row.register != "r7")
 
 
@@ -151,13 +151,13 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
 
 @pytest.mark.long
 def test_while_it_is_silent_to_long_requests_it_is_asked_at_its_rate() -> None:
-    """The presence probe of one register has the block's period."""
+    """The probe, which reads a single register, has the same period as the block."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
     with clocked_line_of(drive, sim, every=5.0) as clocked:
         rows = clocked.run(600)
     assert len(values(rows)) == WIDE
-    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is one of the parts at last
+    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is read by the probe, and later as a part
 
 
 @pytest.mark.long
@@ -199,7 +199,7 @@ def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
         sim.silent_beyond = 1
         clocked.run(60)
         counts = {count for _, count in sim.asked}
-        assert counts <= {WIDE, 1}  # one: a proof that no late reply is taken for another
+        assert counts <= {WIDE, 1}  # single registers are only read to prove that no late reply is due
         (line,) = clocked.poller._lines
         assert len(line._maker._made) == 1
 
@@ -209,8 +209,10 @@ def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
 @example({2, 4}, 5, 1)
 @given(st.sets(st.integers(1, 5), max_size=3), st.integers(1, 6), st.integers(1, 6))
 def test_no_register_is_lost_that_can_be_read_by_itself(refused: set[int], most: int, silent: int) -> None:
-    """Except a device that refuses the first one and is silent to longer requests: no reply proves then
-    that no late answer is due. Otherwise each silence holds the next question up for two minutes."""
+    """No example refuses register 0, because its reply proves that no late reply is due.
+
+    Without that proof, each missing reply would delay the next request by two minutes.
+    """
     drive = family(6)(1, name="pump-1")
     sim = Picky(drive, refused, most, silent)
     with clocked_line_of(drive, sim, every=5.0) as clocked:
@@ -230,7 +232,7 @@ REFUSED = Toy.mystery
 
 
 class Stubborn(SimulatedDrive):
-    """Refuses every read that touches one of its registers."""
+    """A drive that refuses every read which includes the register REFUSED."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         if start <= REFUSED.address < start + count:
@@ -261,11 +263,11 @@ def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     assert set(seen) == set(POLLED) - {REFUSED.name}
     assert told["set_aside"] == ["pump-1.mystery"]
     queued_ahead = 256 * len(POLLED)
-    assert refused <= 2 * queued_ahead  # only queued requests still read it
+    assert refused <= 2 * queued_ahead  # only requests that were already queued
 
 
 class Moody(SimulatedDrive):
-    """Answers every read with an exception, as long as it has one."""
+    """A drive that answers every read with the exception `says`, unless it is None."""
 
     says: Reason | None = None
 
@@ -298,14 +300,14 @@ def test_a_block_that_is_readable_again_is_polled_as_before(
     assert len(rows) > before / 4
 
 
-# ---- values that are missing by their document ----
+# ---- values that the document declares as invalid ----
 
 
-ANSWERED = ("ok", "no valid value")  # a machine that others load may miss an answer
+ANSWERED = ("ok", "no valid value")  # other statuses are possible on a busy computer
 
 
 class Meter(Drive):
-    """One request reads all registers."""
+    """A meter whose registers are all read by one request."""
 
     most_registers = {INPUT: 40, HOLDING: 40}
 
@@ -322,7 +324,7 @@ class Meter(Drive):
 
 
 def rows_by_register(sim: SimulatedDrive) -> tuple[dict[str, Row], Poller, list[Row]]:
-    """Poll all registers until each is answered; return the last answer of each, and all rows."""
+    """Poll until each register is answered; return the last row of each, the poller, and all rows."""
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
         drives = polled(Meter(1, name="em"), Meter.readings())
         with Poller(plant(line(simulator.wires[0].path, drives))) as poller:
@@ -333,7 +335,7 @@ def rows_by_register(sim: SimulatedDrive) -> tuple[dict[str, Row], Poller, list[
                 return len({row.register for row in rows if row.status in ANSWERED}) == len(Meter.registers)
 
             until(all_there)
-        rows += rows_of(poller)  # rows until its end
+        rows += rows_of(poller)  # the last rows
         return {row.register: row for row in rows if row.status in ANSWERED}, poller, rows
 
 
@@ -344,7 +346,7 @@ def test_all_of_a_meter_is_one_request() -> None:
 
 def test_parts_of_a_word_share_one_request() -> None:
     class Single(Drive):
-        """A device whose registers are read singly."""
+        """A device with a limit of one register per request."""
 
         most_registers = {INPUT: 1}
         first = reading(7, part=(0, 3), table=INPUT)
@@ -389,7 +391,7 @@ def test_an_invalid_value_is_a_miss_with_its_reason() -> None:
     lacking = {name for name, row in last.items() if row.status == "no valid value"}
     assert lacking == {"voltage", "energy", "probe", "tariff", "power", "count"}
     assert all(last[name].value is None and last[name].uncertainty_ns is None for name in lacking)
-    assert (last["runs"].value, last["power_scale"].value) == (1, -32768)  # FFFFH has bit 8
+    assert (last["runs"].value, last["power_scale"].value) == (1, -32768)  # bit 8 of FFFFH is 1
     (statistics,) = poller.statistics().values()
     counted = sum(row.status == "no valid value" for row in rows)
     assert statistics.misses["no valid value"] == counted > 0
@@ -398,7 +400,7 @@ def test_an_invalid_value_is_a_miss_with_its_reason() -> None:
 
 def test_words_that_are_written_several_at_once_are_read_with_the_others() -> None:
     class Controller(Drive):
-        """Function 06 is not known to all of its registers."""
+        """A drive with a register that only function 16 writes."""
 
         most_registers = {HOLDING: 10, HOLDING_MULTIPLE: 10}
         level = reading(0, "m")

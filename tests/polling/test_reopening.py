@@ -44,7 +44,7 @@ class Plant:
         self.port = self.poller.bus("hall").line
 
     def there(self) -> Simulator:
-        """Return the line: its port is there while it is open."""
+        """Return a simulator of the line; the port exists while the simulator runs."""
         return Simulator([Wire([self.sim], port=str(self.path), unpaced=True)])
 
     def stop(self) -> None:
@@ -86,7 +86,7 @@ def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
 def test_lines_are_opened_though_the_system_gives_few_threads(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """A reload that ended here would leave motors running without any stop."""
+    """If a reload failed here, motors would keep running without any stop."""
     left = threads
 
     def start(thread: threading.Thread) -> None:
@@ -135,10 +135,10 @@ def test_a_stop_opens_the_port_once_the_poller_has_failed(
 
 @contextmanager
 def server(is_last: Callable[[int, int], bool]) -> Iterator[str]:
-    """A server of Modbus TCP for one client; it ends a connection where `is_last(nth, address)` says so.
+    """Serve Modbus TCP to one client. After the nth request, close if `is_last(nth, address)` is True.
 
-    A connection's first request is its 1st. The server says each address as its value; one that it ends the
-    connection with before a reply is `DEADLY`.
+    The number n starts at 1 for each connection. Each register's value is its address. At a request for the
+    address `DEADLY`, the server closes the connection without a reply.
     """
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
@@ -181,7 +181,7 @@ class Scattered(Drive):
 @pytest.mark.parametrize("every", [None, 0.1])
 @pytest.mark.parametrize("most", [1, 2, 3])
 def test_each_register_has_its_turn_though_connections_end_early(every: float | None, most: int) -> None:
-    """A request that was cut off comes first on the next connection, unless it was the connection's first."""
+    """An interrupted request is sent first on the next connection, unless it was its connection's first."""
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:
         drive = polled(Scattered(1, name="pump"), list(Scattered.registers.values()), every)

@@ -36,7 +36,7 @@ def clocked(*drives: PolledDrive) -> ClockedLines:
 
 @pytest.fixture
 def two() -> Iterator[ClockedLines]:
-    """A plant with two drives; four registers of each are polled every 100 ms."""
+    """Yield a polled plant of two drives; four registers of each are polled every 100 ms."""
     with clocked(*(polled(toy(address), ALL, 0.1) for address in (1, 2))) as made:
         made.run(2)
         yield made
@@ -91,7 +91,7 @@ def test_the_first_value_at_a_new_rate_comes_at_once(two: ClockedLines) -> None:
 
 
 def test_registers_that_stay_keep_their_slots() -> None:
-    """Also where their block is another one without the register that left it."""
+    """They keep their slots although they are in a new block, without the register whose rate changed."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)
@@ -99,13 +99,13 @@ def test_registers_that_stay_keep_their_slots() -> None:
     grid = [round((row.monotonic_ns - begun) / S, 4) % 0.1 for row in rows]
     assert max(min(late, 0.1 - late) for late in grid) < 0.02
     gaps = [later.monotonic_ns - row.monotonic_ns for row, later in pairwise(rows)]
-    assert max(gaps) < 0.12 * S  # none is left out
+    assert max(gaps) < 0.12 * S  # no slot is skipped
     assert len(rows) in (29, 30, 31)
 
 
 @pytest.mark.long
 def test_every_value_is_its_own_register_s_while_rates_change() -> None:
-    """And each register still has rows after each change."""
+    """Every value is of the right register, and each register has rows after each change."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
     with clocked(*drives) as made:
@@ -121,7 +121,7 @@ def test_every_value_is_its_own_register_s_while_rates_change() -> None:
         made.run(1)
         last = made.run(1)
     for row in rows:
-        assert row.status in ("ok", "not sent: expired")  # more than the line's capacity
+        assert row.status in ("ok", "not sent: expired")  # expired if the rates exceed the line's capacity
         if row.value is not None:
             pump = next(each.drive for each in drives if each.drive.name == row.drive)
             assert row.value == proof(pump, pump.register(row.register))
@@ -165,7 +165,7 @@ def test_skipped_slots_stay_counted_when_their_job_goes() -> None:
 
 
 class Stubborn(EncodedDrive):
-    """Refuses every read that touches its `fault`."""
+    """A drive that refuses every read which includes its register `fault`."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         if start <= FAULT.address < start + count:
@@ -181,7 +181,7 @@ def test_a_register_that_is_refused_costs_the_others_nothing_at_a_new_rate() -> 
         made.poller.set_rate(pump, None, 0.2)
         rows = made.run(3)
         missed = {row.register for row in rows if row.value is None}
-        assert missed <= {"fault", "status"}  # that the whole is refused is still known, at any rate
+        assert missed <= {"fault", "status"}  # the refusal of the whole block is remembered at all rates
         assert only_line(made).summary()["set_aside"] == ["pump-1.fault"]
         counts = Counter(row.register for row in made.run(10) if row.value is not None)
     assert {counts[register.name] for register in (CURRENT, FREQUENCY, STATUS)} <= {49, 50, 51}

@@ -12,12 +12,12 @@ from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import Faults, simulated
 
 DRIVES = 31
-FIRST, LATER = 8, 52  # s, the span of the promised rates
-BACK = 45  # s, in which drives that were dead from the start are back, when all have power
+FIRST, LATER = 8, 52  # durations in s over which the promised rates are measured
+BACK = 45  # s until drives that were dead from the start are polled again, after all have power
 
 
 def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
-    """The line is planned ahead; rows are not."""
+    """Skipped slots are planned in advance, but their rows must not appear before the slots."""
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)
     silent.deaf_until = float("inf")
@@ -35,7 +35,7 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
 def test_a_line_is_checked_more_often_while_a_drive_is_silent(
     monkeypatch: pytest.MonkeyPatch, is_silent: bool, looks: int
 ) -> None:
-    """All that a line with a period needs while its drives answer is that it is kept busy."""
+    """While all drives of a line with a period answer, its queue only needs to be refilled."""
     looked: list[int] = []
     tend = PolledLine.tend
 
@@ -54,7 +54,7 @@ def test_a_line_is_checked_more_often_while_a_drive_is_silent(
         looked.clear()
         rows = clocked.run(2)
         assert len([row for row in rows if row.value is not None]) == (20 if is_silent else 40)
-        assert abs(len(looked) - looks) <= 3  # it is called when a drive falls silent or answers again
+        assert abs(len(looked) - looks) <= 3  # the core also calls when a drive falls silent or answers again
 
 
 @pytest.mark.long
@@ -75,11 +75,11 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
         return sum(1 for row in clocked.run(seconds) if row.value is not None)
 
     with clocked:
-        clocked.run(5)  # until delays are learnt
+        clocked.run(5)  # until response delays are measured
         healthy = answered(10)
         for sim in sims[:dead]:
             sim.deaf_until = float("inf")
-        clocked.run(10)  # until it is known
+        clocked.run(10)  # until the poller knows that they are silent
         assert answered(50) >= 0.97 * 5 * healthy
         for sim in sims[:dead]:
             sim.deaf_until = 0.0
@@ -96,11 +96,11 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
 def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
     count: int, dead: int, every: float | None
 ) -> None:
-    """Every third one, so that most living drives follow a silent one."""
+    """Every third drive is dead, so that most answering drives are polled after a dead one."""
     gone = {3 * number + 1 for number in range(dead)}
 
     def answered(addresses: list[int]) -> list[int]:
-        """In the first seconds, and later."""
+        """Return the number of answers in the first seconds, and later."""
         drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in addresses]
         sims = [simulated(drive) for drive in drives]
         for sim in sims:

@@ -1,6 +1,6 @@
-"""Rows of a computer that sleeps while it polls: each has the time of its exchange.
+"""Rows of a computer that sleeps during polling: each row has the time of its exchange.
 
-The test computer does not sleep: a preloaded library gives the process the clocks of one that slept.
+The test computer does not sleep. A preloaded library gives the process the clocks of a computer that slept.
 """
 
 from __future__ import annotations
@@ -69,8 +69,11 @@ def test_rows_have_the_time_of_their_exchange(tmp_path: Path) -> None:
             check=False,
         )
     assert ran.returncode == 0, ran.stderr
-    slept_for = {True: set[int](), False: set[int]()}  # hours, by whether the request left before the sleep
-    before_ns, amid_ns = asked_ns[48], asked_ns[49]  # of that one the clock may be read when it slept
+    slept_for = {
+        True: set[int](),
+        False: set[int](),
+    }  # hours, by whether the request was sent before the sleep
+    before_ns, amid_ns = asked_ns[48], asked_ns[49]  # the second request may be timed before or after it
     for time_ns, monotonic_ns in json.loads(ran.stdout):
         if not before_ns < monotonic_ns <= amid_ns:
             slept_for[monotonic_ns <= before_ns].add(round((time_ns - monotonic_ns - ahead_ns) / HOUR_NS))

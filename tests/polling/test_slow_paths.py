@@ -1,4 +1,4 @@
-"""Paths that delay replies, such as a modem, a gateway or a stalled network, on a clock that the test sets.
+"""Network paths that delay replies, such as modems or stalled networks, on a clock that the test sets.
 
 No value is assigned to the wrong register, and polling continues. Over Modbus TCP a reply with its id needs
 no proof; a gateway that replies with its own ids is treated like RTU.
@@ -58,14 +58,14 @@ ASKED = [pair for pair in READS if "native" not in pair.values[0]]
 
 
 def check_story(story: Path, slow: tuple[Callable[[float], Delay], float]) -> None:
-    """Assert that each drive is read, truly."""
+    """Poll over a slow path, and check that each drive is read and no value is misattributed."""
     path, seconds = slow
     answering = story.run_over(path(seconds), TAIL + TURNS * seconds)
     assert answering == {drive.name for drive in story.drives}
 
 
 def check_writes(opened: Bus, line: PathLine, sim: SimulatedDrive, name: str) -> None:
-    """Assert that what each of thirty writes reports is true."""
+    """Check that the reported outcome of each of thirty writes is true."""
     (drive,) = opened.drives
     done = 0
     with opened:
@@ -85,7 +85,7 @@ def check_writes(opened: Bus, line: PathLine, sim: SimulatedDrive, name: str) ->
 
 
 def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float) -> int:
-    """Assert that a stop leaves at once and is seen to be done; return how often it was sent."""
+    """Check that a stop is sent immediately and confirmed; return how often it was sent."""
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     received = ReceivedRequests(sim)
@@ -99,11 +99,11 @@ def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float)
 
     received.loses = note
     with opened:
-        line.wire.advance(line.now / S)  # its clock starts
+        line.wire.advance(line.now / S)  # sets the wire's clock
         sim.motor.run(1)
         opened.drives[0].stop()
     assert not sim.motor.energised
-    assert sent_after[0] < 1  # after the answered reads, and one without an answer
+    assert sent_after[0] < 1  # s; after the identity check's reads, of which one may get no reply
     assert (line.now - begun) / S < 8 * seconds + 3
     return len(sent_after)
 
@@ -133,7 +133,7 @@ class OneByOne(Drive):
 
 @pytest.mark.parametrize("delay", [constant(0.6), constant(4.0), stalling(0.9), stalling(15.0)])
 def test_replies_that_all_look_alike_are_never_mixed_up(delay: Delay) -> None:
-    """A read of another table, even a refused one, shows that no earlier reply can still come."""
+    """A reply to a read of another table, even an exception, proves that no earlier reply is still due."""
     drives = [OneByOne(address, name=f"meter-{address}") for address in (1, 2)]
     story = Path(drives)
     assert story.run_over(delay, TAIL + TURNS * 15) == {drive.name for drive in story.drives}
@@ -154,7 +154,7 @@ def test_reads_over_a_slow_path_are_true(
     slow: tuple[Callable[[float], Delay], float],
     path_of: Callable[..., tuple[Bus, PathLine]],
 ) -> None:
-    """Four registers of each of two drives, read one after another by a client that only tries again."""
+    """A client reads four registers of each of two drives in turn, and retries failed reads."""
     path, seconds = slow
     drives = of_one_variant(LINES[name])
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
@@ -168,7 +168,7 @@ def test_raw_reads_over_a_slow_path_are_true(
     slow: tuple[Callable[[float], Delay], float],
     path_of: Callable[..., tuple[Bus, PathLine]],
 ) -> None:
-    """Reads past the table, each once, beside reads of the same function and length from other addresses."""
+    """Raw reads are sent once, between reads with the same function and length at other addresses."""
     path, seconds = slow
     drives = [drive for drive in of_one_variant(LINES[name]) if drive.framing is not Framing.DELIXI]
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
@@ -215,7 +215,7 @@ def test_write_results_over_a_slow_path_are_true(
 def test_a_write_has_the_time_that_reads_did_not_need(
     name: str, path_of: Callable[..., tuple[Bus, PathLine]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its answer alone is slow; nor is it found out only by reading the register back."""
+    """Only the reply to the write is slow, and it is received, not replaced by a read back."""
     drive = WRITTEN[name]
     sim = simulated(drive)
     opened, line = path_of([sim], constant(0.0))
@@ -252,7 +252,7 @@ def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
 def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """Its first frame leaves at once; its later reads wait as long as replies are known to take."""
+    """Its first frame is sent immediately; later reads wait as long as replies are known to take."""
     sim = simulated(MAKE[model](1))
     assert check_stop(*path_of([sim], constant(seconds)), sim, seconds) <= 6
 
@@ -280,16 +280,16 @@ KINDS = ("delay", "twice", "merge")  # faults of a gateway that keep the stream 
 
 
 class TrueIds(PathWire):
-    """A path behind a gateway that replies with the requests' ids, late as it likes."""
+    """A path behind a gateway that replies with the requests' ids, after arbitrary delays."""
 
     most_late = 2.0
 
 
 class OwnIds(PathWire):
-    """A path behind a gateway that counts its replies, whatever their requests' ids were."""
+    """A path behind a gateway that numbers its replies itself, regardless of the requests' ids."""
 
     ids = TransactionIds.IGNORE
-    most_late = 0.25  # s out of order: beyond the window of three time-outs no rule holds without ids
+    most_late = 0.25  # s; without ids, a reply later than three timeouts cannot be recognised
     count = 0
 
     def distort(self, reply: bytes) -> bytes:
@@ -343,7 +343,7 @@ def test_a_stalled_gateway_costs_no_truth(story_of: type[Path]) -> None:
 
 @pytest.mark.long
 def test_a_provably_late_reply_delays_no_request() -> None:
-    """No request waits for a late reply, and none is sent to prove anything."""
+    """No request waits for a late reply, and no request is sent only as a proof."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
     story.run_over(stalling(3.0))
     told = story.clocked.poller.summary()["lines"]["line"]

@@ -87,7 +87,7 @@ def test_no_library_is_imported_before_it_is_needed() -> None:
     late |= {
         "importlib.metadata",
         "multidrop.families.files.loader",
-    }  # most plants name no family file, most commands write no capture
+    }  # most plants use no family file, and most commands write no capture
     assert late.isdisjoint(told.stdout.split())
 
 
@@ -129,7 +129,8 @@ def test_pandas_and_polars_take_the_wide_form() -> None:
 
 
 def test_chosen_columns_come_in_their_order_and_are_always_there() -> None:
-    """Also columns without a row in a batch: each batch has the same columns."""
+    """A chosen column is present even if a batch has no row for it: all batches have the same columns."""
+
     never = "насос.output_frequency"
     wide = example().wide(never, SPEED, PUMP)
     assert wide.columns == ["time", "monotonic_ns", never, SPEED, PUMP]
@@ -148,7 +149,7 @@ def test_an_unknown_column_is_an_error() -> None:
 
 
 def test_rows_are_in_the_order_of_their_times_whatever_order_they_came_in() -> None:
-    """Two lines' requests overlap; a row of each is found at its time."""
+    """Rows of two lines may arrive out of order; the table is sorted by time."""
     rows = [row(second, "pump", name, second) for name in ("b", "a") for second in (3.0, 1.0, 2.0)]
     table = pa.table(from_rows(rows).wide())
     assert table.column("pump.a").to_pylist() == table.column("pump.b").to_pylist() == [1.0, 2.0, 3.0]
@@ -161,14 +162,15 @@ def test_only_equal_times_are_joined() -> None:
         early,
         early._replace(register="b", time_ns=early.time_ns + 1, monotonic_ns=early.monotonic_ns + 1),
     ]
-    rows.append(rows[1]._replace(drive="fan"))  # of another line, at the same nanosecond
+    rows.append(rows[1]._replace(drive="fan"))  # on another line, at the same time to the nanosecond
     table = pa.table(from_rows(rows).wide())
     assert table.column("pump.a").to_pylist() == [1.0, None]
     assert table.column("pump.b").to_pylist() == table.column("fan.b").to_pylist() == [None, 1.0]
 
 
 def test_a_clock_that_is_set_back_joins_nothing() -> None:
-    """UTC repeats an hour; the monotonic clock distinguishes the rows."""
+    """If UTC repeats, the monotonic time still distinguishes the rows."""
+
     first = row(1.0, "pump", "a", 1.0)
     table = pa.table(from_rows([first._replace(monotonic_ns=2 * SECOND, value=2.0), first]).wide())
     assert table.column("pump.a").to_pylist() == [1.0, 2.0]

@@ -80,7 +80,7 @@ def test_a_stop_is_watched(line: Line) -> None:
     assert line.sim.motor.frequency == 0
 
 
-def test_a_trip_during_a_start_raises_not_verified(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trip_while_starting(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.drive.set_frequency(20)
     monkeypatch.setattr(line.sim.motor, "run", lambda direction: line.sim.trip(FAULT))
     with pytest.raises(NotVerified, match="tripped"):
