@@ -55,11 +55,11 @@ OFFSETS = [0, -40, 273.15, 0.5, 1000, -0.01]
 
 
 def most_significant_first(number_format: NumberFormat, raw: float) -> bytes:
-    """Return the bytes that a document prints."""
+    """Return the bytes of a number, most significant first, as documents print them."""
     if number_format in DIGITS:
         return bytes.fromhex(f"{raw:0{DIGITS[number_format]}d}")
     if number_format is NumberFormat.I8:
-        return bytes([0x5A, int(raw) % 256])  # beside a byte of something else
+        return bytes([0x5A, int(raw) % 256])  # with an unrelated high byte
     return struct.pack(PACKED[number_format], raw)
 
 
@@ -73,7 +73,7 @@ def words_of(data: bytes) -> tuple[int, ...]:
 
 
 def counts(number_format: NumberFormat) -> st.SearchStrategy[Any]:
-    """Return the raw counts of a format, the ends more often."""
+    """Return a strategy for raw counts of a format, which draws the limits more often."""
     if number_format is NumberFormat.F64:
         return st.floats(allow_nan=False, allow_infinity=False)
     if number_format in (NumberFormat.F16, NumberFormat.F32):
@@ -98,7 +98,7 @@ def declared(**registers: Any) -> type[Drive]:
 
 
 def row_of(family: type[Drive], name: str, data: bytes, at: int = 0) -> Row:
-    """Return the row that the core makes of a reply's data."""
+    """Return the row into which the core decodes a reply's data."""
     columns = Columns(1)
     layout = RowLayout(0, [row_field(family.register(name), at, 0)])
     assert add_rows(columns, layout, completion(5, first_ns=9, words=words_of(data)), UTC_0)
@@ -107,11 +107,11 @@ def row_of(family: type[Drive], name: str, data: bytes, at: int = 0) -> Row:
 
 
 def is_near(found: float, exact: Fraction, parts: list[Fraction]) -> bool:
-    """Return True within the rounding of float64 arithmetic with these parts."""
+    """Return True if `found` is `exact` within the rounding errors of float64 arithmetic with `parts`."""
     try:
-        least = Fraction(2) ** -1074  # of float64; below 2^-1022 it has fewer digits
+        least = Fraction(2) ** -1074  # the smallest float64; below 2^-1022 a float64 has fewer digits
         return abs(Fraction(found) - exact) <= 4 * Fraction(2) ** -52 * max(map(abs, [exact, *parts])) + least
-    except OverflowError:  # beyond the largest float64
+    except OverflowError:  # `found` is infinite
         return max(map(abs, [exact, *parts])) > Fraction(2) ** 1020
 
 
@@ -134,7 +134,7 @@ def numbers(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, float]:
 @example((NumberFormat.I64, "DCBA", 0.001, 0, -(2**63)))
 @example((NumberFormat.I16, "ABCD", -0.1, 0, 0))
 @example((NumberFormat.F64, "AB", 0.01, 0, 2.225073858507203e-309))
-def test_a_number_of_any_format_order_step_and_offset(
+def test_every_format_order_step_and_offset_is_decoded_and_encoded(
     case: tuple[NumberFormat, str, float, float, float],
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -165,7 +165,7 @@ def test_a_number_of_any_format_order_step_and_offset(
 @settings(max_examples=examples(300), deadline=None)
 @given(numbers().filter(lambda case: case[0] in WRITTEN and case[0] not in FLOATS))
 @example((NumberFormat.U64, "BADC", 1, 0, 2**64 - 1))
-def test_a_whole_number_is_written_held_and_read_back(
+def test_whole_numbers_survive_write_and_read_back(
     case: tuple[NumberFormat, str, float, float, float],
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -193,7 +193,7 @@ def test_a_whole_number_is_written_held_and_read_back(
     max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
-def test_a_float_is_written_held_and_read_back(
+def test_floats_survive_write_and_read_back(
     number_format: NumberFormat, order: str, data: st.DataObject
 ) -> None:
     raw = data.draw(counts(number_format))
@@ -233,10 +233,12 @@ def bit_fields(draw: st.DrawFn) -> Bits:
 @given(bit_fields())
 @example(Bits(NumberFormat.U64, "CDAB", (0, 63), 2**64 - 1))
 @example(Bits(NumberFormat.I16, "BA", (15, 15), 0x8000))
-def test_a_part_of_a_word(case: Bits) -> None:
+def test_a_part_of_a_word_is_decoded_and_encoded(case: Bits) -> None:
     low, high = case.part
     size = struct.calcsize(PACKED[case.number_format])
-    digits = f"{case.whole:0{8 * size}b}"[::-1][low : high + 1][::-1]  # as a document draws them
+    digits = f"{case.whole:0{8 * size}b}"[::-1][low : high + 1][
+        ::-1
+    ]  # the part's bits, most significant first
     exact = int(digits, 2)
     if case.number_format.name[0] == "I" and digits[0] == "1":
         exact -= 2 ** len(digits)
@@ -252,7 +254,7 @@ def test_a_part_of_a_word(case: Bits) -> None:
         sim.memory._cell(INPUT, 7 + at).raw = word
     assert sim["field"] == exact
     sim["field"] = 0
-    sim["field"] = exact  # the other bits stay
+    sim["field"] = exact  # must not change the other bits
     assert sim.read(4, 7, size // 2) == list(words_of(data))
 
 
@@ -266,7 +268,7 @@ class Alarm(IntFlag):
     SENSOR = 2
 
 
-def test_a_field_may_have_names() -> None:
+def test_a_part_of_a_word_can_be_an_enumeration() -> None:
     family = declared(
         phase=reading(7, Phase, part=(4, 7), table=INPUT), alarms=reading(7, Alarm, part=(8, 9), table=INPUT)
     )
@@ -306,7 +308,7 @@ def test_invalid_count_has_no_value(
 @table(
     ("number_format", "part", "invalid", "wire"),
     [
-        (NumberFormat.I16, None, 0x8000, "80 00"),  # its bits
+        (NumberFormat.I16, None, 0x8000, "80 00"),  # compared as bits
         (NumberFormat.I16, None, -32768, "80 00"),
         (NumberFormat.I32, None, 0x80000000, "80 00 00 00"),
         (NumberFormat.U64, None, 0xFFFFFFFFFFFFFFFF, "FF FF FF FF FF FF FF FF"),
@@ -316,8 +318,8 @@ def test_invalid_count_has_no_value(
         (NumberFormat.F16, None, (), "7E 00"),
         (NumberFormat.F16, None, math.inf, "7C 00"),
         (NumberFormat.F16, None, 0, "80 00"),
-        (NumberFormat.F32, None, (), "7F C0 00 00"),  # NaN
-        (NumberFormat.F32, None, (), "FF A0 00 01"),  # and another
+        (NumberFormat.F32, None, (), "7F C0 00 00"),  # a NaN
+        (NumberFormat.F32, None, (), "FF A0 00 01"),  # another NaN
         (NumberFormat.F64, None, (), "7F F8 00 00 00 00 00 00"),
         (NumberFormat.F32, None, math.inf, "7F 80 00 00"),
         (NumberFormat.F32, None, -9999.9, "C6 1C 3F 9A"),
@@ -325,13 +327,15 @@ def test_invalid_count_has_no_value(
         (NumberFormat.BCD16, None, (), "12 3A"),
         (NumberFormat.BCD32, None, (), "F0 00 00 00"),
         (NumberFormat.BCD16, None, 9999, "99 99"),
-        (NumberFormat.U16, (0, 0), 0xFFFF, "FF FF"),  # of the whole word
-        (NumberFormat.U16, (0, 7), 0xFF, "12 FF"),  # of the part
+        (NumberFormat.U16, (0, 0), 0xFFFF, "FF FF"),  # compared with the whole word
+        (NumberFormat.U16, (0, 7), 0xFF, "12 FF"),  # compared with the part
         (NumberFormat.U16, (8, 15), 0xFF, "FF 12"),
         (NumberFormat.I16, (0, 3), -8, "00 08"),
     ],
 )
-def test_counts_that_mean_no_value(number_format: NumberFormat, part: Any, invalid: Any, wire: str) -> None:
+def test_an_invalid_raw_count_gives_no_value(
+    number_format: NumberFormat, part: Any, invalid: Any, wire: str
+) -> None:
     data = bytes.fromhex(wire)
     register = reading(7, table=INPUT, number_format=number_format, part=part, invalid=invalid)
     family = declared(level=register)
@@ -356,7 +360,7 @@ def test_bus_raises_no_value_for_an_invalid_count(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(NoValue, match=r"^tank: level holds no valid value at present$") as lack:
         drive.read(drive.level, drive.speed)
     assert (lack.value.register, dict(lack.value.values)) == ("level", {"speed": 20})
-    assert drive.write(drive.limit, 7) == 7  # though it held none
+    assert drive.write(drive.limit, 7) == 7  # although it held no valid value
     with pytest.raises(ValueError, match=r"limit = 65535 is the count that means no value$"):
         drive.write(drive.limit, 0xFFFF)
     assert sim["limit"] == 7
@@ -373,7 +377,7 @@ def test_bus_raises_no_value_for_an_invalid_count(monkeypatch: pytest.MonkeyPatc
     st.sampled_from([-3, -1, 1, 4]),
     st.data(),
 )
-def test_a_power_of_ten_is_that_of_the_scale_register(
+def test_a_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
     number_format: NumberFormat, step: float, power: int, distance: int, data: st.DataObject
 ) -> None:
     raw = data.draw(counts(number_format))
@@ -412,7 +416,9 @@ def test_a_power_of_ten_is_that_of_the_scale_register(
     places = known.find(Framing.RTU, Message(1, 4, start, stop - start)).places
     assert [place.at for place in places if place.name == "level"] == [10 - start]
     apart = known.find(Framing.RTU, Message(1, 4, 10, size // 2)).places
-    assert "level" not in [place.name for place in apart]  # without its scale it has no value
+    assert "level" not in [
+        place.name for place in apart
+    ]  # a request without the scale register gives no value
 
 
 # ---- into a recording ----
@@ -422,7 +428,7 @@ def test_a_power_of_ten_is_that_of_the_scale_register(
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cases=st.lists(numbers(), min_size=1, max_size=20))
-def test_a_recording_has_the_values_of_the_core(
+def test_a_recording_has_the_same_values_as_the_core(
     tmp_path: Path, suffix: str, cases: list[tuple[NumberFormat, str, float, float, float]]
 ) -> None:
     columns = Columns(len(cases))

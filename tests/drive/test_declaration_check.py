@@ -251,7 +251,7 @@ def test_all_mistakes_are_reported_together() -> None:
     "step": "0.1", "span": (2, 1), "number_format": "f32", "kept": "RAM", "table": "coil", "default": "x",
     "harmless": (1.5,), "broadcast": 3, "never": 1, "ram_address": -1, "at_least": "none", "moves": 7,
 }.items()}))  # fmt: skip
-def test_any_combination_of_mistakes_gives_sentences(wrong: dict[str, Any]) -> None:
+def test_any_combination_of_mistakes_gives_one_line_sentences(wrong: dict[str, Any]) -> None:
     register = setting(1, "V", **wrong)
     if wrong:
         assert mistakes_in(v=register)
@@ -260,7 +260,7 @@ def test_any_combination_of_mistakes_gives_sentences(wrong: dict[str, Any]) -> N
         declare(v=register)
 
 
-def test_two_settings_at_one_address_must_mean_the_same() -> None:
+def test_two_settings_with_different_meanings_at_one_address_are_reported() -> None:
     for other in (
         setting(8, "V", number_format=NumberFormat.I16),
         setting(8, "V", step=0.1),
@@ -273,7 +273,7 @@ def test_two_settings_at_one_address_must_mean_the_same() -> None:
     assert mistakes_in(volts=setting(8), other=setting(8, table=several, number_format=NumberFormat.U32))
 
 
-def test_no_other_register_writes_to_the_motor_command() -> None:
+def test_a_register_that_would_write_to_a_motor_command_s_address_is_reported() -> None:
     run = command(0x20, Run, harmless=(0,))
     assert mistakes_in(run=run, speed=setting(9, "rpm", ram_address=0x20)) == (
         "speed: its ram_address is that of run, which commands the motor",
@@ -288,7 +288,7 @@ def test_no_other_register_writes_to_the_motor_command() -> None:
     assert declare(run=run, speed=setting(9, "rpm", ram_address=0x21)).registers
 
 
-def test_registers_that_may_share_an_address() -> None:
+def test_registers_of_the_same_meaning_may_share_an_address() -> None:
     family = declare(
         volts=setting(8, "V"),
         volts_again=setting(8, "V", span=(0, 5)),
@@ -300,23 +300,23 @@ def test_registers_that_may_share_an_address() -> None:
         alias=setting(9, ram_address=8),
     )
     assert len(family.registers) == 8
-    assert DelixiNative.registers  # a parameter by two function codes
+    assert DelixiNative.registers  # declares parameters with two function codes at one address
 
 
-def test_a_register_has_one_name_and_one_class() -> None:
+def test_a_register_object_with_two_names_is_reported() -> None:
     speed = reading(1, "rpm")
     assert mistakes_in(speed=speed, rpm=speed) == (
         "rpm: this is the register speed already; declare one of its own",
     )
 
     class Base(Drive):
-        """Has two registers."""
+        """A family with two registers."""
 
         speed = reading(1, "rpm")
         torque = reading(2, "%")
 
     class Less(Base):
-        """Replaces one register."""
+        """A subclass without one of the registers."""
 
         speed = None  # type: ignore[assignment]
 
@@ -324,7 +324,7 @@ def test_a_register_has_one_name_and_one_class() -> None:
     assert list(Base.registers) == ["speed", "torque"]
 
 
-def test_access_must_be_possible_in_the_table() -> None:
+def test_an_access_that_the_table_does_not_allow_is_reported() -> None:
     blind = Table("output", None, 0x06)
     assert mistakes_in(v=reading(1, table=blind)) == ("v: an output cannot be read, and so holds no reading",)
     assert mistakes_in(v=reading(1, harmless=(0,)))
@@ -397,7 +397,7 @@ def test_facts_and_registers_are_reported_together() -> None:
 
 @pytest.mark.parametrize("name", [*VERBS, "identify"])
 def test_method_without_verb_decorator_is_reported(name: str) -> None:
-    """Such a call would only make a generator, and send no request."""
+    """Without the decorator, a call would only create a generator and send no request."""
 
     def script(self: Any) -> Script[None]:
         yield from insist(self.control, 0)

@@ -18,7 +18,7 @@ RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
 
 
 class Counting(Drive):
-    """Counts its calls, across all copies."""
+    """A drive that records each computation of its state, in all copies."""
 
     looks: list[float] = []
     speed = reading(0x10)
@@ -26,14 +26,14 @@ class Counting(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Running while it turns."""
+        """Return running if the speed is not 0."""
         speed = yield from read(self.speed)
         self.looks.append(speed)
         return RUNS if speed else STANDS
 
 
 class Noting(Drive):
-    """It is at rest only after two readings of 0, so its state is computed each time."""
+    """A drive that stores an attribute while its state is computed, so each call must compute it."""
 
     speed = reading(0x10)
 
@@ -43,13 +43,13 @@ class Noting(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """At rest after two readings of 0."""
+        """Return stopped after two readings of 0 in a row."""
         speed = yield from read(self.speed)
         self.zeros = 0 if speed else self.zeros + 1
         return STANDS if self.zeros > 1 else RUNS
 
 
-def test_equal_values_are_computed_once() -> None:
+def test_the_state_of_equal_values_is_computed_once() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     for temperature in range(5):
@@ -62,20 +62,20 @@ def test_equal_values_are_computed_once() -> None:
     assert Counting.looks[-1] == 25.0
 
 
-def test_nan_is_never_equal() -> None:
+def test_the_state_of_nan_is_computed_again() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     assert [reader.state({"speed": math.nan}) for _ in range(2)] == [RUNS, RUNS]
     assert len(Counting.looks) == 2
 
 
-def test_a_family_that_notes_something_is_asked_each_time() -> None:
+def test_the_state_of_a_family_with_attributes_is_computed_each_time() -> None:
     reader = StateReader(Noting(1))
     shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
     assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
 
 
-# Words of the manuals. A Delixi with Modbus has no status; only the fault code shows a fault.
+# Status words from the manuals. A Delixi with Modbus has none: only its fault code shows a fault.
 @pytest.mark.parametrize(
     ("model", "values", "condition"),
     [
@@ -85,7 +85,7 @@ def test_a_family_that_notes_something_is_asked_each_time() -> None:
         ("delixi-modbus", {"output_frequency": 25.0}, None),
     ],
 )
-def test_a_fault_is_known_by_a_status_alone(
+def test_a_fault_is_detected_from_the_status_alone(
     model: str, values: dict[str, float], condition: Condition | None
 ) -> None:
     found = StateReader(MODELS[model](1)).state(values)

@@ -16,7 +16,7 @@ from multidrop.sim import SimulatedDrive
 
 
 class Device(Drive):
-    """The device on the line, as its simulation needs it."""
+    """A family that declares the simulated device's registers."""
 
     first = setting(5, span=(0, 65535), moves=False)
     second = setting(6, span=(0, 65535), moves=False)
@@ -46,7 +46,7 @@ def test_numbers_of_any_format_are_read(meter: tuple[SimulatedBus, ModbusDevice]
         device.read_input(0, format="F32")
 
 
-def test_bits_are_bool(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_coils_and_discrete_inputs_are_returned_as_bool(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     line, device = meter
     line.sims[0]["door"] = 1
     assert device.read_discrete(4)[0] is True
@@ -55,7 +55,7 @@ def test_bits_are_bool(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     assert line.sims[0]["lamp"] == 1
 
 
-def test_nothing_is_written_without_confirmation(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_writes_without_confirm_are_refused_and_not_sent(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     line, device = meter
     for write in (
         lambda: device.write_holding(5, [1, 2]),
@@ -67,7 +67,7 @@ def test_nothing_is_written_without_confirmation(meter: tuple[SimulatedBus, Modb
     assert line.frames == []
 
 
-def test_what_is_written_is_read_back(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_written_registers_are_read_back(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     line, device = meter
     assert device.write_holding(5, [7], confirm=True) == [7]
     assert device.write_holding(5, [1, 2], confirm=True) == [1, 2]
@@ -75,15 +75,15 @@ def test_what_is_written_is_read_back(meter: tuple[SimulatedBus, ModbusDevice]) 
     assert [request.function for request, _ in line.frames] == [6, 3, 16, 3]
 
 
-def test_a_write_whose_effect_is_not_seen_is_unconfirmed(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
-    """Its confirmation is a copy of the request, as an adapter's echo is."""
+def test_a_write_that_cannot_be_read_back_is_unconfirmed(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+    """The reply to a write is a copy of the request, so it may be an adapter's echo."""
     line, device = meter
     line.loses = lambda request: request.function == 3
     with pytest.raises(Unconfirmed, match="could not be read back"):
         device.write_holding(5, [7], confirm=True)
 
 
-def test_another_number_than_written_is_an_error(
+def test_a_write_that_reads_back_another_number_raises_not_verified(
     meter: tuple[SimulatedBus, ModbusDevice], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line, device = meter
@@ -103,7 +103,7 @@ def test_another_number_than_written_is_an_error(
         ([1], "U17", "format = 'U17' is not one of U16"),
     ],
 )
-def test_numbers_that_cannot_be_written(
+def test_numbers_that_do_not_fit_the_format_are_refused(
     meter: tuple[SimulatedBus, ModbusDevice], values: list[float], format: str, sentence: str
 ) -> None:
     line, device = meter
@@ -112,7 +112,7 @@ def test_numbers_that_cannot_be_written(
     assert line.frames == []
 
 
-def test_a_refused_address_is_the_devices_exception(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_a_refused_address_raises_drive_exception(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     with pytest.raises(DriveException, match="illegal address"):
         meter[1].read_holding(5000)
 

@@ -35,7 +35,7 @@ PACKED = {  # names in documents
 
 
 class Meter(Drive):
-    """A setting of each format; no read limit is stated."""
+    """A drive with a setting of each number format, and without a stated read limit."""
 
     u16 = setting(0, "V", kept=Kept.RAM)
     i16 = setting(1, "V", number_format=NumberFormat.I16, kept=Kept.RAM)
@@ -66,7 +66,7 @@ formats = pytest.mark.parametrize("register", FORMATS, ids=lambda each: each.nam
 
 
 def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
-    """Return the numbers that it can hold."""
+    """Return a strategy for the numbers that the register can hold."""
     if register.is_float:
         width = 16 if register.number_format is NumberFormat.F16 else 32
         return st.floats(width=width, allow_nan=False, allow_infinity=False)
@@ -83,7 +83,7 @@ def on_the_wire(register: Register[Any], number: float) -> bytes:
 
 @formats
 @given(data=st.data())
-def test_a_number_is_packed_as_its_format_says(register: Register[float], data: st.DataObject) -> None:
+def test_a_written_number_has_the_bytes_of_its_format(register: Register[float], data: st.DataObject) -> None:
     number = data.draw(numbers(register))
     request = write_request(Meter(1), register, register.encode(number))
     assert request.data == on_the_wire(register, number or 0)  # a zero has no sign
@@ -102,7 +102,7 @@ def attached() -> Any:
 @formats
 @settings(max_examples=examples(30))
 @given(data=st.data())
-def test_a_number_is_written_held_and_read_back(
+def test_numbers_survive_write_and_read_back(
     attached: Any, register: Register[float], data: st.DataObject
 ) -> None:
     _, meter, sim = attached
@@ -110,7 +110,7 @@ def test_a_number_is_written_held_and_read_back(
     outcome = meter.try_write(register, number)
     assert (outcome.effect, outcome.held) == (Effect.DONE, number)
     assert meter.read(register) == number == sim[register.name]
-    sim[register.name] = number  # as from its keypad
+    sim[register.name] = number  # as if set on the keypad
     assert meter.read(register) == number
 
 
@@ -138,7 +138,7 @@ def test_value_outside_the_number_format_is_refused(attached: Any, name: str, va
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @example(struct.unpack(">f", struct.pack(">f", 1e-45))[0])
 @pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda each: each.name)
-def test_a_float_is_shown_with_the_digits_it_holds(register: Register[float], raw: float) -> None:
+def test_a_float_is_shown_with_enough_digits_to_read_it_back(register: Register[float], raw: float) -> None:
     shown = register.format(register.decode(raw)).partition(" ")[0]
     assert register.encode(register.parse(shown)) == raw
     assert len(shown.lstrip("-").replace(".", "").partition("e")[0].strip("0")) <= 9
@@ -150,13 +150,13 @@ def test_a_float_is_shown_with_the_digits_it_holds(register: Register[float], ra
      (1 / 3, "0.33333334 V"), (1e20, "1e+20 V"), (math.nan, "nan V"), (math.inf, "inf V"),
      (16_777_217, "16777216 V")],
 )  # fmt: skip
-def test_floats_read_well(value: float, text: str) -> None:
+def test_floats_are_shown_as_their_shortest_decimals(value: float, text: str) -> None:
     assert Meter.f32.format(value) == text
     if math.isfinite(value):
         assert Meter.f32.format(Meter.f32.decode(Meter.f32.encode(value))) == text
 
 
-def test_a_half_float_is_shown_as_short_as_it_reads_back(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_half_precision_float_is_shown_as_its_shortest_decimal(capsys: pytest.CaptureFixture[str]) -> None:
     assert Meter.f16.format(nearest_value(Meter.f16, 12.1)) == "12.1 V"
     assert capsys.readouterr().err == ""
     assert nearest_value(Meter.f16, 2049.0) == 2048
@@ -172,7 +172,7 @@ def test_span_end_between_two_float32_values_can_be_written(attached: Any) -> No
         meter.write(Meter.narrow, 0.10001)
 
 
-def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
+def test_a_simulated_drive_refuses_floats_outside_the_span() -> None:
     sim = SimulatedDrive(Meter(1))
 
     def answer(value: float) -> Message:
@@ -184,14 +184,16 @@ def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
     for value in (0.2, -1e-9, math.nan, math.inf):
         assert answer(value).exception == 3
     assert sim["narrow"] == pytest.approx(0.05)
-    sim["f32"] = 1e300  # cut off if it does not fit
+    sim["f32"] = 1e300  # too large for a float32
     assert sim["f32"] == math.inf
 
 
-def test_numbers_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_warns_if_a_float_register_changes_a_number(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     (single,) = struct.unpack(">f", struct.pack(">f", 12.1))
     assert nearest_value(Meter.f32, Meter.f32.parse("12.1")) == single
-    assert capsys.readouterr().err == ""  # shown as it was typed
+    assert capsys.readouterr().err == ""  # no warning: shown as typed
     assert nearest_value(Meter.f32, 16_777_217.0) == 16_777_216
     assert capsys.readouterr().err == (
         "multidrop: f32 holds single-precision numbers: 16777217.0 becomes 16777216 V\n"
@@ -203,7 +205,7 @@ def test_numbers_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(("value", "text"), [(12.345678, "12.345678 raw"), (1_234_567, "1234567 raw")])
-def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, text: str) -> None:
+def test_a_number_without_a_scale_is_shown_with_all_its_digits(value: float, text: str) -> None:
     assert value_text(Meter.unscaled, value) == text
 
 
@@ -229,7 +231,7 @@ def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatc
     assert reply.exception == 3  # the command's span holds
 
 
-def test_a_single_register_of_a_table_that_is_written_several_at_once(attached: Any) -> None:
+def test_a_single_register_is_written_by_its_table_s_function_16(attached: Any) -> None:
     line, meter, sim = attached
     assert write_request(meter, Meter.alone, 7) == Message(1, 0x10, 22, 1, bytes([0, 7]))
     assert meter.write(Meter.alone, 7) == 7
@@ -249,5 +251,5 @@ def test_a_step_may_be_negative(attached: Any) -> None:
 @table(
     ("step", "decimals"), [(1, 0), (0.1, 1), (0.01, 2), (100, 0), (1e-7, 7), (-0.05, 2), (2.5, 1), (1e6, 0)]
 )
-def test_a_step_says_how_many_digits_there_are(step: float, decimals: int) -> None:
+def test_decimals_follows_from_the_step(step: float, decimals: int) -> None:
     assert reading(1, "V", step=step).decimals == decimals

@@ -32,24 +32,24 @@ class Fan(Drive):
 
 
 class Pump(Fan):
-    """Has verbs, and a control word without further facts."""
+    """A drive with verbs, and a control word without declared harmless raw counts."""
 
     control = command(0x30, Word)
     target = command(0x31, "Hz", step=0.1, span=(0, 60), moves=False)
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start it."""
+        """Start the motor."""
         yield from write(self.control, Word.RUN)
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop it without `insist`."""
+        """Stop the motor with a plain write instead of `insist`."""
         yield from write(self.control, Word.STOP)
 
     @verb
     def coast(self) -> Script[None]:
-        """Stop it."""
+        """Stop the motor with `insist`."""
         yield from insist(self.control, Word.STOP)
 
     @verb
@@ -59,20 +59,20 @@ class Pump(Fan):
 
     @verb
     def state(self) -> Script[State]:
-        """Running while it turns."""
+        """Return running if the speed is not 0."""
         speed = yield from read(self.speed)
         return State(Condition.RUNNING if speed else Condition.STOPPED)
 
 
 class Known(Pump):
-    """Has `identify`."""
+    """A drive with `identify`."""
 
     kind = reading(0x40)
     control = command(0x30, Word, harmless=(Word.STOP,))
 
     @verb
     def identify(self) -> Script[None]:
-        """Its kind is 0."""
+        """Check that the register `kind` is 0."""
         if (yield from read(self.kind)) != 0:
             raise WriteForbidden(f"{self.name} is no pump")
 
@@ -109,7 +109,7 @@ def test_command_is_left_to_verbs_by_default(
 
 def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     class Bare(Drive):
-        """Has only a command."""
+        """A drive with a command, but without verbs."""
 
         level = reading(1)
         run = command(2)
@@ -125,7 +125,7 @@ def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.M
 
 def test_harmless_counts_need_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stoppable(Pump):
-        """Declares its harmless counts."""
+        """A drive whose stop is declared harmless."""
 
         control = command(0x30, Word, harmless=(Word.STOP,))
 
@@ -138,7 +138,9 @@ def test_harmless_counts_need_no_confirmation(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
-def test_moving_an_unidentified_drive_needs_confirmation(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_moving_a_drive_without_identify_needs_confirmation(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     def command_it(line: SimulatedBus, pump: Pump) -> None:
         acts = {
             "start": pump.start,
@@ -164,13 +166,13 @@ def test_moving_an_unidentified_drive_needs_confirmation(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("name", ["start_staggered", "ramp", "run_at"])
 def test_ramps_and_sequences_need_confirmation_too(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     class Combined(Pump):
-        """Its author has made one verb of two."""
+        """A drive with a verb that combines two others."""
 
         setpoint_name = "target"
 
         @verb
         def run_at(self, hz: float) -> Script[None]:
-            """Start it at this frequency."""
+            """Write the setpoint and start the motor."""
             yield from self.set_frequency.script(hz)
             yield from self.start.script()
 
@@ -194,9 +196,7 @@ def test_ramps_and_sequences_need_confirmation_too(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("name", ["stop", "coast"])
-def test_a_stop_is_never_withheld_for_want_of_a_confirmation(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_a_stop_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
     getattr(line.attach(Pump(1)), name)()
     assert written(line) == [STOP]
@@ -217,12 +217,12 @@ def test_class_with_identify_needs_no_confirmation(monkeypatch: pytest.MonkeyPat
 
 
 def acknowledged(request: Message) -> bytes | None:
-    """Exception 05 to a write."""
-    return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # the CRC by pymodbus
+    """Return exception 05 as the reply to a write, and None for a read."""
+    return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # CRC from pymodbus
 
 
-def test_stop_in_flight_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exception 05: the server has accepted the request and is processing it (V1.1b3, section 7)."""
+def test_exception_05_to_a_write_is_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exception 05 means: accepted and being processed (application protocol V1.1b3, section 7)."""
     line = SimulatedBus(monkeypatch, simulated(Known(1)))
     drive = line.attach(Known(1))
     line.answers = acknowledged
@@ -231,9 +231,11 @@ def test_stop_in_flight_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert written(line) == [RUN]
 
 
-def test_a_drive_s_own_meaning_of_05_is_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_05_with_another_meaning_in_the_family_is_a_refusal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Locked(Known):
-        """One whose manual has another 05."""
+        """A drive whose manual defines exception 05 differently."""
 
         exceptions: ClassVar = {5: "locked by its password"}
 
@@ -246,7 +248,7 @@ def test_a_drive_s_own_meaning_of_05_is_a_refusal(monkeypatch: pytest.MonkeyPatc
 
 def test_setting_may_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     class Readable(Drive):
-        """Its control word can be read."""
+        """A drive whose control word can be read."""
 
         control = setting(1, Word, moves=True, harmless=(Word.STOP,), kept=Kept.RAM)
         mode = setting(2, moves=True, kept=Kept.RAM)
@@ -260,7 +262,7 @@ def test_setting_may_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPat
     assert len(line.written) == 1
 
 
-def test_a_plant_file_and_a_command_confirm_it(tmp_path: Path) -> None:
+def test_a_plant_file_or_a_command_line_option_can_confirm_a_drive(tmp_path: Path) -> None:
     (tmp_path / "pump.py").write_text(
         "from multidrop import Drive, command, reading\n"
         "class Pump(Drive):\n    speed = reading(1)\n    run = command(2)\n"

@@ -32,7 +32,7 @@ def meter(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, Meter]:
     return line, line.attach(Meter(1, name="tank"))
 
 
-def test_one_register_is_its_value_and_several_a_dict(meter: tuple[SimulatedBus, Meter]) -> None:
+def test_reading_one_register_returns_its_value_and_several_a_dict(meter: tuple[SimulatedBus, Meter]) -> None:
     line, tank = meter
     assert tank.read(tank.level) == tank.read("level") == 2.5
     sent = len(line.frames)
@@ -74,7 +74,7 @@ def test_a_setting_is_written_by_its_name(meter: tuple[SimulatedBus, Meter]) -> 
         tank.write("limits", 6.5)
 
 
-def test_a_drive_that_is_not_attached_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calls_of_a_drive_that_is_not_attached_raise_not_attached(monkeypatch: pytest.MonkeyPatch) -> None:
     pump = InnovertIBD(1, name="pump-1")
     sentence = r"^pump-1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"
     for call in (

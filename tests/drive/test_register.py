@@ -43,16 +43,16 @@ class Example(Drive):
 
 
 @table(("raw", "value"), [(3, 0.3), (7, 0.7), (285, 28.5), (65535, 6553.5)])
-def test_a_raw_count_times_a_step_is_the_nearest_number(raw: int, value: float) -> None:
+def test_a_decoded_value_is_the_float_nearest_to_raw_times_step(raw: int, value: float) -> None:
     assert Example.current.decode(raw) == value
 
 
-def test_names_come_from_the_class() -> None:
+def test_a_register_is_named_like_its_class_attribute() -> None:
     assert Example.current.name == "current"
     assert list(Example.registers)[:2] == ["current", "unknown"]
 
 
-def test_an_enumeration_decodes_to_its_member_and_a_stranger_to_its_number() -> None:
+def test_a_raw_count_without_a_member_decodes_to_its_number() -> None:
     assert Example.run.decode(2) is Run.GO
     assert Example.run.decode(9) == 9
     assert Example.bits.decode(9) == Bits.RUN | Bits.FAULT
@@ -84,12 +84,12 @@ def test_values_that_a_register_refuses(
 
 
 @given(st.integers(0, 40000))
-def test_every_count_survives_the_round_trip(raw: int) -> None:
+def test_every_raw_count_survives_decoding_and_encoding(raw: int) -> None:
     assert Example.frequency.encode(Example.frequency.decode(raw)) == raw
 
 
 @given(st.floats(0, 400))
-def test_encoding_takes_the_nearest_count(value: float) -> None:
+def test_encoding_rounds_to_the_nearest_raw_count(value: float) -> None:
     assert abs(Example.frequency.decode(Example.frequency.encode(value)) - value) <= 0.00501
 
 
@@ -107,7 +107,7 @@ def test_encoding_takes_the_nearest_count(value: float) -> None:
         (Example.coarse, 15.0, "15 V"),
     ],
 )
-def test_values_read_well(register: Register[Any], value: object, text: str) -> None:
+def test_format_returns_values_with_their_unit(register: Register[Any], value: object, text: str) -> None:
     assert register.format(value) == text
 
 
@@ -123,11 +123,11 @@ def test_typed_text_becomes_a_value() -> None:
         Example.run.parse("go|stop")
 
 
-def test_how_many_addresses_a_register_takes() -> None:
+def test_words_is_the_number_of_addresses_of_a_register() -> None:
     assert (Example.energy.words, Example.current.words, Example.coil.words) == (2, 1, 1)
 
 
-def test_an_unknown_register_is_answered_with_its_neighbours() -> None:
+def test_the_error_for_an_unknown_register_names_similar_registers() -> None:
     with pytest.raises(ValueError, match="did you mean current"):
         Example.register("curent")
 
@@ -158,7 +158,9 @@ def test_number_too_large_for_a_float_is_refused(name: str, number: int) -> None
         (9600, "8O2", 12),
     ],
 )
-def test_a_character_has_its_bits(baudrate: int, format: str, bits: int) -> None:
+def test_the_duration_of_a_character_includes_start_parity_and_stop_bits(
+    baudrate: int, format: str, bits: int
+) -> None:
     assert Settings(baudrate, format).character == pytest.approx(bits / baudrate)
 
 

@@ -16,7 +16,7 @@ from multidrop.drive.text import Text, text
 ROOT = Path(__file__).parents[2]
 SCRIPT = [sys.executable, "-m", "bench.questions.coverage"]
 
-HELD = [  # as they are
+HELD = [  # entries that the register model can describe
     {"name": "voltage", "reg_type": "input", "address": "0x10", "format": "s16", "scale": 0.1},
     {"name": "relay", "reg_type": "coil", "address": 0},
     {"name": "door", "reg_type": "discrete", "address": 3},
@@ -68,7 +68,7 @@ def shares(coverage: Any) -> dict[str, tuple[int, int]]:
     }
 
 
-def test_every_key_of_a_template_is_carried(bench: Any, tmp_path: Path) -> None:
+def test_every_supported_key_of_a_template_is_converted(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "all.json").write_text(wb(HELD))
     coverage = covered(bench, tmp_path)
     whole = (len(HELD), len(HELD))

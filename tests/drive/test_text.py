@@ -35,7 +35,7 @@ class Meter(Drive):
 
 
 class Meter(Drive):
-    """A text of more registers than one request may read."""
+    """A drive with a text that is longer than its limit for one request."""
 
     most_registers = {INPUT: 5}
     level = reading(0, table=INPUT)
@@ -51,7 +51,7 @@ def test_a_text_is_read_as_the_document_prints_it() -> None:
 
 
 @given(st.binary(max_size=24))
-def test_bytes_of_a_line_are_never_control_characters(data: bytes) -> None:
+def test_decoded_texts_have_no_control_characters(data: bytes) -> None:
     found = Meter.serial.decode(data)
     assert found.isprintable()
     assert Meter.serial.decode(b"\x1b[2J\x07") == "?[2J?"
@@ -71,19 +71,19 @@ def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value
 
 
 class Known(Meter):
-    """Its maker says who it is."""
+    """A drive that is identified by the text `maker`."""
 
     limit = setting(1, "m", span=(0, 10), kept=Kept.RAM)
 
     @verb
     def identify(self) -> Script[None]:
-        """Ask for its maker."""
+        """Check that the text `maker` is ABB."""
         if (found := (yield from read(self.maker))) != "ABB":
             raise WriteForbidden(f"{self.name} is of {found}")
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
-def test_text_identifies_a_device(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+def test_identify_can_read_a_text(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
     line = SimulatedBus(monkeypatch, sim)
@@ -96,7 +96,7 @@ def test_text_identifies_a_device(monkeypatch: pytest.MonkeyPatch, maker: str) -
     assert (line.written != []) == (maker == "ABB")
 
 
-def test_a_text_of_another_family_is_asked_for_by_a_scan() -> None:
+def test_scan_reads_texts_to_identify_families() -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = "ABB"
 
@@ -108,9 +108,9 @@ def test_a_text_of_another_family_is_asked_for_by_a_scan() -> None:
     assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
-def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_polling_a_text_or_reading_another_family_s_text_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     class Other(Drive):
-        """With a text of its own."""
+        """Another family, with a text at the same address."""
 
         serial = text(20, 12)
 
@@ -140,7 +140,7 @@ def test_text_longer_than_a_request_is_refused(details: tuple[int, int], sentenc
         text(*details)
 
 
-def test_a_text_s_other_mistakes() -> None:
+def test_invalid_texts_are_refused() -> None:
     with pytest.raises(ValueError, match="order = 'CDAB' of a text is not 'AB', 'BA' or 'B'"):
         text(1, 2, order="CDAB")
     with pytest.raises(ValueError, match="a text is in holding or input registers, and 'coil' is neither"):

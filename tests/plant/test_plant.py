@@ -106,7 +106,7 @@ def load(tmp_path: Path) -> Load:
 
 @pytest.fixture
 def mistakes(load: Load, tmp_path: Path) -> Mistakes:
-    """A function that returns the mistakes of a plant file, without path and line number at their start."""
+    """Return a function that loads a plant file and returns its mistakes, without path and line number."""
 
     def mistakes(text: str) -> list[str]:
         with pytest.raises(PlantError) as refusal:
@@ -122,7 +122,7 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
 @pytest.mark.parametrize(
     "text", ["a." * 300 + "b = 1", "a = " + "[" * 300 + "]" * 300, "a." * 100_000 + "b=1"]
 )
-def test_what_is_nested_too_deeply_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_plant_file_with_too_deep_nesting_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(text)
     with pytest.raises(PlantError):
@@ -177,7 +177,7 @@ address = 3
 """
 
 
-def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(load: Load) -> None:
+def test_a_line_s_silence_replaces_the_standard_s_but_not_a_family_s(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
@@ -188,7 +188,7 @@ def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(l
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
-def test_a_line_s_echo_is_learnt_unless_it_is_told(load: Load) -> None:
+def test_a_line_s_echo_is_detected_unless_it_is_declared(load: Load) -> None:
     assert load(SILENT).lines[0].echo is Echo.AUTO
     assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
 
@@ -201,7 +201,7 @@ def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: L
     ]
 
 
-def test_a_byte_order_mark_is_no_part_of_the_file(load: Load) -> None:
+def test_a_byte_order_mark_is_skipped(load: Load) -> None:
     assert load("\ufeff" + SILENT).metadata() == load(SILENT).metadata()
 
 
@@ -226,7 +226,7 @@ def test_a_mistake_names_the_line_of_its_key_or_table(load: Load) -> None:
     assert all(rows[number - 1].startswith(start) for number, start in zip(numbers, starts, strict=True))
 
 
-def test_the_same_mistake_in_many_drives_is_one_sentence(load: Load) -> None:
+def test_the_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Load) -> None:
     drives = (
         TOY.replace('"D"', f'"D{address}"').replace("address = 1", f"address = {address}")
         + 'poll = ["output_curent"]\n'
@@ -239,7 +239,7 @@ def test_the_same_mistake_in_many_drives_is_one_sentence(load: Load) -> None:
     assert sentence.endswith("; the same in 30 more places")
 
 
-def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) -> None:
+def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes) -> None:
     text = (
         GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
         .replace('"output_current",', '"output_curent",')
@@ -430,14 +430,14 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
     ],
 )
-def test_a_mistake_is_one_sentence_with_place_and_remedy(
+def test_each_mistake_is_one_sentence_with_its_place_and_remedy(
     mistakes: Mistakes, text: str, sentence: str
 ) -> None:
     assert mistakes(text) == [sentence]
 
 
 @pytest.mark.parametrize(("text", "line"), [("[[line]\n", 1), (HEAD + "address = 1\naddress = 2\n", 5)])
-def test_what_is_not_toml_is_a_sentence_with_its_line(mistakes: Mistakes, text: str, line: int) -> None:
+def test_invalid_toml_is_reported_with_its_line(mistakes: Mistakes, text: str, line: int) -> None:
     (sentence,) = mistakes(text)
     assert re.fullmatch(rf"is not TOML: .* \(at line {line}, column \d+\)", sentence)
 
@@ -455,7 +455,7 @@ def test_arguments_that_the_family_refuses_are_each_reported(mistakes: Mistakes)
     ]
 
 
-def test_a_file_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+def test_an_unreadable_plant_file_is_reported_as_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         PlantError, match=r"none.toml: the plant file cannot be read: No such file or directory"
     ):
@@ -478,16 +478,16 @@ SCANNED = "is a port, and no plant file; `multidrop scan {} --out plant.toml` wr
         ("/dev/ttyUSB0", SCANNED.format("/dev/ttyUSB0")),
     ],
 )
-def test_an_address_or_a_port_is_told_from_a_plant_file(name: str, told: str) -> None:
-    for given in (name, Path(name)):  # which has lost one of two slashes
+def test_a_url_or_port_given_as_a_plant_file_is_reported_as_such(name: str, told: str) -> None:
+    for given in (name, Path(name)):  # Path reduces two slashes to one
         with pytest.raises(PlantError) as raised:
             load_plant(given)
         assert str(raised.value).lower().startswith(name.lower().rstrip("/"))
         assert told in str(raised.value)
 
 
-def test_a_device_is_not_read_for_a_plant_file() -> None:
-    """A serial port would be waited for, and bytes on its line would be lost."""
+def test_a_device_given_as_a_plant_file_is_not_read() -> None:
+    """Reading a serial port would block, and take bytes from its line."""
     with pytest.raises(PlantError, match=r": is a device, and no plant file$"):
         load_plant(os.devnull)
 
@@ -501,14 +501,16 @@ def test_a_device_is_not_read_for_a_plant_file() -> None:
     ],
     ids=["nested", "decimal", "hexadecimal"],
 )
-def test_a_file_that_tomllib_chokes_on_is_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+def test_a_file_that_makes_tomllib_fail_is_reported_as_a_sentence(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(PlantError, match=sentence) as found:
         load_plant(tmp_path / "a.toml")
     assert len(found.value.mistakes) == 1
 
 
-def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> None:
+def test_control_characters_in_names_are_escaped_in_errors(mistakes: Mistakes) -> None:
     name, address = mistakes(HEAD + TOY.replace('"D"', r'"D\n\u001B[2J"').replace("= 1", "= 99"))
     assert name.startswith(r'line "L", drive "D\n\x1b[2J": name = ')
     assert name.endswith("has characters that do not print; leave them out")
@@ -518,8 +520,8 @@ def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> Non
 @pytest.mark.parametrize(
     "port", ["spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class={}", "loop://"]
 )
-def test_other_urls_than_documented_ones_are_refused(mistakes: Mistakes, port: str) -> None:
-    """pyserial's spy:// empties the file that it names."""
+def test_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, port: str) -> None:
+    """For example, pyserial's spy:// would overwrite the file that the URL names."""
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', f'port = "{port}"'))
     scheme = port.partition(":")[0]
     assert sentence.endswith(
@@ -528,7 +530,7 @@ def test_other_urls_than_documented_ones_are_refused(mistakes: Mistakes, port: s
     )
 
 
-def test_a_port_s_url_has_no_user(mistakes: Mistakes) -> None:
+def test_a_port_url_with_a_user_is_refused_without_showing_the_password(mistakes: Mistakes) -> None:
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', 'port = "tcp://bob:S3C@ET@10.0.0.7"'))
     assert "tcp://10.0.0.7: it has a user or a password" in sentence
     assert "S3C" not in sentence
@@ -540,16 +542,16 @@ def test_reserved_names_of_lines_and_drives_are_refused(mistakes: Mistakes) -> N
     assert drive.startswith('line "..", drive "stop": name "stop" is reserved for the MQTT topic PREFIX/stop')
 
 
-def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes) -> None:
+def test_a_model_file_name_that_is_too_long_is_reported_as_a_sentence(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
-    assert sentence.endswith((".py: File name too long", ".py to take a model from"))  # the latter on Windows
+    assert sentence.endswith((".py: File name too long", ".py to take a model from"))  # the second on Windows
 
 
 @table(
     ("text", "expected"),
     [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)],
 )
-def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
+def test_parse_duration_returns_seconds(text: str, expected: float) -> None:
     assert parse_duration(text) == pytest.approx(expected)
 
 
@@ -573,12 +575,12 @@ def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
         b"5 s",
     ],
 )
-def test_what_is_no_duration_is_refused(text: str) -> None:
+def test_invalid_durations_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a duration from 100 us to 24 h, such as"):
         parse_duration(text)
 
 
-def test_a_drive_s_owner_says_what_it_keeps_in_ram_and_that_it_is_an_ibd(tmp_path: Path) -> None:
+def test_ram_and_confirmed_of_a_plant_file_reach_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         """
@@ -614,7 +616,7 @@ def two_lines(directory: Path) -> Path:
     return path
 
 
-def test_a_line_gets_another_port_and_all_else_stays(tmp_path: Path) -> None:
+def test_with_ports_changes_only_the_ports_of_lines(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     changed = plant.with_ports({"roof": "ports/roof"})
     assert [line.port for line in changed.lines] == ["/dev/hall", "ports/roof"]
@@ -623,7 +625,7 @@ def test_a_line_gets_another_port_and_all_else_stays(tmp_path: Path) -> None:
     assert plant.with_ports({"roof": "/dev/hall", "hall": "/dev/roof"}).lines[0].port == "/dev/roof"
 
 
-def test_ports_that_cannot_be_given(tmp_path: Path) -> None:
+def test_with_ports_refuses_unknown_lines_and_duplicate_ports(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     with pytest.raises(ValueError, match=r"plant\.toml has no line 'rof'; did you mean roof\?"):
         plant.with_ports({"rof": "x"})
@@ -641,15 +643,16 @@ def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
 
 
 @table("every", [0, 0.0, -1.0, 0.00009, 86401.0, float("nan"), float("inf"), True, "1 s"])
-def test_a_period_that_no_plant_file_may_have_is_refused(every: Any) -> None:
-    """A period of 0 s would end the polling of its line."""
+def test_a_period_outside_the_limits_is_refused(every: Any) -> None:
+    """A period of 0 s would make the polling of its line fail."""
+
     register = YD1000.register("status")
     with pytest.raises(ValueError, match=rf"^every = {every!r} is not a number of seconds from 0\.0001 to "):
         Polled(register, every)
     assert Polled(register, None).every is None
 
 
-def test_a_star_polls_all_readings_but_those_with_a_rate_of_their_own(load: Load) -> None:
+def test_a_star_polls_all_readings_and_respects_their_own_rates(load: Load) -> None:
     def polls(entries: str) -> dict[str, float | None]:
         (line,) = load(HEAD + TOY + f'every = "1 s"\npoll = {entries}').lines
         return {poll.register.name: poll.every for poll in line.drives[0].polls}
@@ -666,7 +669,7 @@ def test_a_star_polls_all_readings_but_those_with_a_rate_of_their_own(load: Load
     }
 
 
-def test_a_text_in_a_poll_is_named_as_a_text(mistakes: Mistakes, tmp_path: Path) -> None:
+def test_polling_a_text_is_reported_as_such(mistakes: Mistakes, tmp_path: Path) -> None:
     (tmp_path / "meter.toml").write_text(
         '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'
         "[reading]\npower = { at = 1 }\n[text]\nmark = { at = 9, length = 4 }\n"
@@ -675,6 +678,6 @@ def test_a_text_in_a_poll_is_named_as_a_text(mistakes: Mistakes, tmp_path: Path)
     assert sentence.endswith("'mark' of Meter is a text: texts are read, but neither polled nor written")
 
 
-def test_a_star_twice_is_a_mistake(mistakes: Mistakes) -> None:
+def test_a_second_star_in_a_poll_list_is_reported(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY + 'poll = ["*", "*"]')
     assert sentence.endswith('poll number 2: "*" is there twice; keep it once')

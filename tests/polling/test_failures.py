@@ -243,9 +243,7 @@ def test_a_failed_poller_stops_polling_but_sends_commands(failed: Two) -> None:
     exchanges = failed.poller.statistics()["ill"].counters.exchanges
     bus = failed.poller.bus("ill")
     bus.drives[0].read(CURRENT)
-    assert (
-        failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2
-    )  # the read, and one in flight
+    assert failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2  # with one in flight
 
 
 def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:

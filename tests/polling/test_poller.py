@@ -134,7 +134,7 @@ def port(pump: SimulatedDrive) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
+def test_requests_at_a_rate_stay_on_their_grid_without_bursts(port: str) -> None:
     periods = {"output_current": 0.02, "output_frequency": 0.05}
     polls = [polled(drive(), [Quick.registers[name]], every).polls for name, every in periods.items()]
     before_ns = clock.now_ns()
@@ -154,14 +154,14 @@ def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
     assert len(polling.rows) + left_out >= slots
 
 
-def test_without_a_rate_the_line_is_kept_busy(port: str) -> None:
+def test_without_a_rate_all_registers_are_polled_continuously(port: str) -> None:
     with Polling(line(port, polled(drive(), READINGS))) as polling:
         polling.until("ok", 100 * len(READINGS))
     assert len({row.register for row in polling.rows}) == len(READINGS)
     assert polling.poller.summary()["lines"]["line"]["overrun_slots"] == 0
 
 
-def test_neither_starves_the_other(port: str) -> None:
+def test_registers_with_and_without_a_rate_are_both_polled(port: str) -> None:
     polls = polled(drive(), READINGS).polls[1:] + polled(drive(), READINGS[:1], 0.01).polls
     with Polling(line(port, PolledDrive(drive(), polls))) as polling:
         until(lambda: {row.register for row in polling.look() if row.value is not None} == NAMES)
@@ -173,7 +173,7 @@ def test_neither_starves_the_other(port: str) -> None:
     [[{"baudrate": 9600}, {"baudrate": 19_200}], [{"silence": None}, {"silence": 0.01}]],
     ids=["two baud rates", "two silences"],
 )
-def test_drives_of_one_kind_are_asked_side_by_side(kinds: list[dict[str, Any]]) -> None:
+def test_drives_with_equal_settings_are_polled_next_to_each_other(kinds: list[dict[str, Any]]) -> None:
     drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
     wire = ClockedWire([simulated(drive) for drive in drives], Faults())
     with ClockedLines(wire, [polled(drive, [Toy.fault]) for drive in drives]) as clocked:
@@ -186,7 +186,7 @@ def test_drives_of_one_kind_are_asked_side_by_side(kinds: list[dict[str, Any]]) 
 # ---- rows ----
 
 
-def test_batches_for_a_while(port: str) -> None:
+def test_batches_yields_rows_for_the_given_seconds(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         rows = [row for batch in poller.batches(0.3, every=0.05) for row in batch]
         samples = [row for row in rows if row.value is not None]
@@ -195,13 +195,13 @@ def test_batches_for_a_while(port: str) -> None:
         assert all(row.uncertainty_ns is not None and row.uncertainty_ns > 0 for row in samples)
 
 
-def test_batches_until_the_caller_leaves_off(port: str) -> None:
+def test_leaving_a_loop_over_batches_early_is_allowed(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         assert len(next(poller.batches())) > 0
 
 
 @pytest.mark.parametrize("taker", ["pyarrow", "polars"])
-def test_a_batch_is_taken_as_it_is(port: str, taker: str) -> None:
+def test_pyarrow_and_polars_read_a_batch_of_a_poller(port: str, taker: str) -> None:
     module = pytest.importorskip(taker, reason=f"needs {taker}")
     take = {"pyarrow": "record_batch", "polars": "DataFrame"}[taker]
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
@@ -211,7 +211,7 @@ def test_a_batch_is_taken_as_it_is(port: str, taker: str) -> None:
     assert len(columns["value"]) == len(batch)
 
 
-def test_an_asyncio_program_needs_no_second_api(port: str) -> None:
+def test_an_asyncio_program_can_wait_for_rows_with_fileno(port: str) -> None:
     async def three() -> list[Row]:
         loop = asyncio.get_running_loop()
         batches: asyncio.Queue[Any] = asyncio.Queue()
@@ -239,7 +239,7 @@ def test_untaken_rows_are_bounded_and_counted(port: str, monkeypatch: pytest.Mon
 
 
 @pytest.mark.long
-def test_many_lines_at_once() -> None:
+def test_sixteen_lines_are_polled_concurrently() -> None:
     with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
         drives = [polled(Quick(at, name=f"drive-{at}"), READINGS) for at in range(1, 17)]
         lines = [
@@ -258,7 +258,7 @@ def test_many_lines_at_once() -> None:
 
 
 @pytest.mark.long
-def test_a_call_of_one_line_costs_the_others_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calls_of_one_line_do_not_cause_checks_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lines with a rate are checked once per interval, no matter how often other lines call."""
     looks: list[int] = []
     is_steady = PolledLine.is_steady
@@ -281,7 +281,7 @@ def test_a_call_of_one_line_costs_the_others_nothing(monkeypatch: pytest.MonkeyP
     assert len(looks) <= len(lines) * (seconds * 1e9 / poller_module.LOOK_NS + 2)
 
 
-def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDrive) -> None:
+def test_commands_are_carried_out_while_the_line_is_polled(port: str, pump: SimulatedDrive) -> None:
     with Polling(line(port, polled(drive(), READINGS), name="hall-1")) as polling:
         bus = polling.poller.bus("hall-1")
         (ours,) = bus.drives
@@ -329,7 +329,7 @@ PIECES = {  # further statuses if this computer delivered the rest of the bytes 
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_polled_reply_has_its_status(fault: str, pump: SimulatedDrive) -> None:
+def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: SimulatedDrive) -> None:
     fate, said = FAULTS[fault]
     # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
@@ -342,7 +342,7 @@ def test_a_polled_reply_has_its_status(fault: str, pump: SimulatedDrive) -> None
 
 
 @pytest.mark.slow
-def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
+def test_a_drive_that_answers_every_second_request_has_values_and_misses(pump: SimulatedDrive) -> None:
     turns = itertools.cycle([True, False])
     wire = Faulty([pump], lambda reply: reply if next(turns) else b"", unpaced=True)
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
@@ -354,7 +354,7 @@ def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
 
 
 @pytest.mark.slow
-def test_a_silence_that_is_too_short_for_the_drive() -> None:
+def test_a_silence_too_short_for_the_drive_causes_misses() -> None:
     """The drive takes a request that arrives before its own silence is over for a part of the last frame."""
     strict = simulated(Brisk(1, name="pump-1"))
     strict.needs_silence = True
@@ -368,7 +368,7 @@ def test_a_silence_that_is_too_short_for_the_drive() -> None:
     polling.check_summary()
 
 
-def test_replies_that_come_byte_by_byte(pump: SimulatedDrive) -> None:
+def test_replies_at_9600_baud_are_read_without_early_requests(pump: SimulatedDrive) -> None:
     """On a line at 9600 baud, silences are kept: the drive receives no early request."""
     slow = simulated(Slow(1, name="pump-1"))
     asked = polled(Slow(1, name="pump-1"), Slow.readings())
@@ -381,7 +381,7 @@ def test_replies_that_come_byte_by_byte(pump: SimulatedDrive) -> None:
     polling.check_summary()
 
 
-def test_a_port_that_is_gone_in_the_middle_of_a_reply() -> None:
+def test_a_port_lost_during_a_reply_gives_misses_with_that_status() -> None:
     master, slave = os.openpty()
     with Polling(line(os.ttyname(slave), polled(drive(), READINGS))) as polling:
         os.read(master, 1024)
@@ -394,7 +394,7 @@ def test_a_port_that_is_gone_in_the_middle_of_a_reply() -> None:
 
 
 @pytest.mark.long
-def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> None:
+def test_a_port_that_returns_under_its_link_is_reopened(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     asked = [polled(drive(), ONE), polled(drive(2, "pump-2"), ONE, 0.05)]
     targets: set[Path] = set()
@@ -447,7 +447,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Path) -> None:
+def test_a_lost_line_does_not_disturb_the_others(port: str, tmp_path: Path) -> None:
     link = tmp_path / "hall-2"
     lines = [
         line(port, polled(drive(), ONE), name="hall-1"),
@@ -465,7 +465,7 @@ def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Pa
 
 @pytest.mark.long
 @pytest.mark.parametrize("slow", ["close", "open"])
-def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
+def test_a_slow_reopening_or_closing_does_not_delay_other_lines(
     port: str, slow: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link, is_held_up, may_go_on = tmp_path / "hall-2", threading.Event(), threading.Event()
@@ -499,7 +499,7 @@ def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
+def test_a_drive_that_returns_after_a_silence_is_polled_again(pump: SimulatedDrive) -> None:
     other = simulated(drive(2, "pump-2"))
     asked = [polled(drive(), ONE), polled(drive(), READINGS[:1], 0.05), polled(drive(2, "pump-2"), ONE)]
     with Simulator([Wire([pump, other], unpaced=True)]) as sim:
@@ -528,7 +528,7 @@ def test_a_plant_without_lines_can_be_polled() -> None:
 
 
 @pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
-def test_nothing_is_left_behind(port: str, end: str) -> None:
+def test_closing_a_poller_leaves_no_descriptor_or_thread(port: str, end: str) -> None:
     Poller(plant(line(port, polled(drive(), ONE)))).close()  # opens the descriptors that are opened lazily
     before = descriptors(), threads()
     if end == "never entered":
@@ -605,7 +605,7 @@ def test_a_request_unanswered_at_the_end_has_a_row(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_slot_that_is_not_over_at_the_end_was_not_missed(responder: tuple[int, str], leaves: str) -> None:
+def test_a_slot_that_is_not_over_at_the_end_has_no_row(responder: tuple[int, str], leaves: str) -> None:
     """At the end of every run, some slots have started that are not over; they are no misses."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
@@ -632,7 +632,7 @@ def test_motors_are_stopped_before_the_port_is_closed(port: str, pump: Simulated
     assert pump["control"] == 0
 
 
-def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) -> None:
+def test_an_unopenable_port_raises_and_leaves_no_descriptor_or_thread(port: str) -> None:
     Poller(plant(line(port, polled(drive(), ONE)))).close()
     before = descriptors(), threads()
     good, bad = (
@@ -645,7 +645,7 @@ def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) 
     assert (descriptors(), threads()) == before
 
 
-def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
+def test_rows_can_be_taken_after_the_poller_is_closed(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), ONE)))) as poller:
         until(lambda: poller.summary()["samples"])
     poller.close()  # a second call is allowed
@@ -654,7 +654,7 @@ def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
     assert poller.take() is None
 
 
-def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
+def test_a_line_can_be_closed_right_after_its_port_was_reopened() -> None:
     """The queue of the new port starts empty, whatever was queued on the earlier port."""
     sim = simulated(drive())
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as clocked:

@@ -40,7 +40,7 @@ def values(rows: list[Row]) -> dict[str, float]:
 # ---- halves ----
 
 
-def test_registers_at_the_same_addresses_and_groups_stay_together() -> None:
+def test_halves_keep_registers_of_one_address_or_group_together() -> None:
     class Kind(Drive):
         read_together = (("high", "low"),)
         a = reading(0)
@@ -68,7 +68,7 @@ def test_registers_at_the_same_addresses_and_groups_stay_together() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [None, 0.5])
-def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(every: float | None) -> None:
+def test_one_refused_register_hardly_delays_its_neighbours(every: float | None) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, refused={7})
     with clocked_line_of(drive, sim, every) as clocked:
@@ -84,7 +84,7 @@ def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(ev
 
 
 @pytest.mark.slow
-def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
+def test_a_device_with_a_smaller_limit_is_read_in_smaller_blocks() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=8)
     with clocked_line_of(drive, sim) as clocked:
@@ -98,7 +98,7 @@ def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
 
 
 @pytest.mark.slow
-def test_a_temporarily_refused_block_is_read_whole_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_temporarily_refused_block_is_later_read_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
@@ -117,7 +117,7 @@ def test_a_temporarily_refused_block_is_read_whole_again(monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_trials_of_the_whole_make_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_retries_of_a_split_block_add_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=12)
@@ -135,7 +135,7 @@ def test_trials_of_the_whole_make_no_rows(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.long
 @pytest.mark.parametrize("every", [None, 0.5])
 @pytest.mark.parametrize("longest", usually(10, 1))
-def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
+def test_a_device_that_ignores_long_requests_is_read_with_shorter_ones(
     longest: int, every: float | None
 ) -> None:
     drive = family(WIDE)(1, name="pump-1")
@@ -150,7 +150,7 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
 
 
 @pytest.mark.long
-def test_while_it_is_silent_to_long_requests_it_is_asked_at_its_rate() -> None:
+def test_probes_of_a_device_that_ignores_long_requests_keep_the_rate() -> None:
     """The probe, which reads a single register, has the same period as the block."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
@@ -161,7 +161,7 @@ def test_while_it_is_silent_to_long_requests_it_is_asked_at_its_rate() -> None:
 
 
 @pytest.mark.long
-def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> None:
+def test_blocks_of_a_dead_drive_are_not_split() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     sim.deaf_until = float("inf")
@@ -176,7 +176,7 @@ def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> N
 
 
 @pytest.mark.slow
-def test_a_drive_that_falls_silent_is_not_split() -> None:
+def test_blocks_of_a_drive_that_falls_silent_are_not_split() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     with clocked_line_of(drive, sim) as clocked:
@@ -191,7 +191,7 @@ def test_a_drive_that_falls_silent_is_not_split() -> None:
 
 
 @pytest.mark.long
-def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
+def test_a_block_that_was_answered_once_is_not_split_by_silence() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, drive.registers.values())]) as clocked:
@@ -208,7 +208,7 @@ def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
 @settings(max_examples=examples(4), deadline=None)
 @example({2, 4}, 5, 1)
 @given(st.sets(st.integers(1, 5), max_size=3), st.integers(1, 6), st.integers(1, 6))
-def test_no_register_is_lost_that_can_be_read_by_itself(refused: set[int], most: int, silent: int) -> None:
+def test_every_register_that_can_be_read_alone_is_polled(refused: set[int], most: int, silent: int) -> None:
     """No example refuses register 0, because its reply proves that no late reply is due.
 
     Without that proof, each missing reply would delay the next request by two minutes.
@@ -281,7 +281,7 @@ class Moody(SimulatedDrive):
     ("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"]
 )
 @pytest.mark.parametrize("registers", [[Toy.output_current, Toy.fault], [Toy.fault]], ids=["two", "one"])
-def test_a_block_that_is_readable_again_is_polled_as_before(
+def test_a_block_that_becomes_readable_again_is_polled_as_before(
     says: Reason, is_set_aside: bool, registers: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
@@ -339,7 +339,7 @@ def rows_by_register(sim: SimulatedDrive) -> tuple[dict[str, Row], Poller, list[
         return {row.register: row for row in rows if row.status in ANSWERED}, poller, rows
 
 
-def test_all_of_a_meter_is_one_request() -> None:
+def test_all_registers_of_the_meter_are_read_by_one_request() -> None:
     (block,) = blocks(Meter(1), Meter.readings())
     assert (block.start, block.count, len(block.registers)) == (0, 11, 8)
 
@@ -363,7 +363,7 @@ def test_a_scale_register_is_read_with_its_register() -> None:
     assert (block.start, block.count, block.offset(Meter.power)) == (8, 2, 0)
 
 
-def test_values_of_a_meter_are_polled() -> None:
+def test_polled_values_of_all_number_formats_are_right() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = 230.5, 2**53, 21.5, 3
     sim["runs"], sim["power_scale"] = 1, -2
@@ -398,7 +398,7 @@ def test_an_invalid_value_is_a_miss_with_its_reason() -> None:
     assert statistics.samples == sum(row.status == "ok" for row in rows)
 
 
-def test_words_that_are_written_several_at_once_are_read_with_the_others() -> None:
+def test_registers_written_by_function_16_are_read_together_with_others() -> None:
     class Controller(Drive):
         """A drive with a register that only function 16 writes."""
 

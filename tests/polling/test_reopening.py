@@ -60,7 +60,7 @@ def hall(tmp_path: Path, _turns_awaited: None) -> Iterator[Plant]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", usually(RuntimeError("can't start new thread"), MemoryError()))
-def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
+def test_a_stop_reopens_the_port_if_no_thread_can_and_polling_continues(
     hall: Plant, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
     tried = 0
@@ -83,7 +83,7 @@ def test_without_a_thread_a_stop_opens_the_port_and_polling_goes_on(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [0, 1])
-def test_lines_are_opened_though_the_system_gives_few_threads(
+def test_all_lines_are_opened_even_with_few_threads(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
     """If a reload failed here, motors would keep running without any stop."""
@@ -115,7 +115,7 @@ def test_lines_are_opened_though_the_system_gives_few_threads(
 
 
 @pytest.mark.slow
-def test_a_stop_opens_the_port_once_the_poller_has_failed(
+def test_a_stop_reopens_a_lost_port_after_the_poller_has_failed(
     hall: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     until(lambda: hall.port.is_lost)
@@ -180,7 +180,7 @@ class Scattered(Drive):
 
 @pytest.mark.parametrize("every", [None, 0.1])
 @pytest.mark.parametrize("most", [1, 2, 3])
-def test_each_register_has_its_turn_though_connections_end_early(every: float | None, most: int) -> None:
+def test_every_register_is_read_although_connections_end_early(every: float | None, most: int) -> None:
     """An interrupted request is sent first on the next connection, unless it was its connection's first."""
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:

@@ -51,7 +51,7 @@ def only_line(made: ClockedLines) -> PolledLine:
     return line
 
 
-def test_one_register_s_rate_is_changed_and_no_other_s(two: ClockedLines) -> None:
+def test_set_rate_of_one_register_changes_no_other_rate(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "output_current", 1.0)
     two.run(1)  # queued requests are still sent
     counts = values(two.run(10))
@@ -60,7 +60,7 @@ def test_one_register_s_rate_is_changed_and_no_other_s(two: ClockedLines) -> Non
     assert all(count in (99, 100, 101) for count in counts.values())
 
 
-def test_all_registers_of_a_drive_get_a_rate(two: ClockedLines) -> None:
+def test_set_rate_of_a_drive_changes_all_its_registers(two: ClockedLines) -> None:
     pump = two.poller.bus("line").drives[0]
     two.poller.set_rate(pump, None, 0.5)
     two.run(1)
@@ -69,7 +69,7 @@ def test_all_registers_of_a_drive_get_a_rate(two: ClockedLines) -> None:
     assert {counts["pump-2", register.name] for register in ALL} <= {99, 100, 101}
 
 
-def test_from_a_rate_to_as_fast_as_possible_and_back(two: ClockedLines) -> None:
+def test_a_rate_can_be_removed_and_set_again(two: ClockedLines) -> None:
     for drive in ("pump-1", "pump-2"):
         two.poller.set_rate(drive, None, None)
     two.run(1)
@@ -82,7 +82,7 @@ def test_from_a_rate_to_as_fast_as_possible_and_back(two: ClockedLines) -> None:
 
 
 @pytest.mark.slow
-def test_the_first_value_at_a_new_rate_comes_at_once(two: ClockedLines) -> None:
+def test_the_first_value_at_a_new_rate_is_read_immediately(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "fault", 3600.0)
     two.run(1)
     assert values(two.run(10))["pump-1", "fault"] == 0
@@ -90,7 +90,7 @@ def test_the_first_value_at_a_new_rate_comes_at_once(two: ClockedLines) -> None:
     assert values(two.run(1))["pump-1", "fault"] == 1
 
 
-def test_registers_that_stay_keep_their_slots() -> None:
+def test_registers_with_an_unchanged_rate_keep_their_slots() -> None:
     """They keep their slots although they are in a new block, without the register whose rate changed."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
@@ -104,7 +104,7 @@ def test_registers_that_stay_keep_their_slots() -> None:
 
 
 @pytest.mark.long
-def test_every_value_is_its_own_register_s_while_rates_change() -> None:
+def test_no_value_is_misattributed_while_rates_change() -> None:
     """Every value is of the right register, and each register has rows after each change."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
@@ -134,7 +134,7 @@ def test_every_value_is_its_own_register_s_while_rates_change() -> None:
 
 
 @pytest.mark.slow
-def test_memory_is_bounded_over_many_rates() -> None:
+def test_memory_is_bounded_over_many_changes_of_rates() -> None:
     with clocked(polled(toy(), ALL, 0.1)) as made:
         line = only_line(made)
 
@@ -154,7 +154,7 @@ def test_memory_is_bounded_over_many_rates() -> None:
     assert all(now <= then + 4 for now, then in zip(after, before, strict=True)), (before, after)
 
 
-def test_skipped_slots_stay_counted_when_their_job_goes() -> None:
+def test_skipped_slots_remain_counted_after_their_rate_is_changed() -> None:
     with clocked(polled(toy(), ALL, 0.001)) as made:
         made.run(2)
         (before,) = (line["overrun_slots"] for line in made.poller.summary()["lines"].values())
@@ -173,7 +173,7 @@ class Stubborn(EncodedDrive):
         return super().read(function, start, count)
 
 
-def test_a_register_that_is_refused_costs_the_others_nothing_at_a_new_rate() -> None:
+def test_a_refused_register_remains_set_aside_at_a_new_rate() -> None:
     pump = toy()
     with ClockedLines(ClockedWire([Stubborn(pump)], Faults()), [polled(pump, ALL, 0.1)]) as made:
         made.run(3)
@@ -188,7 +188,7 @@ def test_a_register_that_is_refused_costs_the_others_nothing_at_a_new_rate() -> 
 
 
 @pytest.mark.slow
-def test_a_silent_drive_s_rate_is_changed_while_it_rests() -> None:
+def test_the_rate_of_a_silent_drive_can_be_changed() -> None:
     pump, silent = toy(1), SimulatedDrive(toy(2))
     silent.deaf_until = float("inf")
     drives = [polled(pump, ALL, 0.1), polled(silent.drive, ALL, 0.1)]
@@ -206,7 +206,7 @@ def test_a_silent_drive_s_rate_is_changed_while_it_rests() -> None:
         assert {values(made.run(10))["pump-2", register.name] for register in ALL} <= {49, 50, 51}
 
 
-def test_rates_are_set_before_the_polling_too() -> None:
+def test_rates_can_be_set_before_polling_starts() -> None:
     pump = toy()
     made = clocked(polled(pump, ALL, 0.1))
     made.poller.set_rate(pump, CURRENT, 1.0)
@@ -216,7 +216,7 @@ def test_rates_are_set_before_the_polling_too() -> None:
     assert counts["pump-1", "status"] in (99, 100, 101)
 
 
-def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> None:
+def test_a_drive_that_is_added_again_has_its_declared_rates() -> None:
     pump = polled(toy(), ALL, 0.1)
     with clocked(pump) as made:
         made.poller.set_rate("pump-1", None, 1.0)
@@ -246,12 +246,12 @@ def test_an_invalid_rate_changes_nothing(two: ClockedLines) -> None:
     assert set(values(two.run(10)).values()) <= {99, 100, 101}
 
 
-def test_another_plant_s_drive_of_the_same_name_is_not_taken_for_one_s_own(two: ClockedLines) -> None:
+def test_set_rate_of_another_drive_object_with_the_same_name_raises(two: ClockedLines) -> None:
     with pytest.raises(ValueError, match="pump-1 is not polled here"):
         two.poller.set_rate(toy(1), None, 1.0)
 
 
-def test_no_rate_is_set_when_polling_has_ended() -> None:
+def test_set_rate_raises_after_polling_has_ended() -> None:
     poller = Poller(plant())
     poller.close()
     with pytest.raises(ValueError, match="polling has ended"):

@@ -16,7 +16,7 @@ FIRST, LATER = 8, 52  # durations in s over which the promised rates are measure
 BACK = 45  # s until drives that were dead from the start are polled again, after all have power
 
 
-def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
+def test_the_row_of_a_skipped_slot_does_not_appear_before_the_slot() -> None:
     """Skipped slots are planned in advance, but their rows must not appear before the slots."""
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)
@@ -63,7 +63,7 @@ def test_a_line_is_checked_more_often_while_a_drive_is_silent(
     ("dead", "back_s"),
     [(1, 5), (5, 25), (10, 45)],
 )
-def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_s: int) -> None:
+def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s: int) -> None:
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]
     clocked = ClockedLines(
@@ -93,7 +93,7 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
 @pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead", "every"), [(16, 5, None), (16, 1, 0.5), (31, 10, None)])
-def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
+def test_drives_dead_from_the_start_hardly_slow_the_others(
     count: int, dead: int, every: float | None
 ) -> None:
     """Every third drive is dead, so that most answering drives are polled after a dead one."""

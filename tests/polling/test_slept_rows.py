@@ -47,7 +47,7 @@ print(json.dumps([[row.time_ns, row.monotonic_ns] for row in rows if row.status 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_rows_have_the_time_of_their_exchange(tmp_path: Path) -> None:
+def test_rows_have_the_time_of_their_exchange_although_the_computer_slept(tmp_path: Path) -> None:
     sim = simulated(InvtCHE(1, baudrate=38400))
     answer, slept, asked_ns = sim.answer, tmp_path / "slept", list[int]()
 
@@ -72,7 +72,7 @@ def test_rows_have_the_time_of_their_exchange(tmp_path: Path) -> None:
     slept_for = {
         True: set[int](),
         False: set[int](),
-    }  # hours, by whether the request was sent before the sleep
+    }  # hours; True: requests sent before the sleep
     before_ns, amid_ns = asked_ns[48], asked_ns[49]  # the second request may be timed before or after it
     for time_ns, monotonic_ns in json.loads(ran.stdout):
         if not before_ns < monotonic_ns <= amid_ns:

@@ -110,14 +110,16 @@ def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float)
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "slow"), STORIES)
-def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[float], Delay], float]) -> None:
+def test_no_value_is_misattributed_over_a_slow_path(
+    name: str, slow: tuple[Callable[[float], Delay], float]
+) -> None:
     check_story(Path(of_one_variant(LINES[name])), slow)
 
 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "longest"), STALLS)
-def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
+def test_no_value_is_misattributed_over_a_stalled_path(name: str, longest: float) -> None:
     Path(of_one_variant(LINES[name])).run_over(stalling(longest))
 
 
@@ -132,7 +134,7 @@ class OneByOne(Drive):
 
 
 @pytest.mark.parametrize("delay", [constant(0.6), constant(4.0), stalling(0.9), stalling(15.0)])
-def test_replies_that_all_look_alike_are_never_mixed_up(delay: Delay) -> None:
+def test_late_replies_that_look_alike_are_never_misattributed(delay: Delay) -> None:
     """A reply to a read of another table, even an exception, proves that no earlier reply is still due."""
     drives = [OneByOne(address, name=f"meter-{address}") for address in (1, 2)]
     story = Path(drives)
@@ -149,7 +151,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), READS)
-def test_reads_over_a_slow_path_are_true(
+def test_reads_over_a_slow_path_return_the_right_values(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
     path_of: Callable[..., tuple[Bus, PathLine]],
@@ -163,7 +165,7 @@ def test_reads_over_a_slow_path_are_true(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ASKED)
-def test_raw_reads_over_a_slow_path_are_true(
+def test_raw_reads_over_a_slow_path_return_the_right_values(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
     path_of: Callable[..., tuple[Bus, PathLine]],
@@ -204,7 +206,7 @@ WRITTEN = {
 
 @pytest.mark.parametrize("seconds", usually(0.6, 0.0, 0.3, 4.0))
 @pytest.mark.parametrize("name", WRITTEN)
-def test_write_results_over_a_slow_path_are_true(
+def test_outcomes_of_writes_over_a_slow_path_are_right(
     name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(WRITTEN[name])
@@ -212,7 +214,7 @@ def test_write_results_over_a_slow_path_are_true(
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_write_has_the_time_that_reads_did_not_need(
+def test_a_write_may_be_answered_more_slowly_than_reads(
     name: str, path_of: Callable[..., tuple[Bus, PathLine]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only the reply to the write is slow, and it is received, not replaced by a read back."""
@@ -236,7 +238,7 @@ def test_a_write_has_the_time_that_reads_did_not_need(
         assert (opened.peer(drive).counters().late, opened.peer(drive).silences) == (0, 0)
 
 
-def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
+def test_timeouts_of_a_delixi_are_at_least_80_ms(
     path_of: Callable[..., tuple[Bus, PathLine]],
 ) -> None:
     for drive in (DelixiModbus(1), DelixiNative(1)):
@@ -249,7 +251,7 @@ def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
 
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6])
 @pytest.mark.parametrize("model", MAKE)
-def test_a_stop_over_a_slow_path_is_seen_to_be_done(
+def test_a_stop_over_a_slow_path_is_confirmed(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     """Its first frame is sent immediately; later reads wait as long as replies are known to take."""
@@ -259,7 +261,7 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", usually("drop", "flip", "split", "noise"))
-def test_all_families_on_a_slow_path_that_is_rough_too(kind: str) -> None:
+def test_no_value_is_misattributed_over_a_slow_path_with_other_faults(kind: str) -> None:
     story = Path(of_all_variants())
     story.wire.faults = Faults(**{kind: 0.1})
     story.run_over(stalling(3.0))
@@ -315,7 +317,7 @@ def two_of(name: str) -> list[Drive]:
 @pytest.mark.long
 @every_gateway
 @pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
-def test_a_slow_gateway_costs_time_and_no_truth(
+def test_no_value_is_misattributed_over_a_slow_gateway(
     name: str, slow: tuple[Callable[[float], Delay], float], story_of: type[Path]
 ) -> None:
     story = story_of(two_of(name), port=TCP)
@@ -326,7 +328,9 @@ def test_a_slow_gateway_costs_time_and_no_truth(
 @pytest.mark.long
 @every_gateway
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, story_of: type[Path]) -> None:
+def test_late_doubled_and_reordered_tcp_replies_are_never_misattributed(
+    kind: str, story_of: type[Path]
+) -> None:
     story = story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP)
     story.wire.faults = Faults(**{kind: 0.2, "late": story.wire.most_late})
     story.run_over(stalling(1.0))
@@ -335,14 +339,14 @@ def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, stor
 
 @pytest.mark.long
 @pytest.mark.parametrize("story_of", usually(TrueIdsPath, OwnIdsPath))
-def test_a_stalled_gateway_costs_no_truth(story_of: type[Path]) -> None:
+def test_no_value_is_misattributed_over_a_stalled_gateway(story_of: type[Path]) -> None:
     story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).run_over(
         stalling(15.0)
     )
 
 
 @pytest.mark.long
-def test_a_provably_late_reply_delays_no_request() -> None:
+def test_a_late_reply_recognised_by_its_id_delays_no_request() -> None:
     """No request waits for a late reply, and no request is sent only as a proof."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
     story.run_over(stalling(3.0))
@@ -364,7 +368,7 @@ def gateway_path_of(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
-def test_reads_over_a_slow_gateway_are_true(
+def test_reads_over_a_slow_gateway_return_the_right_values(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
     gateway_path_of: Callable[..., tuple[Bus, PathLine]],
@@ -376,7 +380,7 @@ def test_reads_over_a_slow_gateway_are_true(
 
 @pytest.mark.slow
 @table("seconds", [0.0, 0.6, 4.0])
-def test_write_results_over_a_slow_gateway_are_true(
+def test_outcomes_of_writes_over_a_slow_gateway_are_right(
     seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(InnovertIBD(1, ram=["acceleration_time"]))
@@ -386,7 +390,7 @@ def test_write_results_over_a_slow_gateway_are_true(
 @pytest.mark.slow
 @table("seconds", [0.0, 0.6])
 @table("model", FAMILIES)
-def test_a_stop_over_a_slow_gateway_is_seen_to_be_done(
+def test_a_stop_over_a_slow_gateway_is_confirmed(
     model: str, seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(DelixiModbus(1) if model == "delixi-modbus" else MAKE[model](1))

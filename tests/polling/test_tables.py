@@ -23,7 +23,7 @@ SPEED = "pump-1.motor_speed"
 
 
 @pytest.mark.slow
-def test_pandas_gets_times_with_their_type() -> None:
+def test_to_pandas_returns_times_as_datetime64_in_utc() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     frame = example().to_pandas()
     assert list(frame.columns) == list(ROW_COLUMNS)
@@ -35,7 +35,7 @@ def test_pandas_gets_times_with_their_type() -> None:
 
 
 @pytest.mark.slow
-def test_polars_gets_times_with_their_type() -> None:
+def test_to_polars_returns_times_as_datetime_in_utc() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = example().to_polars()
     assert frame.schema["time"] == polars.Datetime("ns", "UTC")
@@ -60,7 +60,7 @@ def test_polars_gets_times_with_their_type() -> None:
         ),
     ],
 )
-def test_a_missing_library_is_named_with_its_extra(
+def test_the_error_for_a_missing_library_has_the_install_command(
     monkeypatch: pytest.MonkeyPatch, method: str, missing: str, sentence: str
 ) -> None:
     pytest.importorskip("pandas", reason="needs pandas")
@@ -112,7 +112,7 @@ def test_registers_of_one_request_share_a_row() -> None:
     assert table.column("monotonic_ns").to_pylist() == [second * SECOND for second in (1, 2, 3, 4)]
 
 
-def test_pandas_and_polars_take_the_wide_form() -> None:
+def test_pandas_and_polars_read_the_wide_form() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = example().wide(PUMP, SPEED).to_pandas()
@@ -128,7 +128,7 @@ def test_pandas_and_polars_take_the_wide_form() -> None:
     assert frame[SPEED].to_list() == [0.3]
 
 
-def test_chosen_columns_come_in_their_order_and_are_always_there() -> None:
+def test_chosen_columns_are_in_their_order_even_if_empty() -> None:
     """A chosen column is present even if a batch has no row for it: all batches have the same columns."""
 
     never = "насос.output_frequency"
@@ -139,7 +139,7 @@ def test_chosen_columns_come_in_their_order_and_are_always_there() -> None:
     assert table.column(PUMP).to_pylist() == [49.99]
 
 
-def test_an_unknown_column_is_an_error() -> None:
+def test_an_unknown_column_raises_value_error() -> None:
     with pytest.raises(ValueError, match=r"no column 'pump-1\.motor_sped'; did you mean pump-1\.motor_"):
         example().wide("pump-1.motor_sped")
     with pytest.raises(ValueError, match=r"there is no column 'x'; a column is DRIVE\.REGISTER"):
@@ -148,7 +148,7 @@ def test_an_unknown_column_is_an_error() -> None:
         example().wide(PUMP, PUMP)
 
 
-def test_rows_are_in_the_order_of_their_times_whatever_order_they_came_in() -> None:
+def test_rows_of_the_wide_form_are_sorted_by_time() -> None:
     """Rows of two lines may arrive out of order; the table is sorted by time."""
     rows = [row(second, "pump", name, second) for name in ("b", "a") for second in (3.0, 1.0, 2.0)]
     table = pa.table(from_rows(rows).wide())
@@ -156,7 +156,7 @@ def test_rows_are_in_the_order_of_their_times_whatever_order_they_came_in() -> N
     assert table.column("monotonic_ns").to_pylist() == [SECOND, 2 * SECOND, 3 * SECOND]
 
 
-def test_only_equal_times_are_joined() -> None:
+def test_only_rows_with_equal_times_are_joined() -> None:
     early = row(1.0, "pump", "a", 1.0)
     rows = [
         early,
@@ -168,7 +168,7 @@ def test_only_equal_times_are_joined() -> None:
     assert table.column("pump.b").to_pylist() == table.column("fan.b").to_pylist() == [None, 1.0]
 
 
-def test_a_clock_that_is_set_back_joins_nothing() -> None:
+def test_rows_with_equal_utc_but_different_monotonic_times_are_not_joined() -> None:
     """If UTC repeats, the monotonic time still distinguishes the rows."""
 
     first = row(1.0, "pump", "a", 1.0)
@@ -176,7 +176,7 @@ def test_a_clock_that_is_set_back_joins_nothing() -> None:
     assert table.column("pump.a").to_pylist() == [1.0, 2.0]
 
 
-def test_a_miss_is_null_and_hides_no_sample() -> None:
+def test_a_miss_is_null_and_does_not_replace_a_sample() -> None:
     columns = Columns(4)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)
     assert add_miss(columns, block(0, 0), Status.NOT_ASKED, SECOND, UTC_0)
@@ -192,14 +192,14 @@ def test_an_empty_batch_has_an_empty_wide_form() -> None:
     assert pa.table(Batch(Columns(4), Names(["p"]), Names(["r"])).wide("p.r")).num_rows == 0
 
 
-def test_drives_with_equal_columns_are_an_error() -> None:
+def test_equal_column_names_of_two_drives_raise_value_error() -> None:
     rows = from_rows([row(1.0, "a.b", "c", 1.0), row(1.0, "a", "b.c", 2.0)])
     with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a register that is called 'a\.b\.c'"):
         rows.wide()
 
 
 @pytest.mark.slow
-def test_many_rows_against_pandas_own_pivot() -> None:
+def test_the_wide_form_equals_the_pivot_of_pandas() -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     rows = [
         row(second / 7, f"pump-{second % 3}", name, float(second), "ok")
