@@ -6,7 +6,7 @@
  * have come, or never will. Therefore outstanding requests are kept beyond the window, and a proof is sent
  * first: a request whose reply differs from all outstanding ones in function, length or value.
  *
-* A reply that fits an outstanding request counts as the reply to that request. It settles the earliest
+ * A reply that fits an outstanding request counts as the reply to that request. It settles the earliest
  * request that it fits, and all requests before that request. */
 #include "line.h"
 
@@ -118,7 +118,7 @@ static void drop_time(struct md_owed *owed)
 /* ---- proofs ---- */
 
 /* Some proofs may not work: a device may be silent to registers that it lacks, and a document may be wrong
-* about a register's range. A proof that was never answered is removed after MOST_FAILURES failures. A
+ * about a register's range. A proof that was never answered is removed after MOST_FAILURES failures. A
  * missing reply counts only if the drive has replied to another request since the last failure. */
 enum { MOST_FAILURES = 2, ANSWERED = 0xFF };
 

@@ -153,7 +153,7 @@ struct md_drive {
     int64_t patience_ns;               /* a longer timeout, learnt from late replies; 0: none */
     int64_t interval_ns;               /* least time between an exchange and the next request */
     int64_t ready_ns;                  /* earliest time of the next request */
-    uint32_t failures;                 /* failed exchanges in a row */
+    uint32_t failures;                 /* number of consecutive failures */
     uint8_t owed_count, proof_count;
     uint8_t is_doubted;                /* its first reply may be to another process */
     uint8_t sure_looks;                /* number of coming replies to read only once whole */
@@ -396,8 +396,8 @@ struct md_block {
     const struct md_field *fields;
     const struct md_extra *extra;
     int count;
-    uint32_t refusals; /* exceptions in a row */
-    uint32_t failures; /* exchanges in a row without a good reply */
+    uint32_t refusals; /* number of consecutive exceptions */
+    uint32_t failures; /* number of consecutive exchanges without a good reply */
     uint8_t refusal;   /* code of the last exception */
     uint8_t may_lack;  /* a field may have no value in a good reply */
     uint8_t is_answered; /* a good reply has come, not only exceptions */

@@ -45,7 +45,7 @@ static void learn(struct md_line *line, int echo)
         line->echo = (uint8_t)echo;
 }
 
-/* Return the time by which an echo of the request in flight would be whole,if the line is known not to echo;
+/* Return the time by which an echo of the request in flight would be whole, if the line is known not to echo;
  * 0 if the drive's delay is not known well enough. */
 static int64_t echo_whole_ns(const struct md_line *line)
 {

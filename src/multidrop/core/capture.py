@@ -65,7 +65,7 @@ class Stream:
             raise BufferError("the stream is full: split it first")
 
     def end(self, is_end: bool) -> None:
-        """Set whether the stream is complete, as after a long silence of the line."""
+        """Set whether the stream is complete, so that an incomplete frame at its end is junk."""
         self.c.is_all = is_end
 
 
@@ -179,12 +179,12 @@ class Unpacker:
         self._c.count += 1
 
     def unpack(self) -> Unpacked:
-        """Append packets to their channels' streams, until the caller must act."""
+        """Append packets to their channels' streams until the caller must act; return why it must."""
         return Unpacked(lib.md_unpack(self._c))
 
 
-_RING = 1 << 18  # bytes; some seconds of a fast line
-_TAKEN = 1 << 16  # bytes of packets read at a time
+_RING = 1 << 18  # bytes; enough for some seconds of a fast line
+_TAKEN = 1 << 16  # bytes; most packets that are read together
 
 
 class Wrappings:
@@ -224,7 +224,7 @@ class Tap:
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:
-        """Yield all bytes as packets of this interface, many at a time."""
+        """Yield pieces of a pcapng file that hold all bytes of the ring buffer, as packets of this interface."""
         if self.c.put == self.c.taken:
             return
         out = self._out = self._out or ffi.new("uint8_t[]", _TAKEN)

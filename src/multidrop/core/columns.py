@@ -32,8 +32,8 @@ class NumberFormat(IntEnum):
     F16 = lib.MD_F16
 
 
-LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # order flag
-LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # order flag, within each 16-bit word
+LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # order flag: least significant 16-bit word first
+LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # order flag: least significant byte first in each word
 MOST_INVALID: int = lib.MD_MOST_INVALID
 
 _MAY_LACK = frozenset(
@@ -59,7 +59,7 @@ class Extra(NamedTuple):
     low: int = 0  # lowest bit of the raw number that belongs to the field
     bits: int = 0  # number of bits that belong to the field; 0: all
     scale_at: int | None = None  # offset of the 16-bit word that holds the decimal exponent
-    scale_format: int = NumberFormat.I16  # of the exponent, whose low 16 bits are signed
+    scale_format: int = NumberFormat.I16  # format of the exponent; its low 16 bits are signed
     invalid: tuple[tuple[int, int], ...] = ()  # masks and patterns that mean "no value"
     scale_invalid: tuple[tuple[int, int], ...] = ()
 
@@ -130,7 +130,7 @@ class RowLayout:
 
     @property
     def refusals(self) -> int:
-        """Number of exceptions in a row."""
+        """Number of consecutive exceptions."""
         return int(self.c.refusals)
 
     @refusals.setter
@@ -144,12 +144,12 @@ class RowLayout:
 
     @property
     def failures(self) -> int:
-        """Number of exchanges in a row without a good reply."""
+        """Number of consecutive exchanges without a good reply."""
         return int(self.c.failures)
 
     @property
     def is_answered(self) -> bool:
-        """True once a good reply came; an exception is none."""
+        """True once a good reply came, not only exceptions."""
         return bool(self.c.is_answered)
 
     def forget(self) -> None:
@@ -352,7 +352,7 @@ def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryvi
 
 
 def greatest_code(codes: memoryview[Any]) -> int:
-    """Return the greatest of uint16 codes; 0 without codes."""
+    """Return the greatest of these uint16 codes; 0 if there are none."""
     return int(lib.md_greatest_code(ffi.from_buffer("uint16_t[]", codes), len(codes)))
 
 

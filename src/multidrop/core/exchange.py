@@ -23,7 +23,7 @@ class Counters(NamedTuple):
     exchanges: int = 0
     answered: int = 0
     values: int = 0
-    sent: int = 0  # requests of which at least one byte left
+    sent: int = 0  # number of requests of which at least one byte was sent
     exceptions: int = 0  # exchanges that ended with an exception
     naks: int = 0  # exceptions with code 07
     busies: int = 0  # exceptions with code 06
@@ -171,7 +171,7 @@ class Peer:
                 "history": self._history,
             },
         )
-        self.number = next(_NUMBERS)  # unique in this process
+        self.number = next(_NUMBERS)  # of this peer, unique in this process
         self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Status] = Counter()  # due values that were not requested, by status
 
@@ -182,7 +182,7 @@ class Peer:
         """True once any reply came, even an exception, a late reply or a doubtful reply."""
         return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
-    failures = _number("c.failures")  # number of exchanges in a row without a reply
+    failures = _number("c.failures")  # number of consecutive exchanges without a reply
     late = _number("c.history.late")  # number of replies recognised after their timeout
     late_until_ns = _number("c.late_until_ns")  # until when replies to earlier requests may come
 

@@ -34,11 +34,11 @@ class Message:
     count: int = 0
     data: bytes = b""
     exception: int = 0
-    transaction: int = 0  # Modbus TCP only
+    transaction: int = 0  # transaction id; only with Modbus TCP
 
 
 MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # framings that carry the standard's PDU
-_LONGER_THAN_RTU = 4  # by how many bytes a Modbus TCP frame is longer than the same frame in RTU
+_LONGER_THAN_RTU = 4  # bytes by which a Modbus TCP frame exceeds the same frame in RTU
 
 
 def characters_on_wire(framing: Framing, length: int) -> int:

@@ -43,7 +43,7 @@ class Chunks:
     def take(self, kind: str) -> tuple[Any, Any]:
         """Return a pointer to a new struct of this C type, all zero, and the object that owns its memory."""
         size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
-        if not self._lock.acquire(blocking=False):  # by a thread, or below a signal handler
+        if not self._lock.acquire(blocking=False):  # held by another thread or by interrupted code
             chunk = Chunk(size)
             return chunk.take(kind, size), chunk.owner
         try:

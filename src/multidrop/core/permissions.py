@@ -13,7 +13,7 @@ from multidrop.core.fork import register_at_fork
 
 
 class Latch:
-    """A drive's stop counter, which the core checks right before a request leaves.
+    """A drive's stop counter, which the core checks right before a request is sent.
 
     `rise` takes no lock, so a signal handler may call it.
     """
@@ -53,7 +53,7 @@ class Latch:
         """
         if seen is None:
             seen = int(self.c[0])
-        if self._is_shut or self._holds:  # after reading `seen`: a rise in between counts
+        if self._is_shut or self._holds:  # after reading `seen`, to notice a rise in between
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)
 
@@ -84,7 +84,7 @@ class Mastership:
     not hold before the first `extend`. Its ports check the clock right before each write: after the deadline
     they send no bytes, not even a stop. If the process is still suspended `guard_s / 2` seconds after the
     deadline, a kernel timer kills it with SIGKILL, so that it cannot send when it resumes. The next master
-    listens to each line for at least `guard_s` before its first request; only stops leave at once.
+    listens to each line for at least `guard_s` before its first request; only stops are sent immediately.
     Thread-safe.
 
     Raises NotImplementedError on other systems than Linux, and ValueError if `guard_s` is out of range.

@@ -174,7 +174,9 @@ class _PortMemory:
     def __init__(self, room: int, mastership: Mastership | None) -> None:
         self.mastership = mastership
         self.lasting: set[object] = set()  # objects kept until the port closes
-        self.queued: list[Exchange | None] = [None] * room  # same indexes as the core's ring
+        self.queued: list[Exchange | None] = [
+            None
+        ] * room  # queued exchanges, by their index in the core's ring
         self._newest: dict[str, tuple[object, ...]] = {}
 
     @contextmanager

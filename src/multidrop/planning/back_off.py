@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-SILENT_AFTER = 2  # failures in a row after which a drive rests
+SILENT_AFTER = 2  # number of consecutive failures after which a drive rests
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
 SILENT_SHARE = 0.015  # share of the line's time for requests to silent drives

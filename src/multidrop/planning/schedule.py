@@ -18,7 +18,7 @@ from typing import Generic, NamedTuple, TypeVar
 from multidrop.planning.back_off import BackOff, Health
 
 TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
-CREDIT_NS = 50_000_000  # part of that share that these jobs may use in advance
+CREDIT_NS = 50_000_000  # line time of that share that may be used in advance
 NEVER_NS = 1 << 63
 
 
