@@ -224,7 +224,7 @@ class Tap:
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:
-        """Yield pieces of a pcapng file that hold all bytes of the ring buffer, as packets of this interface."""
+        """Yield all bytes of the ring as pcapng packets of this interface, many packets in each piece."""
         if self.c.put == self.c.taken:
             return
         out = self._out = self._out or ffi.new("uint8_t[]", _TAKEN)

@@ -174,9 +174,7 @@ class _PortMemory:
     def __init__(self, room: int, mastership: Mastership | None) -> None:
         self.mastership = mastership
         self.lasting: set[object] = set()  # objects kept until the port closes
-        self.queued: list[Exchange | None] = [
-            None
-        ] * room  # queued exchanges, by their index in the core's ring
+        self.queued: list[Exchange | None] = [None] * room  # by index in the core's ring
         self._newest: dict[str, tuple[object, ...]] = {}
 
     @contextmanager

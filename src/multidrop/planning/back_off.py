@@ -81,7 +81,7 @@ class BackOff:
         cost_ns: int,
         has_answered: bool = True,
     ) -> None:
-        """Record a drive's failures in a row, and the line time of its next request if that gets no reply.
+        """Record a drive's consecutive failures, and the line time of its next request if that gets no reply.
 
         Until `late_until_ns` a reply to an earlier request may come, so the drive gets no request, even if it
         has answered since. Once that late reply has come, the drive can be tried immediately.

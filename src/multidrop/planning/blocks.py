@@ -36,7 +36,7 @@ class Block:
         return cls(table, start, count, tuple(registers), read_request(drive, table, start, count))
 
     def offset(self, register: Register[Any]) -> int:
-        """Return the register's offset in the reply's data, in words (coils: bits)."""
+        """Return the register's offset in the reply's data, in 16-bit words (coils: in bits)."""
         return register.address - self.start
 
 
@@ -158,7 +158,7 @@ def sending(drive: Drive, block: Block) -> float:
 class _Neighbours:
     """Registers of one read space by rising address, with the limits of a request.
 
-    They may overlap: several may be parts of one word.
+    Registers may overlap: several may be parts of one 16-bit word.
     """
 
     carrier: Carrier

@@ -52,7 +52,7 @@ def switches(before: Drive, after: Drive) -> bool:
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Return the drive's silence and line settings; drives that share both are read in a row fastest."""
+    """Return the drive's silence and line settings; drives with the same kind save time one after another."""
     return silence(drive), str(drive.settings)
 
 

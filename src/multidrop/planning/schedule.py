@@ -26,7 +26,7 @@ NEVER_NS = 1 << 63
 class Job:
     """One exchange that is carried out repeatedly with the drive at this address.
 
-    Jobs of one `kind` have the same line settings and silence, so they take the least time in a row.
+    Jobs of one `kind` have the same line settings and silence, so they take the least time one after another.
     """
 
     drive: int

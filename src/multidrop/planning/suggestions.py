@@ -35,7 +35,7 @@ class Suggestions:
     """Three changes, each of which alone makes the line reach its rates; None if that change cannot."""
 
     every: tuple[tuple[float, float], ...]  # pairs: wanted period, reachable period (s)
-    baudrate: tuple[int, tuple[Drive, ...]] | None  # a baud rate, and the drives that need it
+    baudrate: tuple[int, tuple[Drive, ...]] | None  # lowest sufficient one, and the drives slower now
     registers: int | None  # most registers of each drive whose rates do not fit
 
     def __str__(self) -> str:

@@ -39,7 +39,7 @@ class LineLog:
     """The log of one line: reports each loss once, and counts bytes from another master."""
 
     def __init__(self, port: str) -> None:
-        self.foreign = 0  # number of bytes received while listening before a request
+        self.foreign = 0  # number of another master's bytes, received while listening
         self.shows = _log.isEnabledFor  # function of a log level: whether it is logged
         self._port = port
         self._foreign_here = 0  # part of `foreign` since the port was last opened
