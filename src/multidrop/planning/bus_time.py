@@ -52,7 +52,7 @@ def switches(before: Drive, after: Drive) -> bool:
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Return the drive's silence and line settings; drives with the same kind save time one after another."""
+    """Return the drive's silence and line settings; drives of one kind take the least time in succession."""
     return silence(drive), str(drive.settings)
 
 

@@ -307,7 +307,7 @@ class Exchanges:
         return prepared
 
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
-        """Read a register of `other`, a drive of another family, at the address of `drive`; return the value.
+        """Read a register from this drive as if it were `other`, a drive of another family; return the value.
 
         Each request is sent only once, and even if a late reply could be mistaken for its reply.
         """
