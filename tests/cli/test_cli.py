@@ -316,7 +316,7 @@ def test_advice_for_programs_is_converted_for_the_command_line() -> None:
 
 
 def test_each_advice_is_found_in_the_error_that_contains_it() -> None:
-    """Otherwise the command line could not replace it."""
+    """Otherwise the command line could not replace the advice by a command."""
     erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
     for script, command in (
@@ -444,7 +444,7 @@ def test_a_familys_json_has_every_register(run: Run) -> None:
     ],
 )
 def test_a_sheet_has_drive_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
-    """In the words of the family's manual (ERMAN, section 3; notes on the YD1000, 4.3 and 6.1)."""
+    """Settings and limits are printed in the family's own words (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
     _, out, _ = run("models", name)
     shown = " ".join(out.split())
     assert [fact for fact in facts if fact not in shown] == []
@@ -519,7 +519,7 @@ def test_a_sheet_wraps_its_notes_as_paragraphs(run: Run) -> None:
 
 
 def test_a_command_can_run_in_a_thread_and_keeps_signal_handlers(capsys: pytest.CaptureFixture[str]) -> None:
-    """Only the main thread can change signal handlers."""
+    """Only the main thread can change signal handlers, so a command in another thread must not try."""
     found: list[int] = []
     before = signal.getsignal(signal.SIGTERM)
     thread = threading.Thread(target=lambda: found.append(main(["models", TOY])))

@@ -214,7 +214,7 @@ def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
 def test_a_value_between_two_steps_is_rounded_with_a_warning(
     run: Run, port: str, toy: SimulatedDrive
 ) -> None:
-    """The rounded value is sent, and is the one reported."""
+    """The rounded value is sent to the drive and reported to the user."""
     note = "multidrop: frequency has steps of 0.01 Hz: 12.345 becomes 12.34 Hz\n"
     assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
         0,
@@ -468,7 +468,7 @@ def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     carry_out = getattr(Bus, place)
 
     def pressed(*args: Any, **details: Any) -> None:
-        if place == "close":  # close it first, so that no file stays open
+        if place == "close":  # closes the port, so that no file stays open
             carry_out(*args, **details)
         raise KeyboardInterrupt
 

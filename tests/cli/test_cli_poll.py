@@ -150,7 +150,7 @@ def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, 
     misses = [row for row in rows if row.value is None]
     assert Counter(row.status for row in misses) == summary["lines"]["hall-1"]["misses"]
     assert {"no reply"} <= {row.status for row in misses if row.drive == "pump-9"} <= LATE_OR_SILENT
-    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # on a busy machine
+    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # if the machine is busy
     assert len(misses) == summary["misses"]
     assert summary["lines"]["hall-1"]["exchanges"] > 0
     assert summary["lines"]["hall-1"]["drives"]["pump-1"]["samples_per_second"] > 0
@@ -324,7 +324,7 @@ def test_convert_refuses_a_file_that_is_no_recording(run: Run, tmp_path: Path) -
 @pytest.mark.long
 @pytest.mark.slow
 def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
-    """It replaces the recording of an earlier demo, and captures the traffic."""
+    """The demo also replaces the recording of an earlier demo, and captures its traffic."""
     out, capture = tmp_path / "demo.arrows", tmp_path / "demo.pcapng"
     with open_writer(out, {"drives": dict.fromkeys(DRIVES)}):
         pass
@@ -354,7 +354,7 @@ def framings_of(model: str) -> list[str]:
 
 @pytest.mark.slow
 def test_the_operator_of_a_demo_never_undoes_a_stop() -> None:
-    """It skips a silent drive, and restarts a motor after a trip."""
+    """The operator skips a silent drive, and restarts a motor after a trip."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     sims[0].deaf_until = math.inf
     stopped, tripped = sims[1].motor, sims[2].motor

@@ -535,7 +535,7 @@ def test_a_stops_failure_is_shown_until_it_is_acknowledged(
     assert "a acknowledge FAILURES" in seen(monitor)
     stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
     poller.stop_all = lambda: stopped  # type: ignore[method-assign]
-    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a page, and after a success
+    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a page, and after a successful stop
         monitor._obey(key)
         assert failure in seen(monitor)
     assert monitor.await_stops() == monitor._at.failures
@@ -649,7 +649,7 @@ def test_no_key_can_do_more_than_stop_motors(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its reads return immediately, without bytes or with an error. There may be no signal."""
+    """Reads of a closed terminal return immediately, without bytes or with an error; no signal may come."""
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)
         monkeypatch.setattr(sys, "stdin", stdin)

@@ -262,7 +262,7 @@ def test_commands_print_through_the_escaping_function() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("command", usually("poll", "plan"))
 def test_running_a_users_model_file_is_reported_once(tmp_path: Path, command: str) -> None:
-    """A new process, because a model file is run only once in each process."""
+    """The command runs in a new process, because each process reports this only once."""
     (tmp_path / "fan.py").write_text(
         "from pathlib import Path\nfrom multidrop import Drive, reading\n"
         f"Path({str(tmp_path / 'ran')!r}).touch()\n\n"

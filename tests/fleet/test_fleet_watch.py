@@ -249,7 +249,7 @@ async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
 
 
 async def test_watch_ends_when_the_task_of_its_connection_ends() -> None:
-    """Otherwise it would show the last view forever."""
+    """Otherwise `fleet watch` would show the last view forever."""
     supervisor().keep("path", asyncio.sleep(0)).cancel()
     watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
     with pytest.raises(Ended, match="path has ended: it was cancelled"):

@@ -57,7 +57,7 @@ def test_fleet_settings_are_checked_without_the_nats_library(
 
 @pytest.mark.parametrize("dying", ["path", "watch"])
 def test_the_part_ends_with_either_of_its_tasks(monkeypatch: pytest.MonkeyPatch, dying: str) -> None:
-    """The gateway then reports it. Otherwise the page would show an old fleet forever."""
+    """The gateway then reports the end. Otherwise the page would show an old view of the fleet forever."""
 
     async def go_on() -> None:
         await asyncio.Event().wait()

@@ -154,10 +154,10 @@ def _guarded(run: Callable[[], int]) -> int:
             status = run()
         sys.stdout.flush()
     except KeyboardInterrupt as interruption:  # the exception's notes list the requests that were sent
-        with suppress(KeyboardInterrupt):  # a second Ctrl-C may follow immediately
+        with suppress(KeyboardInterrupt):  # the user may press Ctrl-C again immediately
             return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
         return INTERRUPTED
-    except BrokenPipeError:  # as with `multidrop models | head`
+    except BrokenPipeError:  # the reader has closed the pipe, as in `multidrop models | head`
         _abandon_output()
         return DONE
     except (ValueError, TypeError, Unsupported) as mistake:
@@ -234,7 +234,7 @@ def _parsed(
     A stop ignores unknown options. It also ignores the word after such an option, because that may be the
     option's value instead of a drive.
     """
-    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may be between positionals
+    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may be between positional words
     if not unknown:
         return arguments, []
     if command not in STOPS:

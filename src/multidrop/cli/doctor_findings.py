@@ -185,7 +185,7 @@ SYSFS = Path("/sys")
 # ioctl requests from linux/serial.h and asm-generic/ioctls.h
 TIOCGSERIAL, TIOCGRS485 = 0x541E, 0x542E
 SERIAL_STRUCT = 72  # upper limit of the size of struct serial_struct, in bytes
-FLAGS_AT = 4  # position of the field `flags` among its ints
+FLAGS_AT = 4  # index of the field `flags` among the ints of struct serial_struct
 LOW_LATENCY = 1 << 13
 RS485_STRUCT = struct.Struct("=III5I")
 RS485_ENABLED, RS485_RX_DURING_TX = 1 << 0, 1 << 4
@@ -234,7 +234,7 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 def com_description(port: str) -> str:
     """Return Windows' description of a COM port's adapter; "" if Windows lists none."""
-    with suppress(ImportError, AttributeError, OSError):  # incompletely implemented in Wine
+    with suppress(ImportError, AttributeError, OSError):  # Wine implements this only in part
         from serial.tools.list_ports import comports
 
         return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")
@@ -278,7 +278,7 @@ def _ask(fd: int, request: int, size: int) -> bytes | None:
     """Return the driver's answer to an ioctl; None if it does not know the request."""
     if sys.platform != "linux":
         return None
-    import fcntl  # does not exist on Windows
+    import fcntl  # Windows has no fcntl
 
     answer = bytearray(size)
     try:

@@ -36,7 +36,7 @@ from multidrop.printable import printable
 from multidrop.recording import FORMATS
 from multidrop.recording.segments import parse_age, parse_size
 
-_TAKE_S = 0.1  # s between two deliveries of new rows
+_TAKE_S = 0.1  # pause between two deliveries of new rows, in s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -202,7 +202,7 @@ def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
 # on the terminal above the summary.
 
 
-EVERY = 0.5  # s between two drawings
+EVERY = 0.5  # pause between two drawings, in s
 _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
 
 

@@ -182,7 +182,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
             if not silent:
                 print_text(sentence(finding), flush=True)
             yield finding
-    finally:  # also after Ctrl-C
+    finally:  # also executed after Ctrl-C
         if shown and redraws:
             _redraw("")
 

@@ -74,7 +74,7 @@ class FleetGateway:
         self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(
             self.lines.poller,
-            may_command=lambda line: self.member.keeper.may_command(line),  # `member` is set below
+            may_command=lambda line: self.member.keeper.may_command(line),  # `self.member` is created below
             may_stop=lambda line: self.member.keeper.may_stop(line),
         )
         self.log = CommandLog(folder / "commands.jsonl")
@@ -179,7 +179,7 @@ class FleetGateway:
         if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()
             _log.warning("%s: draining: all lines go to other gateways", self.name)
-        with suppress(Exception):  # the requester may be gone
+        with suppress(Exception):  # the requester may have disconnected
             await message.respond(json.dumps(self.state()).encode())
 
     def state(self) -> dict[str, Any]:

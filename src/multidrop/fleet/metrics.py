@@ -158,7 +158,7 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
 def _answer(head: bytes, metrics: Metrics) -> bytes:
     try:
         return answer(head, metrics)
-    except Exception:  # reported to the client and in the log
+    except Exception:  # the failure is reported to the client and in the log
         _log.exception("metrics failed")
         return _response(500, "the metrics failed; this gateway's log says why")
 

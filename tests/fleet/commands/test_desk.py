@@ -460,7 +460,7 @@ def test_a_malformed_stop_is_carried_out(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is logged as printable text. A stop that names no drives stops all drives of the line."""
+    """The stop is logged as printable text. If it names no drives, it stops all drives of the line."""
     # A repeated request without an id would be a new stop.
     monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))

@@ -167,7 +167,7 @@ async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     trial.clock.pass_s(1)
     for _ in range(2):
         await renew(lease)
-        lease._extend()  # as after the answer on another path
+        lease._extend()  # as after an answer on another path
         assert lease.until == until
     for bucket in trial.buckets:
         bucket.loses_answers = False
@@ -582,7 +582,7 @@ async def test_a_read_reports_whether_a_session_ended_or_may_be_ended() -> None:
     await renew(lease)
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     trial.clock.pass_s(USUAL.lease / SECOND)
-    assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two are enough
+    assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two ended paths suffice
     await observer.end_the_dead()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     other = trial.observer("c")
@@ -725,7 +725,7 @@ async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
 
 
 async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
-    """A namesake that died while it started has left its record there. We hold two paths, so it is over."""
+    """A namesake that died while it started left this record. It held no other path, so its session is over."""
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()

@@ -206,7 +206,7 @@ async def test_lines_that_a_gateway_cannot_open_go_to_others_and_come_back(
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         await until(running.are_shared, "shares")
         ports = {name: Ports(member) for name, member in running.members.items()}
-        a, b, c = (running.members[name] for name in "abc")  # in any order of joining
+        a, b, c = (running.members[name] for name in "abc")  # they joined in any order
         ports["a"].is_cut = True
         await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
         assert a.lease.is_valid
@@ -286,7 +286,7 @@ async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster
 async def test_beside_an_incompatible_gateway_no_line_is_claimed(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Checked when a gateway starts, and when an incompatible one joins."""
+    """This holds when a gateway starts, and when an incompatible one joins later."""
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
         member = await running.join("a")
@@ -343,7 +343,7 @@ async def test_a_dead_server_moves_no_line(fleet: Cluster) -> None:
 async def test_weak_sessions_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise the next dead server would end all of them."""
+    """Otherwise the next server that dies would end all weak sessions."""
     monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:

@@ -333,7 +333,7 @@ async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
 async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is the only bucket left to write until another bucket was read."""
+    """Until a second bucket was read, this bucket is the only one to write."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()
@@ -382,7 +382,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
 
 
 async def test_a_late_answer_does_not_undo_a_release() -> None:
-    """The record was read before the claim's answer came, and released immediately."""
+    """The claim's record was read before its answer came, and the line was released immediately."""
     trial = Trial()
     await trial.read_and_begin()
     bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
@@ -436,7 +436,7 @@ async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
 
 
 async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
-    """Such a failure, as in a user's own class, is logged with its cause, and the line is retried."""
+    """A failure, such as an exception in a user's own class, is logged with its cause. The line is retried."""
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
 

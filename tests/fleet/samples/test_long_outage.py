@@ -66,7 +66,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 @pytest.mark.long
 async def test_after_an_outage_stored_and_lost_rows_add_up(tmp_path: Path, most: int) -> None:
-    """The outage outlasts the spool's limit: each row is stored, or counted as lost by the spool."""
+    """The outage outlasts the spool's limit. Each row is stored, or counted by the spool as lost."""
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:
 
@@ -82,7 +82,7 @@ async def test_after_an_outage_stored_and_lost_rows_add_up(tmp_path: Path, most:
         state, spooled = await live()
     assert 8 <= 40 - state.missing <= 10
     assert state.rows + spooled.lost == MESSAGES * EXCHANGES * 10
-    assert (state.alarms, state.doubled) == (2, 0)  # messages are missing; rows are lost
+    assert (state.alarms, state.doubled) == (2, 0)  # missing messages, and lost rows
     with History(tmp_path / "hub") as history:
         rows = sorted(tuple(row) for batch in history.read() for row in batch)
     assert exchanges_in(rows) == list(range(state.missing * EXCHANGES, MESSAGES * EXCHANGES))

@@ -142,7 +142,7 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
     info = Request("$JS.API.INFO", b"")
     found = await client.replies([mute, nobody, info], 0.2)
     assert found[0] is None
-    assert found[1] == b""  # the server reports that there is no receiver
+    assert found[1] == b""  # the server reports that the request has no receiver
     assert found[2] is not None
     assert found[2].startswith(b"{")
     with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):

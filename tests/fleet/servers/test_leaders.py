@@ -185,7 +185,7 @@ def test_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
 
 
 def test_leaderships_return_to_their_home_servers(servers: Servers) -> None:
-    """This includes a leadership that was handed over because of a silent server."""
+    """A leadership that was handed over because of a silent server returns too."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}
 

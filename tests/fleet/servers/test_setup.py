@@ -147,7 +147,7 @@ def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
-        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant can be stored meanwhile
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant can be stored in the meantime
 
 
 @pytest.mark.long

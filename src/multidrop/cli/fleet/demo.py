@@ -27,7 +27,7 @@ from multidrop.cli.support.values import counted
 GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
 LINES = 12
-DRIVES = 2  # per line
+DRIVES = 2  # drives per line
 WAIT_S = 60.0  # time limit of steps that take only seconds on an idle computer
 RUN_S = 2.0  # pause before the kill, and after each step
 KEEP = "100 MB"  # limit of stored samples; each server may store 256 MB in all

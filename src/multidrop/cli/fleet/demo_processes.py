@@ -18,7 +18,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from tempfile import mkdtemp
 
-PR_SET_PDEATHSIG = 1  # from prctl(2)
+PR_SET_PDEATHSIG = 1  # option of prctl(2): the signal that a process gets when its parent dies
 # This shell command removes the folder when stdin is closed. It retries, because processes that are being
 # killed may still write into the folder.
 REMOVE = 'cat; for n in 1 2 3 4 5 6 7 8 9 10; do rm -rf "$0" && exit; sleep 1; done'

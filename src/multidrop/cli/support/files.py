@@ -44,7 +44,7 @@ def write_new(path: Path, content: str | bytes) -> None:
         try:
             file.append(content.encode() if isinstance(content, str) else content)
         except BaseException:
-            if path.is_file():  # do not remove a device
+            if path.is_file():  # a device must not be removed
                 path.unlink()
             raise
         finally:

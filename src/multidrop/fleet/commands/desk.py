@@ -46,7 +46,7 @@ HOLD_S = 0.5  # how long to wait for a command's end before answering "under way
 AWAITED_S = 3.0  # time limit for commands when a line is released; most writes and read-backs are faster
 POLL_S = 0.01  # pause between checks whether the commands have ended
 MOST_WRITES = 8  # concurrent commands on one line; stops are not counted
-WAY = "fleet"  # how commands arrived, in the audit log
+WAY = "fleet"  # the audit log's word for commands that came through the fleet
 STOPS_REMEMBERED = 1000  # limit of stops in memory; the oldest are removed
 CALLED = "a stop was called"
 
@@ -69,7 +69,7 @@ class CommandDesk:
         self.offers = Offers(clock)
         self._lines = lines
         self._log = log
-        self._under_way: dict[str, int] = {}  # number of commands in progress, by line
+        self._under_way: dict[str, int] = {}  # number of commands in progress by line
 
     # ---- offering a command ----
 
@@ -207,7 +207,7 @@ class StopDesk:
         self._lines = lines
         self._offers = offers
         self._log = log
-        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # by line and message
+        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # stops by line and message
         self._repeated = RepeatedStops()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:

@@ -170,7 +170,7 @@ def _value(found: Mapping[str, Any]) -> float | str:
 def _is_finite(value: float) -> bool:
     try:
         return isfinite(value)
-    except OverflowError:  # an int may be too large for a float
+    except OverflowError:  # raised for an int that is too large for a float
         return False
 
 

@@ -241,7 +241,7 @@ class Lease:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, held.sent)  # the earlier time is the safe one
+            self.held[path] = Held(record.revision, held.sent)  # the earlier of two possible times is safe
         elif record.revision > held.revision:
             self._lose(path)
 

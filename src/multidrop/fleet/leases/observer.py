@@ -74,7 +74,7 @@ class Observer:
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
         before = watched.get(record.key)
-        if before is not None and is_ended_by_another(record):  # its waiting time continues
+        if before is not None and is_ended_by_another(record):  # the waiting time of this record continues
             watched[record.key] = before._replace(revision=record.revision)
         else:
             watched[record.key] = lease_rules.watch(before, record.revision, self._clock())

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-SECOND = 1_000_000_000  # ns
+SECOND = 1_000_000_000  # one second in ns
 PATHS = 3
 RENEW_S = 0.5  # time between renewals of a path
 RULES = 2  # version of the ownership rules (ownership.py): increment it with each change

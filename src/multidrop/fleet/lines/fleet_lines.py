@@ -47,7 +47,7 @@ class FleetLines:
         line = line_of(record, self._folder)
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
         if not any(one.drive.name in polled for one in line.drives):  # otherwise `add_line` refuses the line
-            self._units.note(line, time.monotonic_ns())  # before the line's first row
+            self._units.note(line, time.monotonic_ns())  # must precede the line's first row
         before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)

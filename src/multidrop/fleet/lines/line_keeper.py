@@ -87,7 +87,7 @@ class LineKeeper:
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
         self._is_leaving = False
-        self._at_work: dict[str, asyncio.Task[None]] = {}  # task that opens, closes or claims, by line
+        self._at_work: dict[str, asyncio.Task[None]] = {}  # task that opens, closes or claims a line
         self._tasks: set[asyncio.Task[None]] = set()
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None

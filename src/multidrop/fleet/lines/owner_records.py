@@ -53,7 +53,7 @@ class OwnerRecords:
         self._records = records
         self._may_write = may_write
         self._on_mine = on_mine
-        self._offered: dict[tuple[str, str], int] = {}  # revision when last released, by line and bucket
+        self._offered: dict[tuple[str, str], int] = {}  # revision at the latest release, by line and bucket
         self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
 
     @property

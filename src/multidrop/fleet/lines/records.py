@@ -144,7 +144,7 @@ class FleetRecords:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
-ASKED_AT_ONCE = 500  # lines in one request; servers allow 1024
+ASKED_AT_ONCE = 500  # limit of lines in one request; servers allow 1024
 DOUBT_S = 30.0  # longer than an election, after which an unanswered write may still be stored
 
 

@@ -75,7 +75,7 @@ class Forwarder:
         loop = asyncio.get_running_loop()
 
         def announce() -> None:
-            with suppress(RuntimeError):  # the loop is closed
+            with suppress(RuntimeError):  # raised if the event loop is closed
                 loop.call_soon_threadsafe(self._news.set)
 
         self._spool.on_message = announce
@@ -84,7 +84,7 @@ class Forwarder:
                 await self._forward()
             except (NotOurLog, OSError) as failure:
                 self._note(str(failure))
-            except Exception as failure:  # a bug here, or MemoryError
+            except Exception as failure:  # an error in this program, or MemoryError
                 self._note(f"{type(failure).__name__}: {failure}", failure)
             await asyncio.sleep(AGAIN_S)
 

@@ -174,7 +174,7 @@ class SampleHub:
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
-        self._end = found.last if found.first <= found.last else kept.place  # otherwise it is empty
+        self._end = found.last if found.first <= found.last else kept.place  # otherwise the stream is empty
         self._sources.last = dict(kept.sources)
         self._check_end(found)
         if found.first > kept.place + 1 and found.last > kept.place:

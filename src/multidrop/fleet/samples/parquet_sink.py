@@ -129,7 +129,7 @@ def _joined(commit: Commit) -> Any:
     drives = table.column("drive").chunk(0)
     ranks = pc.rank(drives.dictionary).cast(pa.int32()).take(drives.indices)
     by_time = pc.array_sort_indices(table.column("time").chunk(0).cast(pa.int64()))
-    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # the second sort is stable
+    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # a stable sort
 
 
 def _about(commit: Commit) -> dict[str, Any]:
@@ -180,7 +180,7 @@ async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
         await asyncio.sleep(every)
         try:
             await _compact(words)
-        except Exception as failure:  # such as a process that cannot start; retried
+        except Exception as failure:  # such as a process that cannot start; the loop retries
             _log.error("merging files failed; retrying", exc_info=failure)
 
 

@@ -48,7 +48,7 @@ class StoredMessage(NamedTuple):
 
     sequence: int
     rows: int
-    size: int  # in bytes
+    size: int  # size of the file in bytes
     path: Path
 
 
@@ -236,7 +236,7 @@ class Spool:
         self._first_s: float | None = None  # when the oldest waiting row arrived
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
-        self._undecided: dict[int, int] = {}  # rows removed before `acknowledge` was called, by sequence
+        self._undecided: dict[int, int] = {}  # removed rows per message, until `acknowledge` is called
         self._trouble: str | None = None
         self._logged_s: float | None = None
         self._wanted = 0  # number of rows that `sync` waits for

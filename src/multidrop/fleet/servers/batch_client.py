@@ -95,7 +95,7 @@ class BatchClient(Client):
 
     def __init__(self) -> None:
         super().__init__()
-        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # takes answers, by inbox
+        self._takers: dict[bytes, Callable[[bytes, bytes], None]] = {}  # handlers of answers, by inbox
         self._inboxes = ""
         self._batch_sid = 0
         self._subscribing = asyncio.Lock()

@@ -32,7 +32,7 @@ OLDEST = (2, 12)  # minimum version; 2.9.10 grants one revision to several claim
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # time limit of an answer; leases are renewed twice a second
 PONG_S = 0.7  # time limit of a ping; the path leaves a slower server
-KEEP_S = 1.0  # between checks of a connection
+KEEP_S = 1.0  # pause between checks of a connection
 # With a limit of 0 attempts, nats-py would retry a closed port until our own timeout.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 
@@ -57,7 +57,7 @@ class ServerPath:
         self._trouble = ""  # the failure that was logged last; "" after a success
         self._leaving: set[asyncio.Task[None]] = set()
         self._wanted: dict[str, Callable[[Msg], Any]] = {}  # the function to call with messages, by subject
-        self._standing: dict[str, Subscription] = {}  # subscriptions at the present server
+        self._standing: dict[str, Subscription] = {}  # subscriptions at the present server, by subject
         self._changing = asyncio.Lock()
 
     @property
@@ -165,7 +165,7 @@ class ServerPath:
         """
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
-                if called := self._wanted.get(subject):  # `unsubscribe` may have removed it
+                if called := self._wanted.get(subject):  # `unsubscribe` may have removed the subject
                     standing[subject] = await client.subscribe(subject, cb=called)
             for subject in standing.keys() - self._wanted.keys():
                 await standing.pop(subject).unsubscribe()

@@ -25,8 +25,8 @@ from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Reque
 from multidrop.supervisor import end_tasks
 
 AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # silence before each repeat; the read fails after the last
-SLOW = 3.0  # silence before a repeat, as a multiple of an answer's usual time,
-MOST_SILENCE_S = 1.0  # but at most this long, because a path gives up then
+SLOW = 3.0  # silence before a repeat, as a multiple of an answer's usual time
+MOST_SILENCE_S = 1.0  # limit of that silence, because a path gives up then
 FORGET = 0.97  # decay of the usual time, per answer
 MOST_SPARE = 300.0  # limit of the budget: twice the need of the 3 s until servers notice a dead route
 EARNED = 0.5  # repeats that one timely answer earns
@@ -95,7 +95,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
                             spare.note(is_late=number > 0)
                         return get.messages
                     failure = failed
-            is_refused = isinstance(failure, NoRight)  # by all servers: their rights are the same
+            is_refused = isinstance(failure, NoRight)  # all servers grant the same rights
             if not gets and (number or not ways[1:] or is_refused):
                 break
         raise failure

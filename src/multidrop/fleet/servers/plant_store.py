@@ -129,7 +129,7 @@ def line_of(record: Record, folder: Path) -> PlantLine:
             raise ValueError(f"line {record.key}: a file {name!r} outside of its folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).write_text(text, "utf-8")
-    plant = home / "line.plant"  # a suffix that no family file has
+    plant = home / "line.plant"  # no family file has this suffix
     plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
     return Plant.load(plant).lines[0]
 

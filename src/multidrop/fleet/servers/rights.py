@@ -45,7 +45,7 @@ class UserRights(NamedTuple):
 
     publish: Sequence[str]
     subscribe: Sequence[str] = ()
-    answers: bool = False  # may answer requests, on the requester's inbox
+    answers: bool = False  # True if it may answer requests on the requester's inbox
 
 
 def _api(request: str, *buckets: str) -> list[str]:

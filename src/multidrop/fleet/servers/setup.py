@@ -20,7 +20,7 @@ CONTEST = "contest"
 ROUNDS = 40  # rounds of `_contest`; nats-server 2.9.10 fails in the first few
 CLAIMANTS = 6
 MOST_REPLICAS = 3
-WAIT_S = 10.0  # an election takes 4 to 9 s
+WAIT_S = 10.0  # time limit of retries; an election takes 4 to 9 s
 CLOCKS_APART_S = 10.0
 
 T = TypeVar("T")
