@@ -281,7 +281,7 @@ def test_an_invalid_rights_command_writes_no_file(
 
 
 def test_only_a_denial_of_this_request_means_not_sent() -> None:
-    """Rights may be granted later on an open connection, so an older denial says nothing about this request."""
+    """Rights may be granted on an open connection, so an older denial says nothing about this request."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
     asyncio.run(denials.note(denied))

@@ -232,7 +232,7 @@ def read(session: Session, bucket: int, record: Stored) -> Session:
 def test_no_line_has_two_masters_or_gets_lost_in_any_interleaving(
     sessions: str, most: int, least: int
 ) -> None:
-    """Two sessions with five records, and three sessions with three, were checked manually: 553,000 states."""
+    """Two sessions with five records, and three with three, were checked manually: 553,000 states."""
     states, wrong = Model(sessions, most).search()
     assert wrong is None
     assert states > least

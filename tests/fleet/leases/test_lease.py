@@ -725,7 +725,7 @@ async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
 
 
 async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
-    """A namesake that died while it started left this record. It held no other path, so its session is over."""
+    """A namesake that died while it started left this record. It held no other path, so it is over."""
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()

@@ -436,7 +436,7 @@ async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
 
 
 async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
-    """A failure, such as an exception in a user's own class, is logged with its cause. The line is retried."""
+    """An exception, such as in a user's own class, is logged with its cause, and the line is retried."""
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
 
