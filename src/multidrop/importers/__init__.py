@@ -1,4 +1,4 @@
-"""Importers convert register tables of other programs into family files: unknown facts are marked as gaps."""
+"""Convert register tables of other programs into family files; facts that the source lacks become gaps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_devices(path: Path) -> list[ImportedDevice]:
 
 
 def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
-    """Make each device's pair of title and address unique, by changing titles."""
+    """Change titles until no two devices have the same title and address."""
     for device in devices:
         device.title = device.title or stem
     addresses = Counter(device.address for device in devices)

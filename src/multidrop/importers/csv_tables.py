@@ -1,6 +1,6 @@
 """CSV and TSV tables: layouts of ioBroker, modpoll and Neuron, and any table whose column names are known.
 
-If programs use a column name in different meanings, the most frequent one is assumed, and a gap says which.
+If programs use a column name with different meanings, the most frequent one is assumed and noted as a gap.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in CARRIED[
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
-_ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's
+_ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's type names
 _BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
 _TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
 _SUFFIXES = {"be": "", "le": "DCBA", "sw": "CDAB", "sb": "BADC"}
@@ -101,8 +101,8 @@ _NAMED_TABLES = (  # the first matching prefix of a cell decides
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
-_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # such as 40001 or 400001: table digit, number from 1
-_ACCESS = {  # whether the register is read, and written
+_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # as 40001 or 400001: table's digit, then number from 1
+_ACCESS = {  # cell: whether the register is read, whether it is written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
     **dict.fromkeys(
@@ -112,14 +112,14 @@ _ACCESS = {  # whether the register is read, and written
 _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
 
-MOST_TITLES = 20  # lines before the header of the columns
+MOST_TITLES = 20  # title lines allowed before the column header
 MOST_UNKNOWN = 20  # unknown columns named in a message
 
 Cells = Mapping[str, str]
 
 
 def read_table(text: str, stem: str) -> list[ImportedDevice]:
-    """Return the devices of a table. Raises ValueError if no column is an address, or if it has no row."""
+    """Return the devices of a table. Raises ValueError if the table has no address column or no row."""
     if "\0" in text:
         raise ValueError("has zero bytes; save it as CSV UTF-8")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
@@ -143,7 +143,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
     layout = _Layout(rows)
     devices: dict[int | None, ImportedDevice] = {}
-    table = ImportedDevice(stem)  # counts the entries
+    table = ImportedDevice(stem)  # only counts the entries, to limit their number
     unknown: set[str] = set()
     for row in rows[1:]:
         cells, further = layout.cells(row), layout.further(row)
@@ -190,14 +190,14 @@ class _Layout:
         return found
 
     def further(self, row: list[str]) -> set[str]:
-        """Return the names of the other columns that have a value in this row."""
+        """Return the names of the columns that are not imported but have a value in this row."""
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return the gaps in a row: columns that may affect the value and are not imported."""
+        """Return a row's gaps: unimported columns that may affect the value, unclear lengths or addresses."""
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
-            columns -= {"precision"}  # only the number of digits shown
+            columns -= {"precision"}  # a tag's precision is only the number of digits shown
         found = [f"the column {name} was not carried over" for name in sorted(columns)]
         is_text = cells.get("type", "").lower().startswith("str")
         if cells.get("length") and is_text and self._length in ("length", "size"):
@@ -247,7 +247,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return the register at its address, with the gaps of its table and its numbering."""
+    """Return a register at the row's address; add gaps if its table or the address numbering is ambiguous."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -269,7 +269,7 @@ def _assume_number(register: ImportedRegister, stated: str | None) -> None:
 
 
 def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
-    """Return address and table of a number such as 40001; a plain address if other cells contradict that."""
+    """Return address and table of a number such as 40001; a plain address if other cells contradict it."""
     address, table = Counting(None).address_in_cell(given, None, "holding")
     is_bit = table in ("coil", "discrete")
     if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
@@ -294,13 +294,13 @@ def _is_number(cells: Cells) -> bool:
 
 
 def _steps(cells: Cells) -> list[tuple[str, str]]:
-    """Return the columns and cells that state the value of one count, except those with trivial values."""
+    """Return the row's scale columns with their cells, except scales of 1."""
     stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
     return [(key, cell) for key, cell in stated if cell and (cell != "1" or key == "decimal")]
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states. An ambiguous or unknown cell is a gap."""
+    """Return the table that a row states, or None. Adds a gap if the cell is ambiguous or unknown."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -354,7 +354,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register is read and written; an unknown word is a gap."""
+    """Set whether the register is read and written; add a gap for an unknown word."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -415,7 +415,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 
 
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
-    """Return the register's bits of its word, or "" for all. A missing bit number is a gap."""
+    """Return the bits that the register uses of its word, "" for all; add a gap if the number is missing."""
     if tag and tag.part:
         return tag.part
     stated = re.fullmatch(r"([0-9]{1,2})(?:\s*(?:-|\.\.|:|to)\s*([0-9]{1,2}))?", cells.get("bit", ""))
@@ -431,7 +431,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row; a missing type or width is a gap."""
+    """Return the number format of a row; add a gap if the type or width is missing."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -471,7 +471,7 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Add a row's step and offset. If a column's meaning varies, add a gap that says which was assumed."""
+    """Set step and offset; if a column's meaning varies between programs, add a gap with the assumed one."""
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")
@@ -494,7 +494,7 @@ def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None
 
 
 def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) -> float:
-    """Return the value of one count. Raises ValueError unless it is a number."""
+    """Return the value of one raw count. Raises ValueError unless the cell is a number."""
     amount = number(given, 1)
     exact = Fraction(str(amount))
     if amount == 0 and key != "decimal":
@@ -518,15 +518,15 @@ def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) 
 # ---- tags of EMQX Neuron's Modbus plugins: SLAVE!ADDRESS[.BIT][#ENDIAN][.LEN[H][L][D][E]] ----
 
 _TAG = re.compile(r"([0-9]{1,6})!([0-9]{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z]{1,2}))?")
-_TAG_ORDERS = {  # Neuron's Modbus TCP page, #ENDIAN: LL is 1,2,3,4
+_TAG_ORDERS = {  # Neuron's Modbus TCP page, section #ENDIAN: LL means the byte order 1,2,3,4
     **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"},
 }
-_TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}  # E is one character a register, in its high byte
+_TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}  # E: one character per register, in the high byte
 
 
 @dataclass(frozen=True)
 class _Tag:
-    """The parts of a tag's address; `part` is a bit, or a text's bytes."""
+    """The parts of a tag's address; `part` is the bit number, or the length of a text."""
 
     slave: int
     address: str
@@ -544,7 +544,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order; mark a gap if the tag does not state it."""
+    """Return a number's byte order; add a gap if the tag does not state it."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

@@ -18,13 +18,13 @@ UNKNOWN_HOST = "HOST"
 _HOST = re.compile(r"[A-Za-z0-9_.:-]{1,200}|\[[0-9A-Fa-f:.]{1,100}\]")
 _PORT = re.compile(r"[^!${}\s][^${}]*")  # neither a YAML tag nor a variable
 _PARITIES = {"n": "N", "none": "N", "e": "E", "even": "E", "o": "O", "odd": "O"}
-# Formats of a family that states none; ASCII frames may have 7 data bits.
+# Serial formats if the family states none; ASCII frames may have 7 data bits.
 _FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", "8N1", "8E1", "8O1", "8N2")}
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """The stated settings of a line: an empty port, a baud rate of 0 and an empty format are unknown."""
+    """A line's settings as far as the source states them; "" (port, format) and 0 (baud rate): unknown."""
 
     port: str = ""
     baudrate: int = 0
@@ -32,7 +32,7 @@ class LineSettings:
     framing: str = "rtu"
 
     def drive_keys(self) -> dict[str, Any]:
-        """Return the keys for a drive in a plant file; on a network line only the framing."""
+        """Return a drive's line keys for a plant file; on a network line that is only the framing."""
         found: dict[str, Any] = {"framing": self.framing} if self.framing != "rtu" else {}
         if self.is_network:
             return found
@@ -69,9 +69,9 @@ def serial_settings(given: Mapping[str, Any], *, port: Any = "", framing: Any = 
 def network_settings(
     host: Any, port: Any, *, is_serial_frames: bool = False, framing: str = "rtu"
 ) -> LineSettings:
-    """Return the line of a host: Modbus TCP, or serial frames over a socket.
+    """Return the settings of a network line: Modbus TCP, or serial frames over a socket.
 
-    An unknown host becomes HOST, and an invalid port number 502.
+    An unknown host becomes the placeholder HOST; an invalid port number becomes 502.
     """
     number = _whole(port)
     known = host if isinstance(host, str) and _HOST.fullmatch(host) else UNKNOWN_HOST
@@ -89,14 +89,14 @@ def _whole(given: Any) -> int:
 
 WRITTEN = "it is written there; what a write does is not known here"
 ONLY_WRITTEN = "is only written: a command is never imported"
-MOST_ENTRIES = 20_000  # in one file
+MOST_ENTRIES = 20_000  # limit per file
 _LONGEST_NAME = 50
 _DECIMAL = re.compile(r"-?[0-9]{1,19}")
 _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 
 
 class Treatment(Enum):
-    """The treatment of a key of the source's schema."""
+    """How an importer treats a key of the source's schema."""
 
     CARRIED = "the importer reads it"
     IRRELEVANT = "it changes no value"
@@ -107,7 +107,7 @@ KeyTable = Mapping[str, Treatment]
 
 
 def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
-    """Return the treatment of each key; the arguments are keys separated by spaces."""
+    """Return a table from key to treatment; each argument lists one treatment's keys, separated by spaces."""
     return {
         **dict.fromkeys(carried.split(), Treatment.CARRIED),
         **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
@@ -116,9 +116,9 @@ def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyT
 
 
 def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
-    """Return a sentence for each key of an entry that may affect the value and is not imported.
+    """Return a sentence for each key of an entry that is not imported although it may affect the value.
 
-    Keys that are not in the table count, too. Keys with empty or false values are ignored.
+    This includes keys missing from the table. Keys with empty or false values are ignored.
     """
     known = {
         Treatment.GAP: "{} was not carried over",
@@ -129,22 +129,22 @@ def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
 
 
 def is_empty(value: Any) -> bool:
-    """Return True for a value that means the key is not set; 0 means it is set."""
+    """Return True if the value means that the key is not set; 0 counts as set."""
     return value is None or value is False or value in ("", [], {})
 
 
 @dataclass
 class ImportedRegister:
-    """One register, with its address on the wire. `gaps` are sentences about unknown facts.
+    """One register, with its address as sent. `gaps` are sentences about unknown facts.
 
-    `lacks` is a fact that the value depends on but a register cannot declare. If there is one, only the raw
-    count is imported. A family file gets only readings; `is_written` and `of_writes` serve coverage reports.
+    `lacks` names a fact that the value depends on and that a register cannot declare; if set, only the raw
+    count is imported. Family files get readings only; `is_written` and `of_writes` are for coverage reports.
     """
 
     name: str
     address: int
     table: str = "holding"
-    details: dict[str, Any] = field(default_factory=dict)  # by the keys of a family file, in this order
+    details: dict[str, Any] = field(default_factory=dict)  # keys of a family file, in this order
     gaps: list[str] = field(default_factory=list)
     lacks: str = ""
     is_read: bool = True
@@ -152,15 +152,15 @@ class ImportedRegister:
     of_writes: dict[str, Any] = field(default_factory=dict)  # further details of a written register
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the other program writes the register; if so, add a gap: the effect is unknown."""
+        """Record whether the source program writes the register; if so, add a gap: the effect is unknown."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits; add a gap for names that a register cannot have.
+        """Add names of the register's values or bits; add a gap if a register cannot have these names.
 
-        If a number has several names, the first is used.
+        If a value or bit has several names, the first is used.
         """
         names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
         for spelt, given in pairs.items():
@@ -177,7 +177,7 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry (with `is_entry` False another fact) that could not be imported, with the reason."""
+    """An entry that could not be imported, and why; for other facts, such as keys, `is_entry` is False."""
 
     name: str
     reason: str
@@ -197,13 +197,13 @@ class ImportedDevice:
     texts: list[ImportedRegister] = field(default_factory=list)
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
-    readable: range = range(0)  # holding registers that one read may include
-    together: int = 0  # registers that one request may read; 0: not stated
+    readable: range = range(0)  # holding registers that a read may span, unnamed ones included
+    together: int = 0  # most registers per read request; 0: not stated
     line: LineSettings = UNKNOWN_LINE
     names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
-        """Add a register under a unique name; an invalid one is recorded as lost."""
+        """Add a register under a unique name; record an invalid register as lost."""
         if isinstance(found.address, bool) or not isinstance(found.address, int):
             self.lose(found.name, f"its address {str(found.address)[:40]!r} is not a whole number")
             return
@@ -225,7 +225,7 @@ class ImportedDevice:
 
     @contextmanager
     def entry(self, name: str) -> Iterator[None]:
-        """Record the entry as lost if reading it fails. Raises ValueError for too many entries."""
+        """In the block, record the entry as lost on an error. Raises ValueError after too many entries."""
         if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
             raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
         try:
@@ -238,13 +238,13 @@ class ImportedDevice:
             self.lose(name, f"it is not laid out as an entry: {type(failure).__name__} {str(failure)[:100]}")
 
     def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
-        """Record the keys of a device or line that are not imported."""
+        """Record as lost the keys of a device or line that are not imported."""
         for sentence in uncarried(given, table):
             self.lose(place, sentence, is_entry=False)
 
 
 class UniqueNames:
-    """Unique Python names, as close as possible to the given spelling."""
+    """Makes unique Python names, as close as possible to the given spelling."""
 
     def __init__(self, taken: Collection[str] = TAKEN_NAMES) -> None:
         self._taken = taken

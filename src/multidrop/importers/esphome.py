@@ -1,6 +1,6 @@
-"""ESPHome's `modbus_controller`: entities of that platform in a node's YAML, or in a package of one.
+"""Import ESPHome's `modbus_controller`: its entities in a node's YAML, or in one of the node's packages.
 
-The tables of keys follow its documentation and its components' schemas.
+The key tables follow ESPHome's documentation and its components' schemas.
 """
 
 from __future__ import annotations
@@ -88,12 +88,12 @@ _WRITTEN = ("switch", "number", "select", "output")
 
 
 def is_esphome(document: Any) -> bool:
-    """Return True for a document with a controller, or with an entity of its platform."""
+    """Return True if the document has a `modbus_controller`, or an entity of that platform."""
     return any(PLATFORM in part or any(_entries(part)) for part in _parts(document))
 
 
 def read_esphome(document: Any) -> list[ImportedDevice]:
-    """Return a device for each address on each bus. Raises ValueError if the document has no entity."""
+    """Return a device for each address on each bus. Raises ValueError if the document has no such entity."""
     parts = [_substituted(part, _substitutions(document), 0) for part in _parts(document)]
     nodes = [part["esphome"] for part in parts if isinstance(part.get("esphome"), dict)]
     devices = _Devices(str(nodes[0].get("name") or "") if nodes else "", parts)
@@ -106,7 +106,7 @@ def read_esphome(document: Any) -> list[ImportedDevice]:
 
 
 def _parts(document: Any) -> Iterator[dict[str, Any]]:
-    """Yield the document and its packages; a list is a list of entities."""
+    """Yield the document and its packages; a package that is a list contains only entities."""
     if isinstance(document, list):
         entities = [each for each in document if isinstance(each, dict) and each.get("platform") == PLATFORM]
         yield from ({_kind_of(entity): entity} for entity in entities)
@@ -134,7 +134,7 @@ def _substitutions(document: Any) -> dict[str, str]:
 
 
 def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
-    """Return a value with each ${name} replaced that the document itself defines."""
+    """Return a value with each ${name} replaced if the document itself defines the name."""
     if isinstance(value, str) and "$" in value and not isinstance(value, YamlTag):
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
     if depth < 5 and known:
@@ -198,7 +198,7 @@ class _Devices:
             _add(device, kind, name, entry)
 
     def _device_of(self, given: Any) -> ImportedDevice:
-        """Return the device of a controller's id; its address is unknown if another file declares it."""
+        """Return a controller's device by id; its address is unknown if another file declares it."""
         if given is None and self._by_controller:
             return next(iter(self._by_controller.values()))
         return self._by_controller.setdefault(
@@ -207,7 +207,7 @@ class _Devices:
 
 
 def _line(parts: list[dict[str, Any]], bus: str) -> LineSettings:
-    """Return the settings of a bus's UART: the one that it names, or the only one."""
+    """Return the settings of the UART that a bus names, or of the only UART."""
     uarts = [each for part in parts for each in _listed(part.get("uart")) if isinstance(each, dict)]
     buses = [each for part in parts for each in _listed(part.get("modbus")) if isinstance(each, dict)]
     named = [each.get("uart_id") for each in buses if len(buses) == 1 or str(each.get("id")) == bus]
@@ -257,7 +257,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Combine factors and offsets, in order, into a step and an offset; other filters are gaps."""
+    """Combine factors and offsets, in order, into a step and an offset; add a gap for any other filter."""
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []
     for each in _listed(filters):
@@ -301,7 +301,7 @@ def _text(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str
 
 def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> bool:
     """Set the register's number format; return False if the register cannot be imported."""
-    is_flag = kind in ("binary_sensor", "switch")  # always one word, whatever other keys say
+    is_flag = kind in ("binary_sensor", "switch")  # always one 16-bit word, whatever other keys state
     given = "U_WORD" if is_flag else str(entry.get("value_type", "U_WORD"))
     found = _FORMATS.get(given.removesuffix("_R"))
     if found is None:
@@ -319,7 +319,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
         register.gaps.append("it is true where one of its bits is")
     if entry.get("multiply") is not None:
         factor = Fraction(str(number(entry["multiply"], 1, "multiply"))) or Fraction(1)
-        scaled(register.details, float(1 / factor))  # ESPHome divides the raw count when reading
+        scaled(register.details, float(1 / factor))  # ESPHome divides the raw count by `multiply`
     if (options := entry.get("optionsmap")) is not None:
         if isinstance(options, dict):
             register.put_names("values", options)

@@ -1,4 +1,4 @@
-"""Write a family file for an imported device, after checking which registers a family can hold."""
+"""Write a family file for an imported device, after dropping registers that a family cannot declare."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from multidrop.importers.device import UNKNOWN_HOST, ImportedDevice, ImportedReg
 from multidrop.printable import printable
 from multidrop.toml_check import TomlPlace, parse_document
 
-MOST_LOST = 500  # listed in the file
+MOST_LOST = 500  # lost entries listed in the family file
 UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"
-_LONGEST = 200  # characters of a text
-_MOST_POINTS = 20  # dots in a text; TOML's parser is slow on a line with very many
+_LONGEST = 200  # limit of a text, in characters
+_MOST_POINTS = 20  # limit of dots in a text; the TOML parser is slow on a line with very many dots
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
@@ -33,7 +33,7 @@ _ORDER = (
 def family_text(device: ImportedDevice, source: str) -> str:
     """Return the text of a family file, which declares only readings and texts.
 
-    Raises ValueError if it would be longer than a family file may be.
+    Raises ValueError if the text would exceed the size limit of family files.
     """
     lines = [
         f"# Imported from {_comment(source)}: compare each line with the manual, and mend each `gap:`.",
@@ -77,7 +77,7 @@ def family_text(device: ImportedDevice, source: str) -> str:
 def plant_text(device: ImportedDevice, family_file: str) -> str:
     """Return the text of a plant file with this device.
 
-    Raises ValueError if its address is unknown, or if it has no register to poll.
+    Raises ValueError if the device's address is unknown, or if it has no register to poll.
     """
     if not device.registers:
         raise ValueError(
@@ -115,7 +115,7 @@ def _line_gap(device: ImportedDevice) -> str:
 
 
 def entry_line(register: ImportedRegister) -> str:
-    """Return the register's line in its section."""
+    """Return the register's TOML line for its section of the family file."""
     parts = [f"at = {sent_as(register.address, register.table)}"]
     if register.table != "holding":
         parts.append(f"table = {_value(register.table)}")
@@ -152,7 +152,7 @@ _PLACE = Path("entry")
 
 
 def settle(device: ImportedDevice) -> None:
-    """Move registers and texts that a family cannot hold to the device's `lost`, with the library's error."""
+    """Move registers and texts that no family can declare to the device's `lost`, with the error."""
     held = _keep(device, device.registers, declare, MOST_REGISTERS, "registers")
     _keep(device, device.texts, declare_text, MOST_TEXTS, "texts")
     _settle_together(device, held)
@@ -165,7 +165,7 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Keep the entries of `listed` that one family can hold; return their declarations by name."""
+    """Drop the entries of `listed` that no family can declare; return the others' declarations by name."""
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:
@@ -183,7 +183,7 @@ def _keep(
 
 
 def declare(found: ImportedRegister, access: Access = Access.READING) -> Register[Any]:
-    """Return the register that a family file would declare. Raises ValueError with all errors in it."""
+    """Return the register that a family file would declare. Raises ValueError that lists all errors."""
     place = TomlPlace(_PLACE)
     declared = Declared(Counting(0), {}, "single")
     ((name, given),) = parse_document(entry_line(found).encode()).items()
@@ -200,7 +200,7 @@ def declare(found: ImportedRegister, access: Access = Access.READING) -> Registe
 
 
 def declare_text(found: ImportedRegister) -> Text:
-    """Return the text that a family file would declare. Raises ValueError with all errors in it."""
+    """Return the text that a family file would declare. Raises ValueError that lists all errors."""
     place = TomlPlace(_PLACE)
     texts = texts_of(parse_document(entry_line(found).encode()), Counting(0), {}, place)
     if place.config_errors:
@@ -210,7 +210,7 @@ def declare_text(found: ImportedRegister) -> Text:
 
 
 def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
-    """Remove scale registers, or whole registers, until one class can hold all registers together."""
+    """Drop scale registers, then whole registers, until one class can declare all remaining registers."""
     by_name = {found.name: found for found in device.registers}
     gaps = {HOLDING: device.readable} if device.readable else {}
     while wrong := _refused_together({**held, "readable_gaps": gaps}):
@@ -229,7 +229,7 @@ def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> 
 
 
 def _refused_together(members: dict[str, Any]) -> dict[str, str]:
-    """Return the errors, by register, of a class with these members; an empty dict if it is valid."""
+    """Return the errors, by register name, of a class with these members; an empty dict if it is valid."""
     try:
         type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:

@@ -1,6 +1,6 @@
-"""Home Assistant's `modbus:` in configuration.yaml and in packages, also in the layouts of former versions.
+"""Import Home Assistant's `modbus:` from configuration.yaml and packages, in current and former layouts.
 
-The tables of keys follow the documentation and schemas of its integration, including former versions.
+The key tables follow the documentation and schemas of the integration, including former versions.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _TYPES = {
     **{"int16": "I16", "int32": "I32", "int64": "I64", "uint16": "U16", "uint32": "U32", "uint64": "U64"},
     **{"float16": "F16", "float32": "F32", "float64": "F64"},
 }
-_LEGACY_TYPES = {  # before 2022: `count` states the number of registers
+_LEGACY_TYPES = {  # types of before 2022, when `count` stated the number of registers
     "int": {1: "I16", 2: "I32", 4: "I64"},
     "uint": {1: "U16", 2: "U32", 4: "U64"},
     "float": {1: "F16", 2: "F32", 4: "F64"},
@@ -66,13 +66,13 @@ VERIFY_KEYS = key_table(carried="address input_type state_on state_off", irrelev
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # and the table of their entries
+_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # key of a list: table of its entries
 MOST_REPEATED = 1000  # limit of virtual_count
 _DEEPEST = 4  # limit of nested packages
 
 
 def read_home_assistant(document: Any) -> list[ImportedDevice]:
-    """Return a device for each slave of each hub of a document. Raises ValueError if it has no entity."""
+    """Return a device for each slave of each hub. Raises ValueError if the document has no Modbus entity."""
     found: dict[tuple[int, int | None], ImportedDevice] = {}
     hubs = list(_hubs(document, "", 0))
     for which, hub in enumerate(hubs):
@@ -148,7 +148,7 @@ def _kind_of(entry: Mapping[str, Any]) -> str:
 
 
 def _legacy_hubs(kind: str, listed: Any, hubs: Any) -> Iterator[Mapping[str, Any]]:
-    """Yield a hub for each `platform: modbus` of before 2021, with the keys that its entries have today."""
+    """Yield a hub for each `platform: modbus` (before 2021), with its entries' keys renamed to today's."""
     known = {
         str(hub.get("name", "modbus_hub")): hub
         for hub in (hubs if isinstance(hubs, list) else [hubs])
@@ -181,7 +181,7 @@ def _modern(kind: str, entry: Mapping[str, Any], table: str) -> dict[str, Any]:
 
 
 def _line(hub: Mapping[str, Any]) -> LineSettings:
-    """Return the line of a hub: of type serial, tcp, udp or rtuovertcp."""
+    """Return the line settings of a hub whose type is serial, tcp, udp or rtuovertcp."""
     kind = str(hub.get("type", ""))
     if kind in ("tcp", "udp", "rtuovertcp"):
         return network_settings(hub.get("host"), hub.get("port", 502), is_serial_frames=kind == "rtuovertcp")
@@ -233,7 +233,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Read the switch's state register, and name the counts for on and off."""
+    """Use the switch's state register if it has one; add a gap if on and off are not 1 and 0."""
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
     if isinstance(verify, dict):
@@ -277,7 +277,7 @@ def _sensor(device: ImportedDevice, register: ImportedRegister, entry: Mapping[s
 
 
 def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
-    """Return the byte order that `swap` states, or before 2021 `reverse_order`."""
+    """Return the byte order stated by `swap`, or by `reverse_order` in files of before 2021."""
     given = str(entry.get("swap") or "none")
     if given not in _SWAPS:
         register.lacks = f"its swap {given[:40]}"
@@ -290,7 +290,7 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return the number format of a data type; None if there is none. A doubtful width is a gap."""
+    """Return the number format of a data type, or None if it has none; add a gap for a doubtful width."""
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
         if kind == "float" and "count" not in entry:  # int is 16 bits in every version
@@ -308,7 +308,7 @@ def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> 
 
 
 def _nan(given: Any) -> int | str:
-    """Return the count of a nan_value, which may be a text in hex without 0x."""
+    """Return the raw count of a `nan_value`, which may be hex text without 0x."""
     text = str(given).strip()
     return int(text, 16) if re.fullmatch(r"[0-9]*[a-fA-F][0-9a-fA-F]*", text) else count(given, "nan_value")
 
@@ -322,7 +322,7 @@ def _more(entry: Mapping[str, Any]) -> int:
 
 
 def _repeat(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str, Any], words: int) -> None:
-    """Add the register, and as many after it as `slave_count` or `virtual_count` states."""
+    """Add the register, and `slave_count` or `virtual_count` further registers at the addresses after it."""
     first = replace(register, details=dict(register.details), gaps=list(register.gaps))
     for at in range(_more(entry) + 1):
         name = f"{first.name}_{at}" if at else first.name

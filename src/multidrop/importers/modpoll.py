@@ -1,4 +1,4 @@
-"""Tables of modpoll: lines `device`, `poll` and `ref` (its documentation, configuration)."""
+"""Import modpoll's tables of lines `device`, `poll` and `ref` (see "configuration" in its documentation)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _TABLES = {
     **{"coil": "coil", "discrete_input": "discrete"},
     **{"holding_register": "holding", "input_register": "input"},
 }
-_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # order of bytes_words
-_CELLS = 7  # a row's word, and name, address, type, access, unit and scale
+_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # by modpoll's BYTES_WORDS
+_CELLS = 7  # cells of a row: its word, name, address, type, access, unit, scale
 _FLAGS = re.compile(r"bool(8|16)?")
 _STRING = re.compile(r"string([0-9]{1,4})")
 
 
 def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
-    """Return the devices of the rows of such a table. Raises ValueError for other rows."""
+    """Return the devices of a modpoll table's rows. Raises ValueError for any other kind of row."""
     devices: list[ImportedDevice] = []
     table = order = ""
     for number, row in enumerate(rows, 1):
@@ -57,7 +57,7 @@ def _reference(device: ImportedDevice, cells: list[str], table: str, order: str)
         device.lose(name, f"which bits {kind} means is not known")
         return
     if text := _STRING.fullmatch(kind):
-        register.details = {"length": (int(text[1]) + 1) // 2}  # bytes as received, whatever the poll's order
+        register.details = {"length": (int(text[1]) + 1) // 2}  # bytes as received, not in the poll's order
         device.add(register, is_text=True)
         return
     kind = kind.lower()

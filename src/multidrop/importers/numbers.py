@@ -1,4 +1,4 @@
-"""Numbers of other programs' tables: their types, steps, and orders of bytes and words."""
+"""Parse numbers in other programs' tables: number types, steps, and byte and word orders."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def number_format(kind: str) -> str | None:
 
 
 def format_of_width(kind: str, words: int) -> str | None:
-    """Return the number format of a type without a width, for `words` words; None for other types."""
+    """Return the number format for `words` 16-bit words of a type without a width; None for other types."""
     letter = _ANY_WIDTH.get(kind.strip().lower())
     return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
@@ -52,7 +52,7 @@ def bits_text(low: int, high: int) -> str:
 
 
 def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
-    """Add the number format and its byte order, which is given for four bytes, such as "CDAB"."""
+    """Set the number format and byte order in `details`; `order` is stated for four bytes, such as "CDAB"."""
     if number != "U16":
         details["number_format"] = number
     if words_of(number) == 1:
@@ -62,7 +62,7 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Add step and offset unless they have no effect; ignore a step of 0. Raises as `number` does."""
+    """Set step and offset in `details`, unless 1 and 0; ignore a step of 0. Raises as `number` does."""
     step, offset = number(step, 1, "scale"), number(offset, 0, "offset")
     if step not in (0, 1):
         details["step"] = step
@@ -71,7 +71,7 @@ def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
 
 
 def number(given: Any, default: float, key: str = "number") -> float:
-    """Return a number, also from text; `default` if it is empty. Raises ValueError for anything else."""
+    """Return a number, also from text; `default` if `given` is empty. Raises ValueError for other values."""
     if given in (None, ""):
         return default
     text = str(given).strip()
@@ -84,9 +84,9 @@ def number(given: Any, default: float, key: str = "number") -> float:
 
 
 def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int:
-    """Return the whole number of a key, which may be text and hex.
+    """Return the key's whole number, which may be text, also in hex.
 
-    Raises KeyError if the key is missing and there is no default, ValueError for anything else.
+    Raises KeyError if the key is missing and there is no default, ValueError if it is no whole number.
     """
     given = entry.get(key)
     if given is None:
@@ -100,12 +100,12 @@ def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int
 
 
 def count(given: Any, key: str = "count") -> int | str:
-    """Return a raw count: a number, also as text and in hex, or NaN. Raises ValueError for anything else."""
+    """Return a raw count, or "NaN"; text may be decimal or hex. Raises ValueError for other values."""
     return "NaN" if str(given).strip().lower() in ("nan", ".nan") else whole({key: given}, key)
 
 
 def float_of_bits(bits: int, number: str) -> float | str:
-    """Return the float with these bits, or "NaN". Raises ValueError for more bits than the format has."""
+    """Return the float with these bits, or "NaN". Raises ValueError if `bits` is too large for the format."""
     code, size = {"F16": (">e", 2), "F32": (">f", 4), "F64": (">d", 8)}[number]
     try:
         (found,) = struct.unpack(code, bits.to_bytes(size))

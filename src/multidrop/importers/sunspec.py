@@ -1,4 +1,4 @@
-"""SunSpec models as JSON: a model is a block of registers, whose address depends on the device."""
+"""Import SunSpec models from JSON: a model is a block of registers, whose address depends on the device."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ GROUP_KEYS = key_table(
     carried="name label points groups", irrelevant="type count desc detail notes comments standards"
 )
 MODEL_KEYS = key_table(carried="id group", irrelevant="label desc detail notes comments standards")
-MOST_REPEATED = 1000  # limit of a point's repetitions
-FIRST = 40000  # assumed: a model's place is not in its file
+MOST_REPEATED = 1000  # most repetitions of a point
+FIRST = 40000  # assumed start address, because a model's file does not state it
 # Counts that mean "not implemented" (SunSpec information model specification, data types).
 _INVALID = {
     **{"int16": 0x8000, "uint16": 0xFFFF, "acc16": 0, "enum16": 0xFFFF, "bitfield16": 0xFFFF},
     **{"int32": 0x80000000, "uint32": 0xFFFFFFFF, "acc32": 0, "enum32": 0xFFFFFFFF, "bitfield32": 0xFFFFFFFF},
-    # As signed numbers, because unsigned 64-bit numbers do not fit into TOML.
+    # 64-bit counts are signed here, because TOML has no unsigned 64-bit numbers.
     **{"int64": -(1 << 63), "uint64": -1, "acc64": 0, "bitfield64": -1},
     **{"float32": math.nan, "float64": math.nan, "sunssf": 0x8000},
 }
@@ -44,7 +44,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     device = ImportedDevice(title)
     reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
     device.lose("the model", reason, is_entry=False)
-    names: dict[str, str] = {}  # names of scale registers, by name of their point
+    names: dict[str, str] = {}  # register names by point name, of points that are scale factors
     address = FIRST
     for point in group["points"]:
         size, count = _size(point), whole(point, "count", 1)
@@ -65,7 +65,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return a point's number of registers. Raises ValueError without it: later addresses depend on it."""
+    """Return a point's number of registers. Raises ValueError if missing: later addresses depend on it."""
     try:
         return whole(point, "size")
     except KeyError:
@@ -124,7 +124,7 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Turn the point's scale factor into a step, or into the name of the register that holds it."""
+    """Set the register's step from the point's scale factor, or name the register that holds the factor."""
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

@@ -1,6 +1,6 @@
-"""Telegraf's inputs.modbus in its three styles: register, request and metric.
+"""Import Telegraf's inputs.modbus in its three configuration styles: register, request and metric.
 
-The tables of keys follow the plugin's README and the structures of its configuration.
+The key tables follow the plugin's README and its configuration structs.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ PLUGIN_KEYS = key_table(
 
 
 class _Field(NamedTuple):
-    """A field of a plugin, with the facts from its place in the file."""
+    """A field of the plugin, with the facts that the enclosing tables state."""
 
     given: Mapping[str, Any]
     style: str
@@ -78,7 +78,7 @@ class _Field(NamedTuple):
 
 
 def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return a device for each slave id of each line. Raises ValueError for a file without fields."""
+    """Return a device for each slave id of each line. Raises ValueError if the file has no fields."""
     inputs = document.get("inputs")
     plugins = inputs.get("modbus") if isinstance(inputs, dict) else None
     if plugins is None:
@@ -114,7 +114,7 @@ def _lose_settings(device: ImportedDevice, plugin: Mapping[str, Any]) -> None:
 
 
 def _line(plugin: Mapping[str, Any]) -> LineSettings:
-    """Return the line of a plugin: a controller of file:///dev/ttyUSB0 or tcp://host:port, and its mode."""
+    """Return the line of a plugin's controller, such as file:///dev/ttyUSB0 or tcp://host:port, and mode."""
     controller, mode = str(plugin.get("controller", "")), str(plugin.get("transmission_mode", ""))
     if controller.startswith("tcp://"):
         try:
@@ -135,7 +135,7 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
 
 
 def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:
-    """Yield the fields of the plugin's style, or of all styles if it states none."""
+    """Yield the fields of the plugin's stated style, or of all styles if it states none."""
     style, slave = str(plugin.get("configuration_type", "")), plugin.get("slave_id")
     text = str((plugin.get("workarounds") or {}).get("string_register_location") or "both")
     if style in ("", "register"):
@@ -211,7 +211,7 @@ def _number(
 
 
 def _plain_type(style: str, kind: str, words: int) -> str:
-    """Return a type that means the same in every style.
+    """Return the style-independent name of a type.
 
     In the register style, FLOAT32 is a whole number whose width is the number of addresses; IEEE floats have
     names that end in -IEEE.
@@ -224,7 +224,7 @@ def _plain_type(style: str, kind: str, words: int) -> str:
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the bits of the word for a type of less than 16 bits, and the type of the number."""
+    """Return which bits of the word a type narrower than 16 bits uses ("" for all), and the number's type."""
     if kind == "BIT":
         return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):

@@ -1,7 +1,7 @@
-"""wb-mqtt-serial: its device templates and its configuration, as JSON.
+"""Import wb-mqtt-serial's device templates and its configuration from JSON.
 
-Use templates of your own, since most published ones are not free to copy. The tables of keys are those of its
-JSON schemas and of its README.
+Use your own templates, since most published ones are not free to copy. The key tables follow its JSON schemas
+and README.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from multidrop.importers.device import (
 )
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
-# Matches comments and trailing commas of lists, which JSON forbids; and strings, which are kept. An unclosed
+# Matches comments and trailing commas, which JSON forbids, and strings, which are kept. An unclosed
 # string or comment extends to the end, so that each character is scanned once.
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
 _DEEPEST = 8  # limit of nested subdevices
-PART = "its place in a larger channel"  # an additional key, for a channel's part
+PART = "its place in a larger channel"  # extra key that marks a part of a composite channel
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -40,8 +40,8 @@ _FORMATS = {
     **{"float": "F32", "double": "F64"},
     **{"bcd8": "BCD16", "bcd16": "BCD16", "bcd24": "BCD32", "bcd32": "BCD32"},
 }
-_WIDTHS = {"u8": 8, "s8": 8, "u24": 24, "s24": 24}  # bits of a format that is the lowest part of a larger one
-_TEXTS = {"string": "B", "char8": "B", "string8": ""}  # B: one character a register, in its low byte
+_WIDTHS = {"u8": 8, "s8": 8, "u24": 24, "s24": 24}  # width of a format narrower than its words
+_TEXTS = {"string": "B", "char8": "B", "string8": ""}  # B: one character per register, in the low byte
 _ORDERS = {"big_endian": False, "little_endian": True}
 _ORDER_OF = {(False, False): "", (True, False): "CDAB", (False, True): "BADC", (True, True): "DCBA"}
 _ENTRY = "name id title address write_address reg_type format units scale offset word_order byte_order"
@@ -78,12 +78,12 @@ PORT_KEYS = key_table(
 
 
 def json_without_comments(text: str) -> str:
-    """Return JSON without the comments, and the commas before a list's end, that such templates have."""
+    """Return valid JSON: remove comments and trailing commas, which such templates may have."""
     return _NOT_JSON.sub(lambda found: found[1] or "", text)
 
 
 def read_wb(document: Any) -> list[ImportedDevice]:
-    """Return a template's device, or all devices of a configuration. Raises ValueError for anything else."""
+    """Return a template's device, or a configuration's devices. Raises ValueError for other documents."""
     if not isinstance(document, dict):
         kind = type(document).__name__
         raise ValueError(f"is no wb-mqtt-serial template and no SunSpec model: it is a {kind}")
@@ -104,7 +104,7 @@ def read_wb(document: Any) -> list[ImportedDevice]:
 
 
 def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
-    """Yield the devices of a port of a configuration, each with its address and line."""
+    """Yield the devices of one port in a configuration, with address and line settings."""
     kind = str(port.get("port_type", "serial"))
     if "tcp" in kind:
         line = network_settings(
@@ -146,7 +146,7 @@ def _device(
 
 
 class _Walk:
-    """Walks through a template's entries, and those of the subdevices that its channels use."""
+    """Walks through a template's entries, and through the entries of the subdevices that its channels use."""
 
     def __init__(self, device: ImportedDevice, template: Mapping[str, Any], is_shifted: bool) -> None:
         self._device = device
@@ -201,7 +201,7 @@ def _listed(found: Any) -> list[tuple[str, Any]]:
 
 
 def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the entries; of a composite entry, yield its parts."""
+    """Yield the entries; replace a composite entry by its parts."""
     for key, entry in listed:
         if isinstance(entry, dict):
             name = str(entry.get("name") or key or entry.get("id") or entry.get("title") or "channel")
@@ -274,7 +274,7 @@ def _number(
 
 
 def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, int] | None) -> tuple[str, str]:
-    """Return the number format, and the part that the format or the address selects."""
+    """Return the number format, and which bits of it the format or the address selects ("" for all)."""
     number = _FORMATS[format]
     own = _WIDTHS.get(format, 16 * words_of(number))
     if bits is None and (own == 16 * words_of(number) or number == "I8"):
@@ -285,13 +285,13 @@ def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, in
     if number[0] not in "UI" or words not in (1, 2, 4):
         register.lacks = f"its bits {shift} to {shift + width - 1} of the format {format}"
         return number, ""
-    sign = number[0] if width == own else "U"  # a part of a number is unsigned
+    sign = number[0] if width == own else "U"  # selected bits are unsigned
     part = "" if (shift, width) == (0, 16 * words) else bits_text(shift, shift + width - 1)
     return f"{sign}{16 * words}", part
 
 
 def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Add the raw counts that mean "no value"; for a float a count is its bit pattern."""
+    """Set the raw counts that mean "no value"; for a float the source states them as bit patterns."""
     number = str(register.details.get("number_format", ""))
     bits = 8 if number == "I8" else 16 * words_of(number)
     found: list[float | str] = []
@@ -310,7 +310,7 @@ def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
 
 
 def _is_plain(register: ImportedRegister) -> bool:
-    """Return True if the register's counts may have names."""
+    """Return True if the register's raw counts may be named: it has no step, offset or the like."""
     is_float = str(register.details.get("number_format", "")).startswith("F")
     return not is_float and not {"step", "offset"} & register.details.keys()
 
@@ -333,7 +333,7 @@ def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry
 
 
 def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
-    """Split "register:shift:width": return the address, and shift and width or None (width 0: not stated)."""
+    """Split "register:shift:width" into the address and (shift, width), or None; width 0 means not stated."""
     register, *bits = str(address).split(":")
     at = whole({"address": register}, "address")
     if not bits:

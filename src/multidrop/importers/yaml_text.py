@@ -8,18 +8,18 @@ from typing import Any
 from multidrop.extras import install_command
 
 MOST_CHARACTERS = 1_000_000
-MOST_NODES = 50_000  # an alias counts as all nodes of its expansion
+MOST_NODES = 50_000  # node limit; an alias counts as all nodes of its expansion
 
 
 class YamlTag(str):
-    """The spelling of a value with a tag, such as `!secret host`, whose real value is elsewhere."""
+    """A tagged value as spelt in the file, such as `!secret host`; its real value is not in the file."""
 
 
 def parse_yaml(text: str) -> Any:
     """Return the document; a value with a tag such as !secret is a `YamlTag`.
 
-    Raises ImportError if PyYAML is missing, ValueError if the text is no YAML, too long, or its expansion too
-    large.
+    Raises ImportError if PyYAML is missing, ValueError if the text is invalid or too long, or expands to too
+    many nodes.
     """
     try:
         yaml: Any = import_module("yaml")
@@ -29,7 +29,7 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(f"has more than {MOST_CHARACTERS} characters of YAML")
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
-        """Counts nodes, and ignores tags."""
+        """Limits the number of nodes."""
 
         left = MOST_NODES
 

@@ -21,26 +21,26 @@ from multidrop.transport import clock
 
 Report = Callable[
     [int, int, ParameterChange, str], None
-]  # called with number, total, the change and its outcome
+]  # called with the write's number, the total, the change and its outcome in words
 
 
 @dataclass
 class Applied:
-    """The writes of an application, and the parameters that were refused.
+    """The result of applying parameters: the writes made, and the parameters refused.
 
-    `earlier` has a sentence for each write of an application that was interrupted before this one. `failure`
-    ended the application; apply again to continue.
+    `earlier` has a sentence for each write of a previous, interrupted application. `failure` is the error
+    that ended this application early; call `apply` again to continue.
     """
 
     plan: ApplyPlan
     written: list[ParameterChange] = field(default_factory=list)
-    refused: dict[str, str] = field(default_factory=dict)  # reasons by code
+    refused: dict[str, str] = field(default_factory=dict)  # reasons by parameter code
     earlier: list[str] = field(default_factory=list)
     failure: BusError | None = None
 
     @property
     def ok(self) -> bool:
-        """True if the drive now holds all values, except those that the plan leaves out."""
+        """True if the drive now holds every value of the plan's writes."""
         return not self.refused and self.failure is None
 
 
@@ -54,23 +54,23 @@ def apply(
 ) -> Applied:
     """Write the parameters that differ to a stopped drive; return the result.
 
-    Each is written once, counted in the EEPROM ledger and read back. Before each write the state is read
-    again: a motor that turns ends the application. If the process is killed, a second call writes the rest,
-    and reports the first call's writes. With `commissioning`, a register may be written again within a
-    minute. Raises as `plan` does.
+    Each parameter is written once, counted in the EEPROM ledger and read back. The drive's state is read
+    before each write; if the motor turns, the application ends. If the process is killed, a second call
+    writes the remaining parameters and reports the first call's writes. With `commissioning`, a register may
+    be written again within a minute. Raises as `plan` does.
     """
     return apply_plan(plan(drive, values, also=also), commissioning=commissioning, report=report)
 
 
 def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report | None = None) -> Applied:
-    """Write the parameters of a plan, as `apply` does.
+    """Write the parameters of a plan as `apply` does; return the result.
 
-    First sends a stop to a drive that shows only an output frequency of 0.
+    If the only evidence of standstill is an output frequency of 0, a stop is sent first.
     """
     journal = _Journal(made.drive)
     result = Applied(made, earlier=journal.earlier())
     if made.writes:
-        if not check_stands(made.drive):  # it may run at 0 Hz, and would turn at the next setpoint
+        if not check_stands(made.drive):  # the motor may have a run command at 0 Hz
             made.drive.stop()
         journal.begin(made)
     with commissioning_block() if commissioning else nullcontext():
@@ -85,7 +85,7 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
 
 
 def _write(change: ParameterChange, drive: Drive, result: Applied, journal: _Journal) -> str:
-    """Write one parameter; return its outcome in words, and note it in `result`."""
+    """Write one parameter; record the outcome in `result`, and return it in words."""
     parameter = change.parameter
     try:
         check_stands(drive)
@@ -117,9 +117,9 @@ def _refused(change: ParameterChange, why: str, result: Applied, journal: _Journ
 
 
 class _Journal:
-    """The file that lists the writes of an application until it ends, beside the EEPROM ledger.
+    """A file beside the EEPROM ledger that lists the writes of an application until the application ends.
 
-    A file that is there before has the writes of an application that was interrupted.
+    If the file exists at the start, it lists the writes of an interrupted application.
     """
 
     def __init__(self, drive: Drive) -> None:
@@ -128,7 +128,7 @@ class _Journal:
         self._path = Ledger().at(identity).path.parent / "applications" / f"{name}.jsonl"
 
     def earlier(self) -> list[str]:
-        """Return a sentence for each write of an interrupted application."""
+        """Return a sentence for an interrupted application, and one for each of its writes; else []."""
         try:
             lines = self._path.read_text("utf-8", errors="replace").splitlines()
         except FileNotFoundError:
@@ -151,7 +151,7 @@ class _Journal:
         self.note(began=format_time(clock.utc_ns()), source=made.source, drive=made.drive.name)
 
     def note(self, **record: Any) -> None:
-        """Append a record in one write, so that a killed process leaves whole records."""
+        """Append a record with one system call, so that a killed process leaves only whole records."""
         with self._path.open("ab", buffering=0) as file:
             file.write(json.dumps(record).encode() + b"\n")
 

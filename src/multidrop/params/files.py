@@ -15,7 +15,7 @@ from multidrop.params.values import ParameterSet
 from multidrop.printable import plain_whole, printable
 from multidrop.toml_check import parse_document
 
-FORMAT = 1  # of the files that this version writes; it refuses higher numbers
+FORMAT = 1  # version of the file format; files with a higher number are refused
 MOST_BYTES = 1_000_000
 FACTS = ("model", "title", "firmware", "saved")
 COLUMNS = ("code", "raw", "name", "value", "factory")
@@ -25,7 +25,7 @@ _FACT = re.compile(r"#\s*(\w+):\s*(.*?)\s*$")
 
 
 def is_parameter_file(path: Path | str) -> bool:
-    """Return True if the name is a CSV file's, or a TOML file there has parameters."""
+    """Return True if the path ends in .csv, or is a TOML file with parameters."""
     path = Path(path)
     if path.suffix.lower() == ".csv":
         return True
@@ -38,7 +38,7 @@ def is_parameter_file(path: Path | str) -> bool:
 
 
 def load(path: Path | str) -> ParameterSet:
-    """Return the parameters in a TOML or CSV file. Raises ValueError, in one sentence, if it is wrong."""
+    """Return the parameters in a TOML or CSV file. Raises ValueError if the file is invalid."""
     path = Path(path)
     try:
         with path.open("rb") as file:
@@ -57,10 +57,10 @@ def load(path: Path | str) -> ParameterSet:
 
 
 def save(found: ParameterSet, path: Path | str, family: Any = None) -> None:
-    """Write a new TOML or CSV file, by the path's suffix.
+    """Write the parameters to a new TOML or CSV file; the path's suffix selects the format.
 
-    Raises ValueError for another suffix, or if the file exists already. `family`, a drive's class,
-    gives names, units and factory values.
+    Raises ValueError for another suffix, or if the file exists. With `family`, a drive class, the file also
+    shows names, units and factory values.
     """
     path = Path(path)
     check_name(path)
@@ -73,7 +73,7 @@ def save(found: ParameterSet, path: Path | str, family: Any = None) -> None:
 
 
 def check_name(path: Path) -> None:
-    """Raise ValueError unless a parameter file can be made under this name."""
+    """Raise ValueError if the suffix is not that of a parameter file, or the file exists."""
     if path.suffix.lower() not in (".toml", ".csv"):
         raise ValueError(f"{path}: a parameter file's name ends in .toml or .csv")
     if path.exists():
@@ -84,7 +84,7 @@ def check_name(path: Path) -> None:
 
 
 def to_toml(found: ParameterSet, family: Any = None) -> str:
-    """Return a set as TOML: a raw count for each code, with a comment for each declared parameter."""
+    """Return a parameter set as TOML: each code's raw count, with a comment if the parameter is declared."""
     facts = {name: getattr(found, name) for name in FACTS}
     lines = [f"format = {FORMAT}"]
     lines += [f'{name} = "{_plain(value)}"' for name, value in facts.items() if value]
@@ -129,7 +129,7 @@ def _raw(code: str, raw: object) -> int:
 
 
 def to_csv(found: ParameterSet, family: Any = None) -> str:
-    """Return a set as CSV with semicolons, as `to_toml` does; only code and raw count are read again."""
+    """Return a parameter set as CSV with semicolons; `load` uses only the code and raw count columns."""
     out = io.StringIO()
     out.write(f"# format: {FORMAT}\n")
     for name in FACTS:
@@ -193,7 +193,7 @@ def _known(family: Any) -> Mapping[str, Parameter]:
 
 
 def _words(parameter: Parameter | None, raw: int) -> tuple[str, str, str]:
-    """Return a declared parameter's name, value and factory value; empty texts for others."""
+    """Return name, value and factory value of a declared parameter as texts; empty texts for None."""
     if parameter is None or not parameter.is_declared:
         return "", "", ""
     default = parameter.default_raw
@@ -201,5 +201,5 @@ def _words(parameter: Parameter | None, raw: int) -> tuple[str, str, str]:
 
 
 def _plain(text: str) -> str:
-    """Return a text that needs no escape in a TOML string, a comment or a line of CSV."""
+    """Return the text without characters that need an escape in a TOML string, a comment or a CSV line."""
     return printable(text).replace("\\", "/").replace('"', "'")

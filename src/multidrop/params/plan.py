@@ -1,4 +1,4 @@
-"""Plan of an application: which parameters are written, in which order, and which are not and why."""
+"""Plan the writes of a parameter set: which parameters, in which order, and why others are left out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.drive.state import Condition
 from multidrop.errors import Advice, Unsupported, WriteForbidden
 from multidrop.params.values import ParameterSet, Progress, check_same_model, parameter_of, read, text_of
 
-MOST_MISTAKES = 5  # shown in one error
+MOST_MISTAKES = 5  # mistakes listed in one error
 
 
 class ParameterChange(NamedTuple):
@@ -33,9 +33,9 @@ class ParameterChange(NamedTuple):
 
 @dataclass(frozen=True)
 class ApplyPlan:
-    """The writes that make a drive hold these values, in order; `left` has reasons by code for the others.
+    """The ordered writes that make a drive hold these values; `left`: why others are not written, by code.
 
-    `notes` are sentences for the person who confirms the plan.
+    `notes` are sentences to show to the user who confirms the plan.
     """
 
     drive: Drive
@@ -57,11 +57,11 @@ def plan(
     also: Collection[str] = (),
     progress: Progress | None = None,
 ) -> ApplyPlan:
-    """Return the writes of `apply`; only reads the drive.
+    """Return the writes that `apply` would make; only reads from the drive.
 
-    `also` has codes of the line's own parameters, which are not written otherwise. Raises WriteForbidden if
-    the motor runs or the drive is of another family. Raises ValueError for another model's values, an unknown
-    code, or values out of range; then no parameter is written.
+    `also` lists codes of communication parameters (address, baud rate) to write as well; by default these are
+    left out. Raises WriteForbidden if the motor runs or the drive is of another family. Raises ValueError for
+    another model's values, an unknown code, or a value out of range.
     """
     given = values if isinstance(values, ParameterSet) else ParameterSet("", values, source="values")
     family: Any = type(drive)
@@ -93,7 +93,7 @@ def plan(
             except TypeError as mistake:
                 mistakes.append(f"{code}: {mistake}")
             except WriteForbidden as mistake:
-                if not mistake.rule.startswith(one.name):  # not a value's mistake
+                if not mistake.rule.startswith(one.name):  # not a mistake in a value
                     raise
                 mistakes.append(f"{code}: {mistake.rule}")
     if mistakes:
@@ -127,9 +127,9 @@ def _notes(given: ParameterSet, present: ParameterSet) -> tuple[str, ...]:
 
 
 def check_stands(drive: Drive) -> bool:
-    """Raise WriteForbidden unless the motor stands and only the line commands it.
+    """Raise WriteForbidden unless the motor is at rest and only the serial line can start it.
 
-    Return False if the drive shows only an output frequency of 0: it may run at a setpoint of 0 Hz.
+    Return False if the only evidence is an output frequency of 0: the motor may run at a setpoint of 0 Hz.
     """
     try:
         state = drive.state()
@@ -148,7 +148,7 @@ def check_stands(drive: Drive) -> bool:
 
 
 def _check_no_run_command(drive: Drive) -> None:
-    """Raise WriteForbidden if the motor has a run command at 0 Hz, or may get one from panel or terminals."""
+    """Raise WriteForbidden if a run command is active at 0 Hz, or the panel or a terminal could give one."""
     status = drive.registers.get("status")
     run = _member(status, "run")
     if status is not None and isinstance(run, Flag) and run in drive.read(status):
@@ -164,7 +164,7 @@ def _check_no_run_command(drive: Drive) -> None:
 
 
 def _member(register: Register[Any] | None, name: str) -> Any:
-    """Return a register's named value, in capitals or not; None if it has none of this name."""
+    """Return the register's named value, ignoring case; None if the register has no value of this name."""
     if register is None or register.values is None or not register.readable:
         return None
     members: Any = register.values
@@ -193,7 +193,7 @@ _STOP = Advice.call("stop")
 
 
 def _bounds(family: Any, known: Mapping[str, Parameter]) -> dict[str, str]:
-    """Return the codes of the registers that bound these parameters, by register name."""
+    """Return the codes of the parameters that limit these parameters, by register name."""
     names = {name for one in known.values() for name in (one.at_least, one.at_most) if name}
     return {one.name: code for code, one in parameters_of(family).items() if one.name in names}
 
@@ -201,9 +201,9 @@ def _bounds(family: Any, known: Mapping[str, Parameter]) -> dict[str, str]:
 def _ordered(
     drive: Drive, changes: list[ParameterChange], present: Mapping[str, int], bounds: Mapping[str, str]
 ) -> tuple[list[ParameterChange], list[ParameterChange]]:
-    """Return the changes so that each is within its bounds when it is written, and those that never are.
+    """Return the changes, ordered so that each is within its limits when written, and the impossible changes.
 
-    The line's own parameters come last: the drive may not answer after them.
+    Communication parameters come last, because the drive may not answer after they are written.
     """
     held = dict(present)
     last = drive.parameter_space.line if drive.parameter_space else ()

@@ -1,4 +1,4 @@
-"""Parameter sets: read from a drive, its manual or a file; and their differences."""
+"""Read parameter sets from a drive or its family's manual, and compare them."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from multidrop.iso_time import format_time
 from multidrop.planning.blocks import Block, blocks, halves
 from multidrop.transport import clock
 
-ILLEGAL_FUNCTION = 1  # exception code: no parameter can be read
+ILLEGAL_FUNCTION = 1  # exception code: the drive cannot read any parameter
 GROUP_END = 10  # after this many unanswered reads in a row, read only the group's declared parameters
-READ_EXPIRY = 60.0  # s until a read's turn, on a line that is polled
+READ_EXPIRY = 60.0  # s that a read may wait for its turn on a polled line
 ATTEMPTS = 3
 
-Progress = Callable[[int, int], None]  # called with the number done, and the total
+Progress = Callable[[int, int], None]  # called with the number of parameters done, and the total
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Parameters as raw counts by code, such as {"P00.03": 5000}.
+    """Parameter values as raw counts by code, such as {"P00.03": 5000}.
 
-    `model` is "" if a file does not state it. `source` is the drive's name or the file's path. `saved` is UTC
-    in ISO 8601, `firmware` the drive's raw version; both are "" if unknown.
+    `source` is the drive's name or the file's path. `saved` is the time of reading, UTC in ISO 8601.
+    `firmware` is the drive's raw version. `model`, `saved` and `firmware` are "" if unknown.
     """
 
     model: str
@@ -39,10 +39,10 @@ class ParameterSet:
 
 
 class Difference(NamedTuple):
-    """A parameter that differs: its raw counts on both sides, None if a side lacks it, and their texts."""
+    """A parameter that differs between two sets: both raw counts (None if a set lacks it) and their texts."""
 
     code: str
-    name: str  # of the declared register, or ""
+    name: str  # name of the declared register, or ""
     first: int | None
     second: int | None
     first_text: str
@@ -50,7 +50,7 @@ class Difference(NamedTuple):
 
 
 def parameter_of(family: Any, code: str) -> Parameter:
-    """Return the parameter of this code. Raises ValueError if the family has none."""
+    """Return the family's parameter with this code. Raises ValueError if there is none."""
     known = parameters_of(family)
     if code not in known:
         first = next(iter(known))
@@ -64,7 +64,7 @@ def text_of(family: Any, code: str, raw: int | None) -> str:
         return "-"
     try:
         return parameters_of(family)[code].text(raw)
-    except (KeyError, Unsupported, AttributeError):  # of a model that is not known here
+    except (KeyError, Unsupported, AttributeError):  # unknown model or code
         return str(raw)
 
 
@@ -74,12 +74,12 @@ def text_of(family: Any, code: str, raw: int | None) -> str:
 def read(
     drive: Drive, codes: Iterable[str] | None = None, *, progress: Progress | None = None
 ) -> ParameterSet:
-    """Return all parameters of a drive, or those of `codes`; parameters that it does not have are left out.
+    """Return all parameters of a drive, or those in `codes`, without those that the drive does not have.
 
-    Monitors among `codes` are left out too. Reads blocks of parameters, and splits a block that the drive
-    refuses. Raises Unsupported if the family has no rule for addresses, ValueError for an unknown code,
+    Monitors in `codes` are left out too. Parameters are read in blocks; a refused block is split. Raises
+    Unsupported if the family has no rule for parameter addresses, ValueError for an unknown code,
     WriteForbidden if the drive is of another family, and NoReply, BadReply, DriveException or LineError if
-    reading fails.
+    a read fails.
     """
     family: Any = type(drive)
     if drive.bus is None:
@@ -108,16 +108,16 @@ def read(
 
 @dataclass
 class _Reader:
-    """Reads parameters, and learns which ones the drive lacks and how long its blocks may be."""
+    """Reads parameters, and learns which parameters the drive lacks and the longest block that it answers."""
 
     drive: Drive
     total: int
     progress: Progress | None
     values: dict[str, int] = field(default_factory=dict)
-    most: int = 0  # longest block that the drive answers, once it has refused a longer one; 0: not learnt
+    most: int = 0  # longest block that was answered after a longer one was refused; 0: not yet known
     done: int = 0
     silent: int = 0  # number of reads in a row that were not answered
-    group: str = ""  # of the newest parameter
+    group: str = ""  # group of the last parameter read
 
     def read(self, wanted: Sequence[Parameter]) -> None:
         found = sorted(blocks(self.drive, wanted), key=lambda block: block.start)
@@ -125,7 +125,7 @@ class _Reader:
             self._read(block)
 
     def _read(self, block: Block) -> bool:
-        """Read a block, in parts if it is refused. Return True if the drive has all of its parameters."""
+        """Read a block, in halves if it is refused. Return True if the drive has all its parameters."""
         kept = self._without_group_end(block)
         if kept is None:
             return False
@@ -139,7 +139,7 @@ class _Reader:
             if refusal.code == ILLEGAL_FUNCTION or self.drive.is_temporary(refusal.code):
                 raise
         except NoReply:
-            self._check_answers()  # some drives do not answer a read of a missing parameter
+            self._check_answers()  # raises unless the drive answers other reads
             self.silent += 1
         else:
             self._note(block.registers, raws)
@@ -149,16 +149,16 @@ class _Reader:
             self._note(block.registers, [None])
             return False
         is_whole = self._read_all(parts)
-        if is_whole:  # each part was answered: the block was too long
+        if is_whole:  # every part was answered, so only the block's length was refused
             self.most = max(part.count for part in parts)
         return is_whole
 
     def _read_all(self, parts: Sequence[Block]) -> bool:
-        answered = [self._read(part) for part in parts]  # each one, also after a refusal
+        answered = [self._read(part) for part in parts]  # reads all parts, even after a refusal
         return all(answered)
 
     def _without_group_end(self, block: Block) -> Block | None:
-        """Return the block without parameters after the end of its group; None if none is left."""
+        """Return the block without parameters past the apparent end of their group; None if it is empty."""
         kept: list[Parameter] = []
         for parameter in block.registers:
             assert isinstance(parameter, Parameter)
@@ -174,7 +174,7 @@ class _Reader:
         return Block.of(self.drive, kept) if kept else None
 
     def _ask(self, block: Block) -> list[int | None]:
-        """Return the raw counts of a block's parameters."""
+        """Read a block; return its parameters' raw counts."""
         drive, table = self.drive, block.table
         if drive.framing is Framing.DELIXI or table.read is None:
             (parameter,) = block.registers
@@ -201,7 +201,7 @@ class _Reader:
             self.progress(self.done, self.total)
 
     def _check_answers(self) -> None:
-        """Raise NoReply if the drive does not answer a read that it answers otherwise."""
+        """Raise NoReply if the drive does not answer a read of a register that it has."""
         readable = (one for one in self.drive.registers.values() if one.readable)
         probe = self.drive.echo_probe or next(readable, None)
         if probe is not None:
@@ -209,9 +209,9 @@ class _Reader:
 
 
 def rows(family: Any, held: ParameterSet | None = None) -> list[dict[str, Any]]:
-    """Return a dict for each parameter of a set, with texts and the reason why it is not written.
+    """Return a dict for each parameter of a set: texts to show, and why it is not written, if so.
 
-    Without a set, return the declared parameters of the family, with "value" empty and no "raw".
+    Without a set, return the family's declared parameters, with an empty "value" and no "raw".
     """
     known = parameters_of(family)
     if held is None:
@@ -236,7 +236,7 @@ def rows(family: Any, held: ParameterSet | None = None) -> list[dict[str, Any]]:
 
 
 def defaults(drive: Drive | type[Drive]) -> ParameterSet:
-    """Return the factory values that the family's manual prints. Raises Unsupported if it prints none."""
+    """Return the factory values printed in the family's manual. Raises Unsupported if it prints none."""
     family: Any = drive if isinstance(drive, type) else type(drive)
     raws = {code: one.default_raw for code, one in parameters_of(family).items()}
     known = {code: raw for code, raw in raws.items() if raw is not None}
@@ -246,9 +246,9 @@ def defaults(drive: Drive | type[Drive]) -> ParameterSet:
 
 
 def compare(first: ParameterSet, second: ParameterSet, family: Any = None) -> list[Difference]:
-    """Return the parameters that differ, in the order of `first`.
+    """Return the parameters that differ between two sets, in the order of `first`.
 
-    `family`, a drive's class, gives names and units. Raises ValueError if the sets are of different models.
+    With `family`, a drive class, names and units are filled in. Raises ValueError if the models differ.
     """
     check_same_model(first, second)
     known = {} if family is None else parameters_of(family)
@@ -266,7 +266,7 @@ def compare(first: ParameterSet, second: ParameterSet, family: Any = None) -> li
 
 
 def check_same_model(first: ParameterSet, second: ParameterSet) -> None:
-    """Raise ValueError if both sets state their model, and not the same one."""
+    """Raise ValueError if both sets state a model and the models differ."""
     if first.model and second.model and first.model != second.model:
         raise ValueError(
             f"{first.source} has parameters of {first.model}, and {second.source} of {second.model}: "

@@ -1,4 +1,4 @@
-"""Find the drives on a line whose settings are unknown. Only reads are sent."""
+"""Find the drives on a serial line with unknown settings. Only reads are sent."""
 
 from multidrop.scan.plant_writer import plant_text as plant_text
 from multidrop.scan.results import Crowd as Crowd

@@ -1,6 +1,6 @@
 """Identify the family of a drive that answers: check the registers that each family's document requires.
 
-Only reads are sent. A drive of a family without an `identify` script must answer the family's first readings.
+Only reads are sent. If a family has no `identify` script, the drive must answer the family's first readings.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from multidrop.transport.exchange import good_reply
 from multidrop.transport.peers import LEAST_TIMEOUT
 
 R = TypeVar("R")
-Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError without a good reply
+Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError unless a valid reply comes
 
-MOST_READINGS = 3  # readings that must be answered if the family has no `identify` script
+MOST_READINGS = 3  # readings that a drive must answer if its family has no `identify` script
 
 
 def identify(
     sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask
 ) -> tuple[list[Drive], str]:
-    """Return a drive of each family that fits best, and a sentence about the remaining doubt.
+    """Return a drive object for each best-fitting family, and a sentence about the remaining doubt.
 
     Several families may fit equally well; the list is empty if none fits.
     """
@@ -49,14 +49,14 @@ def identify(
 
 
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
-    """Return a drive of the family with these settings; None if its manual does not allow them.
+    """Return a drive object of the family with these settings; None if its manual does not allow them.
 
-    A drive with two stop bits, or with another parity on a pseudo-terminal, answers in the sweep's format,
-    too. If the family does not allow that format, the drive gets the family's usual one.
+    A drive can answer in the sweep's format although its own differs: in its stop bits, or on a
+    pseudo-terminal in its parity. If the family does not allow the sweep's format, its usual one is set.
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None
-    if framing is Framing.TCP:  # the gateway knows the settings
+    if framing is Framing.TCP:  # only the gateway knows the serial settings
         return family(address, framing=framing)
     if settings.baudrate not in family.baudrates:
         return None
@@ -65,7 +65,7 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
 
 
 def _score(drive: Drive, ask: Ask) -> int:
-    """Return the number of checks that the drive passes. Raises if a check excludes the family."""
+    """Return the number of checks that the drive passes. Raises BusError or ValueError on a misfit."""
     score = 0
     if type(drive).identify is not Drive.identify:
         _run(drive, drive.identify.script(), ask)
@@ -114,7 +114,7 @@ def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
     return value
 
 
-MOST_TIMEOUT = 1.0  # s, for a drive with a known address only
+MOST_TIMEOUT = 1.0  # s; only for a drive whose address is known
 TRIES = 3
 LATE_NS = 500_000_000  # how long to wait for late replies
 SHORTEST_REPLY = 5  # bytes of an exception reply; fewer bytes are noise

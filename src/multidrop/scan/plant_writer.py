@@ -1,4 +1,4 @@
-"""Write a plant file with the drives that a scan has found, and with doubts as comments."""
+"""Write a plant file for the drives that a scan has found; doubts become comments."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def plant_text(
     rs485: RS485 = RS485.OFF,
     settle: float = 0.0,
 ) -> str:
-    """Return the file's text; `families` by their model in a plant file.
+    """Return the plant file's text; `families` maps each model name in the plant file to its class.
 
-    Raises ValueError if no drive of a known family was found.
+    Raises ValueError if the scan found no drive of a known family.
     """
     names = {family.model or family.__name__: name for name, family in families.items()}
     taken: dict[int, str] = {}
@@ -47,7 +47,7 @@ def plant_text(
 
 def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
     drive = candidate(family, device.settings, device.framing, device.address)
-    assert drive is not None  # identified drives fit their family
+    assert drive is not None  # an identified drive has settings of its family
     yield "[[line.drive]]"
     if device.doubt:
         yield f"# {device.doubt}"

@@ -1,4 +1,4 @@
-"""Findings of a scan: drives, addresses and settings with problems, and its progress."""
+"""Findings of a scan: drives found, addresses and settings with problems, and progress reports."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ GUESS = "it only reads like one: look at its name plate"
 
 @dataclass(frozen=True)
 class Found:
-    """A drive that answers: `models` fit equally well; it is empty if no family fits.
+    """A drive that answers; `models` are the equally likely families, empty if no family fits.
 
-    The settings are the first ones that it answered. Its number of stop bits may differ, because a drive
-    answers requests with another number, too.
+    The settings are the first at which the drive answered. Its number of stop bits may differ, because a
+    drive also answers requests with another number of stop bits.
     """
 
     address: int
@@ -28,10 +28,9 @@ class Found:
 
 @dataclass(frozen=True)
 class Crowd:
-    """An address whose answers never match the request.
+    """An address whose replies never match the request; probably several drives have it.
 
-    Probably several drives have this address. If `reply` is not empty, a frame with a valid checksum came,
-    and `reply` says why it does not match.
+    If a reply had a valid checksum, `reply` says why it does not match; else `reply` is empty.
     """
 
     address: int
@@ -42,7 +41,7 @@ class Crowd:
 
 @dataclass(frozen=True)
 class Noise:
-    """A setting with invalid bytes at so many addresses that they must be noise."""
+    """A setting that received invalid bytes at so many addresses that these are probably noise."""
 
     settings: Settings
     framing: Framing
@@ -52,7 +51,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Untried:
-    """A setting that the port does not support: no request was sent."""
+    """A setting that was skipped because the port does not support it."""
 
     settings: Settings
     framing: Framing
@@ -61,7 +60,7 @@ class Untried:
 
 @dataclass(frozen=True)
 class Progress:
-    """One more address is done. `left` is the remaining time in s if no further drive answers."""
+    """One more address is done; `left` is the scan's remaining time in s if no further drive answers."""
 
     settings: Settings
     framing: Framing

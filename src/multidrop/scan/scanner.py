@@ -1,6 +1,6 @@
-"""Scan a line: carry out sweeps one after another, and find drives by the replies.
+"""Scan a serial line: carry out sweeps one after another, and find drives by their replies.
 
-The line is an argument. No clock is read; times come from the completions.
+The caller passes the function that carries out exchanges. No clock is read: times come from completions.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from multidrop.scan.identify import MOST_TIMEOUT, TRIES, Probe, is_whole
 from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 
-NOISY = 1 / 3  # of a sweep's addresses: invalid bytes at more of them are noise, not drives
-LEAST_NOISY = 4  # addresses with invalid bytes, before they count as noise
-BEGUN = 2  # characters after which a reply counts as started
-LATE = 8  # a reply may be late by this many addresses' timeouts and still be matched to its request
+NOISY = 1 / 3  # share of a sweep's addresses; invalid bytes at more addresses count as noise
+LEAST_NOISY = 4  # least number of addresses with invalid bytes that counts as noise
+BEGUN = 2  # received characters after which a reply counts as started
+LATE = 8  # a reply is still matched to its request while the next so many addresses are asked
 
 
 class CarryOut(Protocol):
-    """Carry out exchanges on a line. Raises LineError."""
+    """A function that carries out an exchange on the line. Raises LineError."""
 
     def __call__(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion: ...
 
@@ -51,10 +51,10 @@ class _Scan:
     def __init__(self, carry_out: CarryOut, families: Sequence[type[Drive]]) -> None:
         self._carry_out = carry_out
         self._families = families
-        self._peers: list[Peer] = []  # references that keep the line's peers alive
+        self._peers: list[Peer] = []  # keeps the peers alive that the line refers to
         self._found: set[tuple[int, Framing, int]] = set()
         self._crowded: set[tuple[int, Framing, int]] = set()
-        self._excess = 0.0  # s by which replies exceeded the usual delay of their family
+        self._excess = 0.0  # s by which a drive's response delay exceeded its family's usual one
         self._refusals: list[LineError] = []
 
     def run(self, sweeps: Sequence[Sweep]) -> Iterator[Finding]:
@@ -65,12 +65,12 @@ class _Scan:
             raise self._refusals[-1]
 
     def _learned(self, sweep: Sweep) -> Sweep:
-        """Return the sweep, with more patience if replies were slow (adapter or network)."""
+        """Return the sweep with a longer timeout if replies so far were slow (adapter or network)."""
         return replace(sweep, patience=sweep.patience + min(2 * self._excess, MOST_TIMEOUT))
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        garbled: dict[int, str] = {}  # address: the frame received, if it was whole
+        garbled: dict[int, str] = {}  # by address: the whole frame that did not match, or ""
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
             peers[address] = self._sweep_peer(sweep)
@@ -85,7 +85,7 @@ class _Scan:
             came = completion.result != Failure.NO_REPLY
             earlier = addresses[max(0, number - 1 - LATE) : number - 1]
             late = [before for before in earlier if before in peers and peers[before].late]
-            for suspect in late:  # the core has matched its late reply
+            for suspect in late:  # the core has matched the late reply to this address
                 del peers[suspect]
             late += _late(sweep, earlier, completion)
             for suspect in late + [address] * came:
@@ -110,11 +110,11 @@ class _Scan:
                 yield Crowd(address, sweep.settings, sweep.framing, whole_frame)
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion:
-        """Carry out an exchange; an echo of the request does not count as a reply."""
+        """Carry out an exchange; return its completion, in which an echo of the request is not a reply."""
         completion = self._once(sweep, sweep.framing, request, peer, not_before_ns)
         if sweep.framing is not Framing.TCP and completion.raw == build_request(sweep.framing, request):
-            # The reply to this request may equal it. Use another framing to find out whether the adapter
-            # echoes.
+            # A valid reply may equal this request. A request in another framing, which drives ignore, shows
+            # whether the adapter echoes.
             other = Framing.ASCII if sweep.framing is Framing.RTU else Framing.RTU
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._sweep_peer(sweep))
             completion = self._once(sweep, sweep.framing, request, peer)
@@ -141,7 +141,7 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer whose timeout ends at the start of a reply; a probe later reads a complete reply."""
+        """Return a peer whose timeout covers only a reply's start; a probe later reads the whole reply."""
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.request.to(sweep.addresses[0]))
         window = sweep.patience + (BEGUN - length) * settings.character
@@ -154,12 +154,12 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Return a drive's key without its format: it may answer in several, but is reported once."""
+    """Return a key for a drive, without its format: a drive that answers in several is reported once."""
     return address, sweep.framing, sweep.settings.baudrate
 
 
 def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[int]:
-    """Return the earlier addresses whose late reply came during this address's exchange."""
+    """Return the earlier addresses whose late replies came during this exchange."""
     if completion.result > 0 or not completion.raw:
         return []
     found = []

@@ -1,4 +1,4 @@
-"""Plan a scan: its requests and their order, before anything is sent. Pure.
+"""Plan a scan: its requests and their order. Pure functions; no request is sent.
 
 A sweep sends one request to many addresses at one setting.
 """
@@ -20,16 +20,16 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
-GATEWAY_PATIENCE = 1.0  # s until a gateway reports that a drive does not answer
+GATEWAY_PATIENCE = 1.0  # s within which a Modbus TCP gateway reports that a drive does not answer
 ADDRESSES = range(1, 32)  # scanned by default
-_ILLEGAL_ADDRESS = 2  # the exception code
-# With these carriers a reply with the value 0 equals its request's echo. An address register is never 0.
+_ILLEGAL_ADDRESS = 2  # exception code: illegal data address
+# With these carriers a reply with the value 0 equals an echo of the request. An address register is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
 @dataclass(frozen=True)
 class ScanRequest:
-    """A read without a drive address."""
+    """A read request to which a drive address can be added."""
 
     function: int
     start: int
@@ -42,11 +42,11 @@ class ScanRequest:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One request to many addresses, each with `patience` s until its reply starts."""
+    """One request to many addresses; each reply must start within `patience` s."""
 
     settings: Settings
     framing: Framing
-    families: tuple[type[Drive], ...]  # families that answer, by their documents
+    families: tuple[type[Drive], ...]  # families whose documents say that they answer the request
     request: ScanRequest
     addresses: tuple[int, ...]
     silence: float
@@ -54,7 +54,7 @@ class Sweep:
 
     @property
     def each(self) -> float:
-        """Seconds that a silent address takes: line silence, request, timeout."""
+        """Seconds that an address without a drive takes: line silence, request, timeout."""
         request = len(build_request(self.framing, self.request.to(1)))
         return self.silence + request * self.settings.character + self.patience
 
@@ -71,11 +71,11 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """Return the sweeps of all settings in these families' documents, most likelihood per second first.
+    """Return sweeps of all settings in these families' documents, the best chance per second first.
 
-    Every setting is swept with the patience that usual response delays need, and again with the longest that
-    the documents allow. `baudrates` and `formats` limit the settings; by default the documents' are used.
-    Raises ValueError for a baud rate or format that is in no document, and if no sweep is left.
+    Every setting is swept first with a timeout for usual response delays, then with one for the longest
+    delays that the documents allow. `baudrates` and `formats` restrict the settings; empty means all. Raises
+    ValueError for a baud rate or format that is in no document, and if no sweep is left.
     """
     settings = _settings(families)
     _check("baud rate", baudrates, {setting.baudrate for setting, _ in settings})
@@ -95,7 +95,7 @@ def sweeps(
 
 
 def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
-    """Drop sweeps that send the same bytes: on a port with a fixed format they are repetitions."""
+    """For a port with a fixed format, keep two sweeps of each request: with a short and a long timeout."""
     brisk: dict[tuple[Framing, ScanRequest], Sweep] = {}
     patient: dict[tuple[Framing, ScanRequest], Sweep] = {}
     for sweep in planned:
@@ -107,7 +107,7 @@ def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
 
 
 def over_tcp(planned: Sequence[Sweep]) -> list[Sweep]:
-    """Return the sweeps for a Modbus TCP port: each request once, with the timeout that a gateway needs."""
+    """Return the sweeps for a Modbus TCP port: each request once, with the timeout that gateways need."""
     once: dict[ScanRequest, Sweep] = {}
     for sweep in planned:
         if sweep.framing in MODBUS:
@@ -129,7 +129,7 @@ def _patient(sweep: Sweep) -> Sweep:
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Return each setting's families with a likelihood, because documents name the usual setting first."""
+    """Return each setting's families with likelihoods; a setting that a document names first is likelier."""
     found: dict[Setting, dict[type[Drive], float]] = {}
     for family in families:
         for framing in family.framings:
@@ -143,7 +143,7 @@ def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive]
 def _sweeps(
     setting: Setting, weights: dict[type[Drive], float], addresses: Sequence[int]
 ) -> Iterator[tuple[float, Sweep]]:
-    """Yield as few sweeps as reach every family at this setting, each with its likelihood."""
+    """Yield the fewest sweeps that reach every family at this setting, each with its likelihood."""
     left = dict(weights)
     while left:
         register = _best(left)
@@ -157,7 +157,7 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register that most families answer; of equal ones, the most common register."""
+    """Return the register that most families answer; in a tie, the register that most families declare."""
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,
@@ -176,7 +176,7 @@ _known: WeakKeyDictionary[type[Drive], Mapping[Table, Collection[int]]] = WeakKe
 
 
 def _addresses(family: type[Drive]) -> Mapping[Table, Collection[int]]:
-    """Return the readable addresses of each table; cached for each family."""
+    """Return the family's readable addresses by table (cached)."""
     if family not in _known:
         found: dict[Table, set[int]] = {}
         for register in family.registers.values():
@@ -191,7 +191,7 @@ def _has(family: type[Drive], register: Register[Any]) -> bool:
 
 
 def _answers(family: type[Drive], register: Register[Any]) -> bool:
-    """Return True if the family has this register, or a documented exception for unknown registers."""
+    """Return True if the family has this register, or documents an exception for unknown registers."""
     if _has(family, register):
         return True
     reads = register.table in _addresses(family)

@@ -1,4 +1,4 @@
-"""INVT CHE, simulated (manual, chapter 11; registers and exceptions from the CHE100 manual)."""
+"""Simulated INVT CHE (manual, chapter 11; registers and exceptions from the CHE100 manual)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CONTROL, SETPOINT = 0x1000, 0x2000
 STARTS = range(1, 5)
 FULL = 10_000  # raw setpoint for 100 %
 DEVICE_CODE = 0x0101  # CHE, universal
-_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # 5001H by exception code
+_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # exception code: value of 5001H
 
 
 def _signed(raw: int) -> int:
@@ -24,8 +24,8 @@ class SimulatedCHE(MotorDrive):
 
     The unit of output power is 0.01 kW, as on a CHF100A; no manual of a CHE states it.
 
-    For `storing` s after a write to the EEPROM the drive is busy. The manual does not say what ends a jog or
-    a run. Here both stop commands end both, and a start ends a jog.
+    After a write to the EEPROM the drive is busy for `storing` s. The manual does not say which command ends
+    a jog or a run. Here both stop commands end a jog and a run, and a start ends a jog.
     """
 
     functions = (0x03, 0x06)
@@ -34,7 +34,7 @@ class SimulatedCHE(MotorDrive):
         **MODBUS.codes,
         Reason.VALUE: 0x12,
         Reason.LOCKED: 0x12,
-        Reason.CANNOT: 1,  # "or drive in fault"
+        Reason.CANNOT: 1,  # also for a drive in fault, by the manual
         Reason.DAMAGED: 0x11,  # 11.1: a receive error is answered with a fault frame
     }
 
@@ -55,7 +55,7 @@ class SimulatedCHE(MotorDrive):
     def accept(self, cell: MemoryCell, raw: int) -> int:
         if self.now < self._busy_until:
             raise Refusal(Reason.BUSY)
-        if cell.address == SETPOINT:  # the library writes no negative setpoint, but the drive accepts it
+        if cell.address == SETPOINT:  # the drive accepts negative values; the library sends none
             if not -FULL <= _signed(raw) <= FULL:
                 raise Refusal(Reason.VALUE)
             return raw

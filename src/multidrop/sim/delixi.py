@@ -1,4 +1,4 @@
-"""Delixi 9100 and 9200, simulated: standard Modbus, and Delixi's own protocol."""
+"""Simulated Delixi 9100 and 9200: in standard Modbus, and in Delixi's own protocol."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import COMMAND, SET, STORE, Reason, Refusal
 
-MOST_GAP = 10e-3  # s between two bytes; from part 3, the only one that states a gap
-UNDER_VOLTAGE = 7  # fault number, POFF
+MOST_GAP = 10e-3  # longest gap in s between two bytes; only part 3 of the document states one
+UNDER_VOLTAGE = 7  # fault number of POFF
 
-BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # by the codes of P04.28
-MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # by codes of P04.29: ASCII, then RTU
+BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # indexed by P04.28
+MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # indexed by P04.29: ASCII, then RTU
 NATIVE_FORMATS = ("8N1", "8E1", "8O1")
 COMMANDS, STARTS = range(1, 5), (2, 3)  # values of the run command (K = 02)
 RUN_SOURCE, FREQUENCY_SOURCE = 0, 1  # P00.00 and P00.01
@@ -19,11 +19,11 @@ BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
 
 
 class SimulatedDelixi(MotorDrive):
-    """Delixi by standard Modbus. The manual has no exceptions: a request that fails gets no answer.
+    """Delixi in standard Modbus. The manual documents no exceptions: a request that fails gets no reply.
 
-    Assumptions beyond the document: a run command is confirmed without effect during a fault, or if P00.00 is
-    not 2. The setpoint is 0 if P00.01 is not 1. A start ends a jog. The longest gap within a frame is that of
-    part 3.
+    Assumptions beyond the document: during a fault, or unless P00.00 is 2, a run command is confirmed and has
+    no effect. The setpoint is 0 unless P00.01 is 1. A start ends a jog. The longest gap within a frame is
+    that of part 3.
     """
 
     functions = (0x03, 0x06)
@@ -35,7 +35,7 @@ class SimulatedDelixi(MotorDrive):
         return MOST_GAP
 
     def takes_broadcast(self, request: Message) -> bool:
-        return request.function == 0x06 and request.start == 0x2000  # run commands only
+        return request.function == 0x06 and request.start == 0x2000  # only run commands may be broadcast
 
     def setpoint(self) -> float:
         by_line = self.word(FREQUENCY_SOURCE) == BY_LINE[FREQUENCY_SOURCE]
@@ -58,12 +58,12 @@ class SimulatedDelixi(MotorDrive):
 
 
 class SimulatedDelixiNative(MotorDrive):
-    """Delixi by its own protocol: a set is answered with its copy, a query with the value.
+    """Delixi in its own protocol: the reply to a write is a copy of the request, to a query the value.
 
-    While `locked` is set, writes of parameters are refused by FEH. A start during a fault is refused by F0H.
-    The manual does not describe a run command if P00.00 is not 2; here F0H refuses it. Nor does it describe
-    the effect of P00.01 on K = 04; here the setpoint that was written last counts. Faults from 10 on are read
-    as hex digits that look like the printed decimal number, also in the fault records.
+    While `locked` is set, writes of parameters are refused with FEH. A start during a fault is refused with
+    F0H. The manual does not say what happens to a run command if P00.00 is not 2; here F0H refuses it. It
+    does not say either how P00.01 affects K = 04; here the setpoint that was written last is used. Faults
+    from 10 on are shown as hex digits that look like the printed decimal number, also in the fault records.
     """
 
     begins = BY_LINE
@@ -83,7 +83,7 @@ class SimulatedDelixiNative(MotorDrive):
         return super().accept(cell, raw)
 
     def changed(self, cell: MemoryCell) -> None:
-        if cell.name == "stored_frequency":  # the setpoint that was written last counts
+        if cell.name == "stored_frequency":  # the latest written setpoint is used
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
 
@@ -108,5 +108,5 @@ class SimulatedDelixiNative(MotorDrive):
 
 
 def _printed(fault: int) -> int:
-    """Return the count whose hex digits equal the fault's decimal digits: fault 10 is 00000010H."""
+    """Return the raw count whose hex digits are the fault's decimal digits: fault 10 is 00000010H."""
     return int(str(fault), 16)

@@ -1,7 +1,7 @@
-"""SimulatedDrive: answers requests from its memory, whose layout the drive's class declares.
+"""SimulatedDrive: answers requests from its memory, whose layout comes from the drive's class.
 
-It uses no ports and no clocks: its input is a request with its time, its output a reply or None. The special
-behaviour of families is in their own files.
+It uses no port and no clock: its input is a request with its time, its output a reply or None. Special
+behaviour of a family is in the family's own file.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from multidrop.sim.memory import Memory, MemoryCell, decode, pack
 from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
-MOST_REMEMBERED = 10_000  # stored writes, which bounds memory
-_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # writes have the limit of reads
-# s: serial-line guide 2.5.2.1; Delixi, part 3; a network may take its time
+MOST_REMEMBERED = 10_000  # most writes in a drive's record, to limit memory
+_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # function code of a write: the read whose length limit applies
+# Longest gap within a frame in s: serial-line guide 2.5.2.1; Delixi, part 3; generous over a network.
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3, Framing.TCP: 10.0}
 
 
@@ -30,28 +30,28 @@ class Written(NamedTuple):
     """A write that was carried out."""
 
     time: float
-    name: str  # of the register
+    name: str  # the register's name
     address: int
     raw: int
 
 
 @dataclass
 class DriveCounters:
-    """Counts of one drive since it was made."""
+    """Numbers of one drive's requests, replies and writes since its creation."""
 
-    requests: int = 0  # addressed to it alone
-    replies: int = 0  # including refusals
+    requests: int = 0  # not counting broadcasts
+    replies: int = 0  # refusals included
     refusals: int = 0
     broadcasts: int = 0
-    damaged: int = 0  # frames with its address
-    early: int = 0  # frames that came before the silence after a reply was over
+    damaged: int = 0  # damaged frames with this drive's address
+    early: int = 0  # frames that came too soon after a reply
     functions: Counter[int] = field(default_factory=Counter)
     eeprom_writes: Counter[str] = field(default_factory=Counter)
     writes: deque[Written] = field(default_factory=lambda: deque(maxlen=MOST_REMEMBERED))
 
 
 def _most_cells(drive: Drive) -> dict[int, int]:
-    """Return a request's limit of cells by the function code that reads them; at least one register fits."""
+    """Return how many cells a request may cover, by reading function code; at least the longest register."""
     most: dict[int, int] = {}
     held = [(register.table, len(register.reach)) for register in drive.registers.values()]
     for table, words in [*held, *((text.table, 1) for text in drive.texts.values())]:
@@ -62,14 +62,14 @@ def _most_cells(drive: Drive) -> dict[int, int]:
 
 
 class SimulatedDrive:
-    """A drive of any class; registers hold the values written to them.
+    """A simulated drive of any class; its registers hold the values written to them.
 
-    `drive[name]` gets and sets a register's value in its own unit, None for "no value", or a text.
+    `drive[name]` gets or sets a register's value in its unit (None means "no value"), or a text.
     """
 
-    functions: ClassVar[Collection[int] | None] = None  # None: all of its protocol
-    codes: ClassVar[Mapping[Reason, int] | None] = None  # exception codes; None: as the protocol
-    needs_silence: ClassVar[bool] = False  # by its document, a frame without silence before it is ignored
+    functions: ClassVar[Collection[int] | None] = None  # supported function codes; None: all of the protocol
+    codes: ClassVar[Mapping[Reason, int] | None] = None  # exception codes by reason; None: the protocol's
+    needs_silence: ClassVar[bool] = False  # the manual says that a frame without silence before it is ignored
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
@@ -78,7 +78,7 @@ class SimulatedDrive:
         self.memory = Memory(type(drive), drive.framing)
         self.counters = DriveCounters()
         self.now = 0.0  # time of the last request
-        self.deaf_until = 0.0  # until then all frames are ignored; inf: a dead drive
+        self.deaf_until = 0.0  # time until which all frames are ignored; inf: for ever
         self.most = _most_cells(drive)
         for proof in drive.identity_proofs:
             self.memory.set(drive.register(proof.register), proof.example)
@@ -99,7 +99,7 @@ class SimulatedDrive:
             self.memory.set_text(self.drive.texts[name], value)
             return
         register = self.drive.register(name)
-        if isinstance(value, str):  # a name, such as of a wiring; raises ValueError with the known names
+        if isinstance(value, str):  # a named value; an unknown name raises ValueError
             value = register.parse(value)
         self.memory.set(register, value)
         for cell in self.memory.of(register):
@@ -109,10 +109,10 @@ class SimulatedDrive:
         """Advance the drive's state to the time `now`."""
 
     def refresh(self, cell: MemoryCell) -> None:
-        """Set the cell to the value that a read at this time returns."""
+        """Update the cell to the value that a read at `self.now` returns."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
-        """Return the count to store if `raw` is written to the cell. Raises Refusal."""
+        """Return the raw count to store when `raw` is written. Raises Refusal if the drive rejects it."""
         register = cell.register
         if register is None or register.words > 1:
             return raw
@@ -122,7 +122,7 @@ class SimulatedDrive:
         return raw
 
     def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
-        """Refuse a value of several words outside its span, if all its words are written."""
+        """Raise Refusal for a value of several words outside its span, if all its words are written."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
@@ -142,7 +142,7 @@ class SimulatedDrive:
 
     @property
     def delay(self) -> float:
-        """Seconds from the request's end to the reply's start, at least the silence after an RTU frame."""
+        """Seconds from the request's end to the reply's start; at least the silence after an RTU frame."""
         return max(self.response_delay, self.silence)
 
     @property
@@ -164,7 +164,7 @@ class SimulatedDrive:
             return self.answer(frame.message, frame.end)
         if not self._is_for_all(frame.address) and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
-        return None  # a length that does not fit its function
+        return None  # its length does not fit its function
 
     def _is_for_all(self, address: int) -> bool:
         return address == 0 and self.drive.framing is not Framing.TCP
@@ -173,7 +173,7 @@ class SimulatedDrive:
         return function in (self.protocol.answers if self.functions is None else self.functions)
 
     def _answer_damaged(self, frame: Frame) -> Message | None:
-        """Refuse a damaged request, if the family has a code for wrong checksums."""
+        """Return the exception reply to a damaged request; None if the family has no code for that."""
         code = self._code(Reason.DAMAGED)
         whole = len(frame.body) == self.protocol.octets and self._knows(frame.function)
         if code is None or not whole or self._is_for_all(frame.address):
@@ -223,7 +223,7 @@ class SimulatedDrive:
             raise Refusal(Reason.COUNT)
 
     def read(self, function: int, start: int, count: int) -> list[int]:
-        """Return the counts of neighbouring cells. Raises Refusal."""
+        """Return the raw counts of `count` adjacent cells. Raises Refusal if one is unreadable."""
         self.check_count(function, count)
         raws = []
         for address in range(start, start + count):
@@ -235,7 +235,7 @@ class SimulatedDrive:
         return raws
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
-        """Write neighbouring cells: all, or none when one is refused. Raises Refusal."""
+        """Write adjacent cells. Raises Refusal if one rejects its count; then no cell is written."""
         found = [self.memory.writable(function, start + at) for at in range(len(raws))]
         cells = [cell for cell in found if cell is not None]
         if len(cells) < len(raws):
@@ -252,7 +252,7 @@ class SimulatedDrive:
             self.changed(cell)
 
     def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        """Return whether a write to this cell wears the EEPROM; True for settings of unknown memory."""
+        """Return True if a write to this cell wears the EEPROM, as a setting of unknown memory may."""
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
             return False
@@ -262,12 +262,12 @@ class SimulatedDrive:
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """Return the count of an EncodedDrive: it names drive, table and register (a coil: its lowest bit)."""
+    """Return an EncodedDrive's count, made of drive, table and register address; a coil has its lowest bit."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 
 def proof(drive: Drive, register: Register[Any]) -> float:
-    """Return the register's value on an EncodedDrive, as a row has it; NaN: a count that means no value."""
+    """Return the register's value on an EncodedDrive as a row shows it; NaN if the count means "no value"."""
     if register in drive.known_counts():
         return register.coding.value_of(_known(drive, register))
     size = 2 if register.table.carrier is Carrier.WORD else 4
@@ -277,16 +277,16 @@ def proof(drive: Drive, register: Register[Any]) -> float:
 
 
 def _known(drive: Drive, register: Register[Any]) -> int:
-    """Return a raw count within the range that the family's document states."""
+    """Return a raw count within the range stated by the family's document."""
     least, most = drive.known_counts()[register]
     raw = encoded(drive.address, register.table, register.address)
     return least + raw % (most - least + 1)
 
 
 class EncodedDrive(SimulatedDrive):
-    """A drive whose every count names drive, table and register: see `encoded`.
+    """A drive whose raw counts identify drive, table and register: see `encoded`.
 
-    Writes are confirmed and forgotten.
+    Writes are confirmed but change no count.
     """
 
     def refresh(self, cell: MemoryCell) -> None:

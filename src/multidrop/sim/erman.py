@@ -1,4 +1,4 @@
-"""ERMAN ER-G-220-01(02), simulated (Modbus manual v1.4, sections 5 to 8)."""
+"""Simulated ERMAN ER-G-220-01(02) (Modbus manual v1.4, sections 5 to 8)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DEC
 
 
 class SimulatedERMAN(MotorDrive):
-    """ERMAN. Coils keep their state; START acts when it is written while neither stop is on.
+    """ERMAN. Coils keep their state; writing START on starts the motor unless a stop coil is on.
 
-    The manual leaves three points open. It does not say whether a coil is a level or a pulse: here clearing
-    START stops as well, and clearing a stop or resetting starts nothing. It does not say when the motor is
-    overloaded: here above 1.2 times its rated current. And it does not say whether the drive obeys the line
-    if b.001 is not 2: here it does.
+    The manual leaves three points open. It does not say whether a coil is a level or a pulse. Here clearing
+    START also stops the motor, and neither clearing a stop coil nor a reset starts it. It does not say when
+    the motor is overloaded: here above 1.2 times its rated current. It does not say whether the drive obeys
+    the line if b.001 is not 2: here it does.
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    codes = {  # all examples print 03 for a wrong address, which contradicts the table of section 5
+    codes = {  # 03 for a wrong address as in all examples, against the table of section 5
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 3,
         Reason.WRITE_ADDRESS: 3,
@@ -37,7 +37,7 @@ class SimulatedERMAN(MotorDrive):
         self.memory.make_writable(COIL, COILS)
 
     def takes_broadcast(self, request: Message) -> bool:
-        return True  # section 6 only says that address 0 is the broadcast
+        return True  # section 6 says that address 0 is the broadcast, without restrictions
 
     def _start(self, on: int) -> None:
         if not on:
@@ -73,5 +73,5 @@ class SimulatedERMAN(MotorDrive):
     }
     shows = {
         "status": _state,
-        "last_fault": lambda self: self.motor.fault_record(1),  # kept after a reset
+        "last_fault": lambda self: self.motor.fault_record(1),  # a reset does not clear it
     }

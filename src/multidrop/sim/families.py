@@ -1,4 +1,4 @@
-"""The simulated drive for each family and each profile."""
+"""Choose the simulation class for a drive by its family or profile."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
     CiA402: SimulatedCiA402,
     DanfossFC: SimulatedDanfossFC,
     Delta: SimulatedDelta,
-    Inovance: SimulatedInovance,  # before Invt, from which it derives
+    Inovance: SimulatedInovance,  # listed before Invt, its base class
     Invt: SimulatedInvt,
     Optidrive: SimulatedOptidrive,
     Yaskawa: SimulatedYaskawa,
@@ -57,6 +57,6 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Return the drive's simulation: its family's, or a general one for a user's own class or file."""
+    """Return the simulation of a drive: its family's, or a general one for a user's class or family file."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
     return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

@@ -1,4 +1,4 @@
-"""The faults of simulated lines and drives, and the TOML file that states them."""
+"""Faults of simulated lines and drives, and the TOML file that sets their rates."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 MOST_BURST = 4096
-RATE, DURATION, WHOLE = (int, float), str, int  # types of keys in a file
+RATE, DURATION, WHOLE = (int, float), str, int  # types of the file's values
 
 
 def _rate(means: str, example: str = "0.01") -> Any:
-    """Return a dataclass field for a rate from 0 (never) to 1 (always)."""
+    """Return a dataclass field for a fault's rate from 0 (never) to 1 (always)."""
     return field(default=0.0, metadata={"means": means, "example": example, "kind": RATE})
 
 
@@ -36,7 +36,7 @@ def _check_rates(faults: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveFaults:
-    """The faults of one drive. A damaged reply has one wrong bit, which every checksum detects."""
+    """The faults of one simulated drive. A damaged reply has one wrong bit, which every checksum detects."""
 
     loss: float = _rate("of its replies are lost")
     damage: float = _rate("of its replies have one bit turned")
@@ -54,11 +54,11 @@ class DriveFaults:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Rates of a line's faults, and the faults of its drives by name.
+    """Rates of a simulated line's faults, and the faults of its drives by name.
 
     At most one of `drop`, `flip` and `repeat` happens to a frame, so that each of the three checksums detects
-    it. If a reply is later than its family's response timeout, it cannot be distinguished from the reply to
-    the next equal request.
+    it. A reply later than its family's response timeout cannot be distinguished from the reply to the next
+    identical request.
     """
 
     seed: int = _whole(0, "the same one brings the same faults", "7")
@@ -87,7 +87,7 @@ class Faults:
 
 
 def rates_of(kind: type) -> list[str]:
-    """Return the names of the rates among the faults."""
+    """Return the names of the fields that are rates."""
     return [one.name for one in fields(kind) if one.metadata.get("kind") is RATE]
 
 
@@ -97,7 +97,7 @@ def _keys(kind: type) -> dict[str, Key]:
 
 
 def _help(kind: type) -> str:
-    lines = zip(_keys(kind).values(), fields(kind), strict=False)  # `drives`, the last one, is no key
+    lines = zip(_keys(kind).values(), fields(kind), strict=False)  # drops `drives`, which is no key
     return "".join(f"  {key.example:<20}{one.metadata['means']}\n" for key, one in lines)
 
 
@@ -109,9 +109,9 @@ HELP = (
 
 
 def load_faults(path: Path | str, drives: Collection[str] | None = None) -> Faults:
-    """Read faults from a file; `drives` are the names that its tables may have, None: any.
+    """Read faults from a TOML file; its tables may name only these `drives`, or any if None.
 
-    Raises ValueError with all mistakes in the file.
+    Raises ValueError that lists all mistakes in the file.
     """
     path = Path(path)
     place = TomlPlace(path)

@@ -1,6 +1,6 @@
-"""FaultyWire: a wire with faults between its client and its drives, and with flaky drives.
+"""FaultyWire: a wire that loses, damages and delays frames, and whose drives fail.
 
-Input and output are bytes with times. All random decisions come from one seed.
+Input and output are bytes with times. All random decisions derive from one seed.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
     "flip": lambda frame, at, bit: frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :],
     "repeat": lambda frame, at, bit: frame[: at + 1] + frame[at:],
 }
-DRIFT_S = 20.0  # period of a drifting load
+DRIFT_S = 20.0  # s, period of a drifting load
 
 
 class FaultyWire(Wire):
-    """A wire with `faults`, which may be changed at any time; `struck` counts them.
+    """A wire with `faults`, which may be changed at any time; `struck` counts the faults that occurred.
 
-    To hang up, its port must be a link or a TCP port: a bare pty cannot come back under its name.
+    To hang up, the port must be a link or a TCP port: a bare pty cannot be reopened under its name.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class FaultyWire(Wire):
         self.faults = faults
         self.struck: Counter[str] = Counter()
         self._random = random.Random(f"{faults.seed} {name}")
-        self._stray: list[Transmission] = []  # noise and echo on their way to the client
-        self._held: Transmission | None = None  # a reply that waits for the next one
-        self._back_at: float | None = None  # when a removed port comes back
-        self._due: dict[tuple[str, str], float] = {}  # next silence or trip, by drive and event
-        self._loads: dict[str, float] = {}  # of drives whose load drifts: the mean
+        self._stray: list[Transmission] = []  # noise and echoes in transmission to the client
+        self._held: Transmission | None = None  # a reply held back until the next reply
+        self._back_at: float | None = None  # time at which the removed port returns; None: present
+        self._due: dict[tuple[str, str], float] = {}  # time of the next silence or trip, by drive and event
+        self._loads: dict[str, float] = {}  # mean load of each drive whose load drifts
 
     def _strikes(self, fault: str, of: Faults | DriveFaults | None = None) -> bool:
         rate: float = getattr(of or self.faults, fault)
@@ -67,7 +67,7 @@ class FaultyWire(Wire):
         return True
 
     def _damaged(self, frame: bytes) -> bytes:
-        """Return the frame, damaged at most once, so that every checksum detects it."""
+        """Return the frame, perhaps with one fault, so that every checksum detects the damage."""
         for fault, damage in DAMAGES.items():
             if self._strikes(fault):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))
@@ -91,7 +91,7 @@ class FaultyWire(Wire):
         super().receive(self._damaged(chunk), now, baudrate)
 
     def _pass_time(self, sim: SimulatedDrive, faults: DriveFaults, now: float) -> None:
-        """Silence the drive, trip its motor and move its load, as its faults say."""
+        """Silence the drive, trip its motor and change its load, as its faults state."""
         name = sim.drive.name
         if self._is_due(name, "silence", faults, now):
             sim.deaf_until = max(sim.deaf_until, now + faults.silent_for)
@@ -104,7 +104,7 @@ class FaultyWire(Wire):
             sim.motor.load = mean + faults.drift * math.sin(now * math.tau / DRIFT_S + sim.drive.address)
 
     def _is_due(self, drive: str, event: str, faults: DriveFaults, now: float) -> bool:
-        """Return True once each period of this event."""
+        """Return True once per period of this event."""
         period: float | None = getattr(faults, event)
         if not period:
             return False
@@ -143,7 +143,7 @@ class FaultyWire(Wire):
         return {sim for sim in self.drives if isinstance(sim, MotorDrive) and sim.motor.energised}
 
     def _make_noise(self, begin: float, character: float) -> None:
-        """Add noise for the client and for the drives."""
+        """Add noise bytes, received by the client and by the drives."""
         noise = self._random.randbytes(self._random.randint(1, self.faults.burst))
         self._stray.append(Transmission(noise, begin, character))
         for group in self._groups:
@@ -197,14 +197,14 @@ class FaultyWire(Wire):
         return min(times, default=None)
 
     def _hang_up(self, now: float) -> None:
-        self.where = self.path  # a TCP port keeps its number
-        self._name = os.path.realpath(self.path)  # name of the pty, not of the link to it
+        self.where = self.path  # reopen a TCP port under the same number
+        self._name = os.path.realpath(self.path)  # the pty's own name, behind the link
         self.close()
         self._back_at = now + self._up_to(self.faults.away)
 
     def _come_back(self) -> None:
         self._back_at = None
-        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # else the old name may be free
+        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # forces another pty name
         try:
             self.open()
         finally:
@@ -213,7 +213,7 @@ class FaultyWire(Wire):
 
 
 def _ptys_up_to(name: str) -> list[int]:
-    """Open ptys until the next one, which gets the lowest free number, cannot have this name."""
+    """Open ptys until this name is taken (new ones get the lowest free number); return their descriptors."""
     taken: list[int] = []
     while name.startswith("/dev/pts/"):
         taken += os.openpty()
@@ -223,7 +223,7 @@ def _ptys_up_to(name: str) -> list[int]:
 
 
 def overload_code(drive: Drive) -> int:
-    """Return the family's code of an overload, or of the first fault that it names, or 1."""
+    """Return the family's fault code for an overload, or of its first named fault, or 1."""
     for name in ("fault", "last_fault", "fault_record_1"):
         register = drive.registers.get(name)
         if register is not None and register.values is not None:

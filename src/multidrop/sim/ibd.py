@@ -1,4 +1,4 @@
-"""INNOVERT IBD, simulated (manual, part 9, appendix 2)."""
+"""Simulated INNOVERT IBD (manual, part 9, appendix 2)."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import MotorDrive
 
 SETPOINT = 0x2001
-STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # Prb.00, .01, .02
+STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # addresses of Prb.00, .01 and .02
 BY_PARAMETER, BY_LINE, RUN_BY_LINE = 0, 5, 2
-STOP, RUN, JOG = 1, 2, 3  # bits 1 and 0 of 2000H
+STOP, RUN, JOG = 1, 2, 3  # values of bits 1 and 0 of 2000H
 ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits of PrA.22 that are set in the manual's example
-LARGEST = {107: 36000, 108: 36000}  # assumed maxima of Prb.07 and Prb.08, which the manual does not state
-OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # bits of PrA.22 by Prd.23, .24, .25, .28
-RUNNING, FAULT, ACCELERATING, DECELERATING = 1, 3, 7, 8  # functions of an output
+LARGEST = {107: 36000, 108: 36000}  # assumed maxima of Prb.07 and Prb.08; the manual states none
+OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # Prd.23, .24, .25, .28: bit of PrA.22
+RUNNING, FAULT, ACCELERATING, DECELERATING = 1, 3, 7, 8  # output functions, as set in Prd.23 to .28
 BAUDRATES = (4800, 9600, 19200, 38400)
 FORMATS = ("8N1", "8E1", "8O1")
 
 
 class SimulatedIBD(MotorDrive):
-    """INNOVERT IBD, set up for RS-485 (Prb.01 = 5, Prb.02 = 2), with the outputs of the manual's example.
+    """INNOVERT IBD, set up for RS-485 (Prb.01 = 5, Prb.02 = 2), with outputs programmed as in the example.
 
-    The manual has no exceptions: a request that fails gets no answer. A value above the maximum is stored as
-    the maximum, while the reply repeats the written value. A run command does not end a jog: only a stop
-    followed by a new run does (table 3).
+    The manual documents no exceptions: a request that fails gets no reply. A value above the maximum is
+    stored as the maximum, but the reply repeats the written value. A run command does not end a jog; a stop
+    does, and then a new run command runs the motor (table 3).
 
-    Assumptions beyond the manual: a command is confirmed without effect unless Prb.02 = 2. The setpoint is 0
-    if Prb.01 is neither 5 nor 0. The unit of Prb.00 is 0.01 Hz, as that of 2001H.
+    Assumptions beyond the manual: unless Prb.02 = 2, a command is confirmed and has no effect. The setpoint
+    is 0 if Prb.01 is neither 5 nor 0. The unit of Prb.00 is 0.01 Hz, like that of 2001H.
     """
 
     functions = (0x03, 0x06)
@@ -59,7 +59,7 @@ class SimulatedIBD(MotorDrive):
         return self.word(source) / 100 if source is not None else 0.0
 
     def _control(self, bits: int) -> None:
-        """Carry out a control word. The manual is ambiguous; here BIT3 and BIT2 are read as one number."""
+        """Carry out a control word. The manual is ambiguous; here BIT3 and BIT2 form one number."""
         if bits & 0x10:
             self.motor.reset()
         action = bits & 0x03
@@ -80,7 +80,7 @@ class SimulatedIBD(MotorDrive):
         return sum(bits, ALWAYS_SEEN)
 
     def _run_state(self) -> int:
-        """Return PA28 of the siblings that have it."""
+        """Return the value of PA28, the run state, which some sibling models have."""
         if not self.motor.energised:
             return 0
         return 2 if self.motor.frequency < 0 else 1

@@ -1,7 +1,7 @@
-"""A drive's memory: the cells of its tables, as the drive's class declares them.
+"""A simulated drive's memory: the cells of its tables, as the drive's class declares them.
 
-A cell is found by function code and address. A table that several codes access (03, 06 and 10) is one address
-space. A cell holds a bit, a word, or Delixi's four bytes.
+A cell is found by function code and address. Function codes that access the same table (03, 06 and 10) share
+one address space. A cell holds a bit, a 16-bit word, or Delixi's four bytes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
-_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # function codes that write several of the same cells
-_DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # not stored, stored
+_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # single write: multiple write of the same cells
+_DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # 05 writes to RAM, 06 to EEPROM
 _DELIXI_STORES = 0x06
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
 _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
@@ -28,7 +28,7 @@ _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
 
 @dataclass(eq=False)
 class MemoryCell:
-    """One address of one table, and its register; None: a reserved address."""
+    """One address of one table; `register` is None for a reserved address."""
 
     table: Table
     address: int
@@ -46,11 +46,11 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[object, int], MemoryCell] = {}  # one for all tables read alike
-        self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
+        self._cells: dict[tuple[object, int], MemoryCell] = {}  # tables read by the same function share cells
+        self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, even in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
-        self.aliases: set[tuple[int, int]] = set()  # addresses whose writes do not reach the EEPROM
+        self.aliases: set[tuple[int, int]] = set()  # (function, address) whose writes do not reach the EEPROM
         for register in drive.registers.values():
             self.declare(register)
         for text in drive.texts.values():
@@ -64,14 +64,16 @@ class Memory:
         return cell
 
     def declare(self, register: Register[Any]) -> None:
-        """Add the register's cells, and its factory value."""
+        """Add the register's cells, and store its factory value in them."""
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)
             if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
-                self._read.setdefault((table.read, cell.address), None)  # unless it is also readable
+                self._read.setdefault(
+                    (table.read, cell.address), None
+                )  # unless another register is readable there
             elif table.read is not None:
                 self._read[table.read, cell.address] = cell
             if register.access is Access.READING:
@@ -109,20 +111,20 @@ class Memory:
         return self._read[key]
 
     def writable(self, function: int, address: int) -> MemoryCell | None:
-        """Return the cell that a write there changes, with any function that the drive takes."""
+        """Return the cell that this function code writes at this address; None if there is none."""
         return self._written.get((function, address))
 
     def get(self, register: Register[Any]) -> Any:
-        """Return the register's value in its own unit; None if its count means "no value"."""
+        """Return the register's value in its unit; None if its raw count means "no value"."""
         reach = register.reach
         cells = [self._cell(register.table, address) for address in reach]
         data = b"".join(pack(register.table, cell.raw) for cell in cells)
         return register.value_in(data, register.address - reach.start)
 
     def set(self, register: Register[Any], value: float | None) -> None:
-        """Store this value, rounded to the register's step; bits that do not fit are lost.
+        """Store this value, rounded to the register's step; bits that do not fit are dropped.
 
-        None is the device's "no value". Raises ValueError if the register has no such count.
+        None stores the count that means "no value". Raises ValueError if the register has no such count.
         """
         coding = register.coding
         if value is None:
@@ -144,7 +146,7 @@ class Memory:
         return 0 if register.scaled_by is None else int(self.get(register.scaled_by) or 0)
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
-        """Store this raw count. If the register is a part of its words, the other bits keep their value."""
+        """Store this raw count. If the register uses only some bits of its words, the other bits are kept."""
         self._put(register, raw, register.coding.mask)
 
     def _put(self, register: Register[Any], raw: int, mask: int) -> None:
@@ -158,12 +160,12 @@ class Memory:
             cell.raw = int.from_bytes(data[size * at : size * (at + 1)]) & _MASKS[register.table.carrier]
 
     def get_text(self, text: Text) -> str:
-        """Return the text in its registers, as a read decodes it."""
+        """Return the text stored in its registers, as a read decodes it."""
         cells = (self._cell(text.table, address) for address in self._addresses(text))
         return text.decode(b"".join(pack(cell.table, cell.raw) for cell in cells))
 
     def set_text(self, text: Text, value: str) -> None:
-        """Store a text. Raises ValueError if it does not fit."""
+        """Store a text in its registers. Raises ValueError if it does not fit."""
         data = text.encode(value)
         for at, address in enumerate(self._addresses(text)):
             self._cell(text.table, address).raw = int.from_bytes(data[2 * at : 2 * at + 2])
@@ -183,21 +185,21 @@ def _space(table: Table) -> object:
 
 
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
-    """Return True if `register` should replace `known` as a cell's: a writable, or else a whole one, wins."""
+    """Return True if a cell's `register` should replace `known`: writable ones first, then whole words."""
     if known is None or register.access is not Access.READING:
         return True
     return known.part is not None and register.part is None
 
 
 def _placed(register: Register[Any], raw: int) -> int:
-    """Return a raw count's bits, shifted to the place of the register's part."""
+    """Return the bits of a raw count, shifted to the register's place in its word."""
     if register.part is None:
         return bits_of(raw, register.number_format)
     return raw << register.part[0] & register.coding.mask
 
 
 def _no_value(register: Register[Any]) -> tuple[int, int]:
-    """Return the bits that mean "no value", and their mask."""
+    """Return the bits that mean "no value", and their mask. Raises ValueError if there are none."""
     for mask, pattern in register.coding.invalid_patterns:
         return pattern, mask
     if register.is_float:
@@ -206,10 +208,10 @@ def _no_value(register: Register[Any]) -> tuple[int, int]:
 
 
 def pack(table: Table, raw: int) -> bytes:
-    """Return the bytes of a raw count in a reply."""
+    """Return the bytes that a reply has for a raw count."""
     return raw.to_bytes(_BYTES[table.carrier])
 
 
 def decode(register: Register[Any], raw: int) -> Any:
-    """Return the value of a raw count that one cell holds; None if it means "no value"."""
+    """Return the value of a one-cell register with this raw count; None if the count means "no value"."""
     return register.value_in(pack(register.table, raw), 0)

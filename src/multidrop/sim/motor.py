@@ -1,4 +1,4 @@
-"""A motor and the power part that feeds it: ramps, volts and amperes, heat, faults.
+"""A simulated motor and its power stage: ramps, voltage and current, temperature, faults.
 
 Only physics: no registers, and time is an argument. Only `run` and `jog` start the motor, and not during a
 fault.
@@ -12,15 +12,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-MAGNETISING = 0.3  # current at no load, as a part of the rated current
-ACCELERATING_TORQUE = 0.5  # part of the rated torque, added to the load
+MAGNETISING = 0.3  # no-load current as a fraction of the rated current
+ACCELERATING_TORQUE = 0.5  # fraction of the rated torque, added to the load while accelerating
 BRAKING_TORQUE = 0.3
-SLIP = 0.04  # at rated torque
-HEATING = 35.0  # degrees above ambient at rated current
-WARMING_TIME = 120.0  # s
-RUN_OUT_TIME = 10.0  # s until the shaft stands still without voltage, from the rated frequency
-REGENERATION = 0.06  # rise of the DC bus while braking
-SAG = 0.02  # fall of the DC bus at rated current
+SLIP = 0.04  # slip at rated torque
+HEATING = 35.0  # heatsink's K above ambient at rated current
+WARMING_TIME = 120.0  # s, thermal time constant
+RUN_OUT_TIME = 10.0  # s for which the shaft coasts from the rated frequency to rest
+REGENERATION = 0.06  # relative rise of the DC bus voltage while braking
+SAG = 0.02  # relative fall of the DC bus voltage at rated current
 
 
 class Phase(Enum):
@@ -32,10 +32,10 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class Rating:
-    """The name plate of a motor."""
+    """The nameplate data of a motor."""
 
     frequency: float = 50.0  # Hz
-    voltage: float = 400.0  # V, also of the mains
+    voltage: float = 400.0  # V; the mains have the same voltage
     current: float = 5.0  # A
     power: float = 2.2  # kW
     torque: float = 14.6  # Nm
@@ -43,35 +43,35 @@ class Rating:
 
 
 class Motor:
-    """One motor on its drive, at the time of the last `run_to`.
+    """The state of one motor at the time of the last `run_to`.
 
-    `target`, `acceleration_time`, `deceleration_time`, `maximum_frequency` and `load` may be
-    changed at any time; the ramp times are those from 0 to the maximum frequency and back.
+    `target`, `acceleration_time`, `deceleration_time`, `maximum_frequency` and `load` may be changed at any
+    time. The ramp times are s from 0 to the maximum frequency and from there to 0.
     """
 
     def __init__(self, rating: Rating | None = None, *, now: float = 0.0) -> None:
         self.rating = rating or Rating()
         self.now = now
-        self.target = 0.0  # Hz; negative: in the other direction
+        self.target = 0.0  # Hz; negative: against `direction`
         self.jog_frequency = 5.0
         self.maximum_frequency = self.rating.frequency
         self.acceleration_time = 10.0
         self.deceleration_time = 10.0
-        self.load = 0.4  # part of the rated torque
+        self.load = 0.4  # load as a fraction of the rated torque
         self.ambient = 25.0  # degrees Celsius
-        self.direction = 1  # or -1
-        self.frequency = 0.0  # Hz at the output, negative backwards
-        self.shaft = 0.0  # speed of the rotor, in Hz
+        self.direction = 1  # 1 forward, -1 reverse
+        self.frequency = 0.0  # output frequency in Hz, negative in reverse
+        self.shaft = 0.0  # rotor speed in Hz
         self.energised = False
         self.heatsink = self.ambient
         self.run_seconds = 0.0
         self.fault = 0
-        self.faults: deque[int] = deque(maxlen=4)  # the latest first
-        self._goal: float | None = 0.0  # Hz; None: the target
-        self._brakes = False  # True while direct current brakes the motor
+        self.faults: deque[int] = deque(maxlen=4)  # fault codes, the latest first
+        self._goal: float | None = 0.0  # frequency to ramp to in Hz; None: `target`
+        self._brakes = False  # True while direct current holds the motor
 
     def run(self, direction: int | None = None) -> None:
-        """Run at `target`, which may change meanwhile. Without `direction`, keep the current one."""
+        """Run at `target`, which may change meanwhile. Without `direction`, keep the present direction."""
         self._start(direction, None)
 
     def jog(self, direction: int | None = None) -> None:
@@ -91,7 +91,7 @@ class Motor:
         self._brakes = False
 
     def brake(self) -> None:
-        """Hold the motor by direct current until the next command."""
+        """Hold the motor with direct current until the next command."""
         if self.fault:
             return
         self.coast()
@@ -115,7 +115,7 @@ class Motor:
         self.fault = 0
 
     def run_to(self, now: float) -> None:
-        """Let time pass until `now`."""
+        """Advance the motor's state to the time `now` in s."""
         seconds = now - self.now
         if seconds <= 0:
             return
@@ -140,7 +140,7 @@ class Motor:
             self.energised = False
 
     def _approach(self, goal: float, ramp_time: float, seconds: float) -> float:
-        """Ramp towards `goal` for at most `seconds`; return the seconds that are left."""
+        """Ramp towards `goal` for at most `seconds`; return the unused seconds."""
         distance = abs(goal - self.frequency)
         needed = distance * ramp_time / self.maximum_frequency
         if needed <= seconds:
@@ -155,7 +155,7 @@ class Motor:
 
     @property
     def goal(self) -> float:
-        """The frequency in Hz at the end of the ramp, negative backwards."""
+        """The output frequency in Hz at the end of the ramp, negative in reverse."""
         wanted = self.target if self._goal is None else self._goal
         return self.direction * max(-self.maximum_frequency, min(wanted, self.maximum_frequency))
 
@@ -171,7 +171,7 @@ class Motor:
 
     @property
     def torque(self) -> float:
-        """Part of the rated torque; negative while it brakes."""
+        """Torque as a fraction of the rated torque; negative while the motor brakes."""
         if not self.energised:
             return 0.0
         extra = {Phase.ACCELERATING: ACCELERATING_TORQUE, Phase.DECELERATING: -BRAKING_TORQUE}
@@ -183,7 +183,7 @@ class Motor:
 
     @property
     def voltage(self) -> float:
-        """Output in V, proportional to the frequency up to the rated one (V/f)."""
+        """Output voltage in V, proportional to the frequency up to the rated frequency (V/f)."""
         return self.rating.voltage * min(1.0, abs(self.frequency) / self.rating.frequency)
 
     @property
@@ -199,11 +199,11 @@ class Motor:
 
     @property
     def speed(self) -> float:
-        """Speed of the shaft in rpm, without direction."""
+        """Speed of the shaft in rpm, never negative."""
         return abs(self.shaft) * 60 / self.rating.pole_pairs * (1 - SLIP * max(self.torque, 0.0))
 
 
-# Values of monitor registers, by their names.
+# Functions that compute monitor values, by register name.
 MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "output_frequency": lambda motor: abs(motor.frequency),
     "reference_frequency": lambda motor: abs(motor.target),
@@ -219,7 +219,7 @@ MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "last_fault": lambda motor: motor.fault_record(1),
 } | {f"fault_record_{nth}": lambda motor, nth=nth: motor.fault_record(nth) for nth in range(1, 5)}
 
-# Values that mean 100 % if the register's unit is %.
+# Functions that return the value of 100 %, for monitors whose unit is %.
 RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_frequency": lambda rating: rating.frequency,
     "reference_frequency": lambda rating: rating.frequency,

@@ -1,8 +1,8 @@
 """MotorDrive: a simulated drive with a motor behind its registers.
 
-Settings with common names configure the motor, and monitors with common names show its state. A family's own
-registers are in two tables by name: `obeys` has functions that carry out writes, and `shows` has functions
-that return the count to read.
+Settings with common names configure the motor, and monitors with common names show its state. Two tables
+cover a family's special registers by name: `obeys` has functions that carry out writes, and `shows` has
+functions that return the raw count to read.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import MONITORS, RATED, Motor, Rating
 from multidrop.sim.protocol import Reason, Refusal
 
-COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # by name of a control word
+COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # actions by name of a control word
     "FORWARD": lambda motor: motor.run(1),
     "REVERSE": lambda motor: motor.run(-1),
     "JOG_FORWARD": lambda motor: motor.jog(1),
@@ -31,11 +31,11 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
-    """A drive with a motor. If a monitor is set from outside, it keeps that value."""
+    """A simulated drive with a motor. A monitor that is set with `drive[name] = value` keeps that value."""
 
     obeys: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
-    shows: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # raw counts
-    begins: ClassVar[Mapping[int, int]] = {}  # raw counts by the address that function 06 writes
+    shows: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # functions that return raw counts
+    begins: ClassVar[Mapping[int, int]] = {}  # initial raw counts by holding register address
 
     def __init__(
         self, drive: Drive, *, response_delay: float | None = None, rating: Rating | None = None
@@ -61,17 +61,17 @@ class MotorDrive(SimulatedDrive):
         super().__setitem__(name, value)
 
     def prepare(self) -> None:
-        """Set initial state that the class does not declare."""
+        """Set up initial state that the drive's class does not declare."""
 
     def trip(self, code: int) -> None:
-        """Cause the fault with this code of the family."""
+        """Trip the motor with this fault code of the family."""
         self.motor.trip(code)
 
     def pass_time(self, now: float) -> None:
         self.motor.run_to(now)
 
     def set_up(self) -> None:
-        """Configure the motor from the registers."""
+        """Configure the motor from the drive's settings."""
         for name in _SETTINGS:
             value = self._known(name)
             if value:
@@ -79,18 +79,18 @@ class MotorDrive(SimulatedDrive):
         self.motor.target = self.setpoint()
 
     def setpoint(self) -> float:
-        """Return the frequency in Hz that the motor is to reach."""
+        """Return the frequency setpoint in Hz."""
         return self._known("frequency") or 0.0
 
     def _known(self, name: str) -> float | None:
-        """Return the register's value, if the class has it and its scale is known."""
+        """Return the register's value; None if the class lacks the register or its scale is unknown."""
         register = self.drive.registers.get(name)
         if register is None or register.step is None:
             return None
         return float(self.memory.get(register))
 
     def run_or_stop(self, action: int, direction: int | None) -> None:
-        """Carry out a control word's action, in the usual numbers: 0 none, 1 stop, 2 run, 3 jog."""
+        """Carry out the action of a control word, numbered as usual: 0 none, 1 stop, 2 run, 3 jog."""
         if action == 1:
             self.motor.stop()
         elif action == 2:
@@ -101,11 +101,11 @@ class MotorDrive(SimulatedDrive):
             self.motor.direction = direction
 
     def carry_out_named(self, raw: int) -> None:
-        """Carry out a control word that has one of the names in COMMANDS."""
+        """Carry out the named control word with this raw count; see COMMANDS."""
         COMMANDS[self.drive.register("control").decode(raw).name](self.motor)
 
     def word(self, address: int) -> int:
-        """Return the holding register at this address; 0 if the class has none."""
+        """Return the raw count of the writable holding register at this address; 0 if there is none."""
         cell = self.memory.writable(0x06, address)
         return cell.raw if cell else 0
 
@@ -134,14 +134,14 @@ class MotorDrive(SimulatedDrive):
 
 
 class ProfileDrive(MotorDrive):
-    """A drive of a profile, whose registers have the names of their roles.
+    """A simulated drive of a profile; its registers are named by their roles.
 
-    While `is_local` is set, the keypad is in control and the line's commands are ignored. `power_cycle` loses
-    everything except settings in EEPROM.
+    While `is_local` is set, the keypad is in control and commands from the line are ignored. After a
+    `power_cycle` only settings in EEPROM are kept.
     """
 
     is_local = False
-    word_before = 0  # the control word before the present one
+    word_before = 0  # the previous control word
 
     def prepare(self) -> None:
         if "signature" in self.drive.registers:
@@ -169,11 +169,11 @@ class ProfileDrive(MotorDrive):
             self.memory.set(register, self.memory.get(self.drive.register("reference")))
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True if one of the bits is set in this word and none was set in the previous word."""
+        """Return True if this word sets one of the bits, and the previous word had none of them set."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:
-        """Switch the mains off and on: commands, setpoint and faults are lost."""
+        """Switch the mains off and on, which clears commands, setpoint and faults."""
         self.motor.coast()
         self.motor.reset()
         for name in ("control", "reset", "reference"):
@@ -184,4 +184,4 @@ class ProfileDrive(MotorDrive):
         self.powered_up()
 
     def powered_up(self) -> None:
-        """Set the state that the drive has after power-up."""
+        """Set the drive's state after power-up."""

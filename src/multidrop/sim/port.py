@@ -1,4 +1,4 @@
-"""The simulator's end of a line: a pty, or a TCP port that accepts one client at a time."""
+"""The simulator's end of a line: a pty, or a TCP port that serves one client at a time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_READ = 4096
 
 
 def is_dead_link(link: Path) -> bool:
-    """Return True for the link of a killed simulator: its terminal is gone or belongs to another program."""
+    """Return True if a killed simulator left this link: its pty is gone or belongs to another program."""
     if not link.is_symlink():
         return False
     target = str(link.readlink())
@@ -26,10 +26,10 @@ def is_dead_link(link: Path) -> bool:
 
 
 class PtyPort:
-    """A pty whose other side a client opens by its path.
+    """A pty whose other end a client opens by its path.
 
-    A descriptor of the client's side stays open here, so that the pty outlives its clients. Of
-    the clients' settings only the baud rate has an effect: a pty stores no parity.
+    A descriptor of the client's end stays open here, so that the pty outlives its clients. Of a client's
+    settings only the baud rate has an effect: a pty stores no parity.
     """
 
     def __init__(self, settings: Settings, link: Path | None) -> None:
@@ -63,7 +63,7 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # without a reader the bytes are lost, as on a wire
+        with contextlib.suppress(BlockingIOError):  # if no client reads, bytes are lost, as on a real line
             os.write(self._master, data)
 
     def baudrate(self) -> int | None:
@@ -95,12 +95,12 @@ class TCPPort:
         self.path = f"{parts.scheme}://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for; it changes when a client connects or disconnects."""
+        """Return the descriptor to poll; it changes when a client connects or disconnects."""
         return (self._client or self._listener).fileno()
 
     def read(self) -> bytes:
         if self._client is None:
-            with contextlib.suppress(BlockingIOError, ConnectionError):  # the client has gone again
+            with contextlib.suppress(BlockingIOError, ConnectionError):  # the client has disconnected already
                 self._client, _ = self._listener.accept()
                 self._client.setblocking(False)
                 self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -122,11 +122,11 @@ class TCPPort:
 
     def write(self, data: bytes) -> None:
         if self._client is not None:
-            with contextlib.suppress(OSError):  # a client that has gone is noticed when reading
+            with contextlib.suppress(OSError):  # reading detects a disconnected client
                 self._client.send(data)
 
     def baudrate(self) -> None:
-        """Return None: over TCP a client's baud rate is unknown."""
+        """Return None, because a TCP client's baud rate is unknown."""
 
     def close(self) -> None:
         self._hang_up()
@@ -134,11 +134,11 @@ class TCPPort:
         self._listener.close()
 
 
-SimulatedEnd = PtyPort | TCPPort  # neither blocks
+SimulatedEnd = PtyPort | TCPPort  # non-blocking ends
 
 
 def open_port(where: str, settings: Settings) -> SimulatedEnd:
-    """Open a port of the kind that `where` names: see Wire."""
+    """Open the pty or TCP port named by `where`; see `Wire` for its forms."""
     if where.startswith(("socket://", "tcp://")):
         return TCPPort(where)
     return PtyPort(settings, None if where == "pty" else Path(where))

@@ -1,4 +1,4 @@
-"""The state machines of the profiles, simulated, by the manuals that each profile names."""
+"""Simulated drives of the profiles, after the manuals that each profile names."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _RUN = (
 class SimulatedProfidrive(ProfileDrive):
     """PROFIdrive: inhibited after power-up, a trip, OFF2 or OFF3, until a word has only OFF1 active.
 
-    `off2` and `off3` are commands from another source, such as a terminal. In local control, and if the
-    remote bit is 0, all bits of the word except the OFF bits are ignored. A word that clears bit 3 lets the
-    motor coast. The three ramp bits are simulated only in part: the motor runs if all three are 1.
+    `off2` and `off3` are commands from another source, such as a terminal. In local control, or if the word's
+    remote bit is 0, only the OFF bits have an effect. A word that clears bit 3 lets the motor coast. The
+    three ramp bits are simulated only in part: the motor runs if all three are 1.
     """
 
     off2 = off3 = False
@@ -114,10 +114,11 @@ _STATES = {DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27}
 
 
 class SimulatedCiA402(ProfileDrive):
-    """CiA 402: each word moves up one state at most; "disable voltage" and a trip go to the lowest state.
+    """CiA 402: a word moves at most one state up; "disable voltage" and a trip lead to the lowest state.
 
-    With the standard's factory settings, as here, a shutdown coasts and "disable operation" ramps down. A
-    drive in local control ignores all words. `stays_off` prevents switching on, as missing mains do.
+    With the standard's factory settings, as here, "shutdown" coasts and "disable operation" ramps down. A
+    drive in local control ignores all words. `stays_off` prevents switching on, as missing mains voltage
+    does.
     """
 
     stays_off = False
@@ -175,7 +176,7 @@ class SimulatedCiA402(ProfileDrive):
 class SimulatedDanfossFC(ProfileDrive):
     """Danfoss FC: a word without bit 10 is ignored. The motor runs while bit 6 is set, even after a reset.
 
-    `is_locked`: the present trip cannot be reset.
+    While `is_locked` is set, the trip cannot be reset.
     """
 
     def powered_up(self) -> None:
@@ -213,13 +214,13 @@ class SimulatedDanfossFC(ProfileDrive):
     shows = {"status": _state}
 
 
-EXTERNAL_FAULT = 49  # EF
+EXTERNAL_FAULT = 49  # fault EF
 
 
 class SimulatedDelta(ProfileDrive):
-    """Delta: a run command during a fault is dropped. While the reset bit is set, it resets every fault.
+    """Delta: a run command during a fault is ignored. While the reset bit is set, it resets every fault.
 
-    The manuals do not state the latter. It is simulated to detect a client that leaves the bit set.
+    The manuals do not say the latter; it is simulated to detect a client that leaves the bit set.
     """
 
     def pass_time(self, now: float) -> None:
@@ -255,7 +256,7 @@ _STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, In
 
 
 class SimulatedInvt(ProfileDrive):
-    """INVT: a start during a fault is refused. `jog_needs_own_stop`: a normal stop does not end a jog."""
+    """INVT: a start during a fault is refused. If `jog_needs_own_stop`, a normal stop ends no jog."""
 
     jog_needs_own_stop = False
     _jogs = False
@@ -266,7 +267,7 @@ class SimulatedInvt(ProfileDrive):
         return super().accept(cell, raw)
 
     def _canonical(self, raw: int) -> InvtControl | None:
-        """Return the profile's control word for a raw count of this family, which may differ."""
+        """Return the profile's control word for this raw count, which the family may have renumbered."""
         values: Any = self.drive.register("control").values
         return next((InvtControl[member.name] for member in values if member == raw), None)
 
@@ -293,7 +294,7 @@ class SimulatedInvt(ProfileDrive):
 
 
 class SimulatedInovance(SimulatedInvt):
-    """Inovance and its copies: the status shows no fault."""
+    """Inovance and its copies: the status register shows no fault."""
 
     def _state(self) -> int:
         if not self.motor.energised:
@@ -346,8 +347,8 @@ class SimulatedYaskawa(ProfileDrive):
 class SimulatedOptidrive(ProfileDrive):
     """Optidrive E3: the motor runs while bit 0 is set and digital input 1 is on, also right after a reset.
 
-    `is_enabled` is that input. `is_first_reading`: register 6 has the layout of the first guide, with the
-    fault code in the low byte and the state in the high byte.
+    `is_enabled` is that input. With `is_first_reading`, register 6 has the layout of the first guide: the
+    fault code in the low byte, the state in the high byte.
     """
 
     is_enabled = True

@@ -1,6 +1,7 @@
-"""Function codes and their effects on a simulated drive.
+"""Carry out the function codes of a protocol on a simulated drive.
 
-Modbus (application protocol V1.1b3), and Delixi's own (RS-485 communication protocol, part 3).
+The protocols are Modbus (application protocol V1.1b3) and Delixi's own (RS-485 communication protocol, part
+3).
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ COIL_ON, COIL_OFF = b"\xff\x00", b"\x00\x00"
 
 # Delixi's function codes K.
 COMMAND, STATE, SETPOINT, SET, STORE, QUERY = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
-NO_DATA = bytes(4)  # D3..D0 if unused
+NO_DATA = bytes(4)  # unused D3..D0
 
 
 class Reason(Enum):
-    """A reason to refuse a request. Each family has its own code for it, or stays silent."""
+    """A reason to refuse a request. A family has its own exception code for it, or does not reply."""
 
     FUNCTION = "no such function"
     READ_ADDRESS = "nothing to be read there"
@@ -37,7 +38,7 @@ class Reason(Enum):
 
 
 class Refusal(Exception):
-    """The drive refuses a request."""
+    """Raised when the drive refuses a request, with the reason."""
 
     def __init__(self, reason: Reason) -> None:
         super().__init__(reason.value)
@@ -46,12 +47,12 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class DriveProtocol:
-    """A protocol's functions and usual exception codes. If a reason has no code, a drive stays silent."""
+    """A protocol's functions and usual exception codes. If a reason has no code, the drive does not reply."""
 
     answers: Mapping[int, Callable[[SimulatedDrive, Message], Message]]
     codes: Mapping[Reason, int]
-    octets: int  # length of a request for one register, without checksum
-    no_data: bytes = b""  # the data of a refusal
+    octets: int  # bytes of a request for one register, without checksum
+    no_data: bytes = b""  # data of an exception reply
 
 
 def _with_data(request: Message, data: bytes) -> Message:
@@ -92,13 +93,13 @@ def _write_coils(sim: SimulatedDrive, request: Message) -> Message:
 
 
 def _write_several(sim: SimulatedDrive, request: Message, raws: list[int]) -> Message:
-    sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)  # the limit is that of a read
+    sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)  # limited as reads are
     sim.write(request.function, request.start, raws)
     return Message(request.address, request.function, request.start, request.count)
 
 
 def _return_query_data(sim: SimulatedDrive, request: Message) -> Message:
-    if request.start != 0:  # the only subfunction that is simulated
+    if request.start != 0:  # only subfunction 0 is simulated
         raise Refusal(Reason.FUNCTION)
     return request
 

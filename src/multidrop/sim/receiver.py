@@ -1,8 +1,7 @@
-"""Split received bytes into requests, as a drive does. Input: bytes with times; output: frames.
+"""Split received bytes into requests, as a drive does. The input is bytes with times, the output frames.
 
-Invalid bytes affect only the frames that they damage, and buffers are bounded. An RTU frame ends with
-silence. Therefore a request is damaged if other bytes follow without a pause, unless these start another
-request.
+Invalid bytes affect only the frames that they damage. Buffers are bounded. Silence ends an RTU frame, so a
+request is damaged if other bytes follow it without a pause, unless these bytes start another request.
 """
 
 from __future__ import annotations
@@ -13,25 +12,25 @@ from dataclasses import dataclass, replace
 from multidrop.core import Framing, Message, crc16, lrc, parse_request, sum8
 
 MOST_RTU = 256
-TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id; most bytes of a frame
+TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id; longest frame in bytes
 MOST_TEXT = 513
-LEAST_RTU = 4  # address, function, CRC
-# Function codes of requests: a byte starts a request only if one of these follows.
+LEAST_RTU = 4  # shortest frame in bytes: address, function, CRC
+# Function codes of requests: a byte is a request's address only if one of these follows.
 _REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame; `message` is its request, or None if it is none.
+    """A received frame; `message` is the request in it, or None if it is not a valid request.
 
-    `body` has no start, end or checksum. `intact`: the checksum is correct.
+    `body` is without start, end and checksum. `intact` is True if the checksum is correct.
     """
 
     body: bytes
     message: Message | None
     intact: bool
-    begin: float  # time of the first bit
-    end: float  # time of the last bit
+    begin: float  # s, time of the first bit
+    end: float  # s, time of the last bit
     transaction: int = 0  # id of a Modbus TCP frame
 
     @property
@@ -44,9 +43,9 @@ class Frame:
 
 
 class Receiver:
-    """A receiver for one framing and baud rate. A silence of `most_gap` s ends a frame.
+    """Receives frames of one framing and baud rate. A silence of `most_gap` s ends a frame.
 
-    `character` is the time of one character in s, or 0 if the line has no timing.
+    `character` is the duration of a character in s, or 0 if the line has no timing.
     """
 
     def __init__(self, framing: Framing, character: float, most_gap: float) -> None:
@@ -54,17 +53,17 @@ class Receiver:
         self.character = character
         self.most_gap = most_gap
         self._buffer = bytearray()
-        self._end = float("-inf")  # time of the last bit received
+        self._end = float("-inf")  # s, time of the last received bit
         cuts = {Framing.RTU: self._cut_rtu, Framing.TCP: self._cut_tcp}
         self._cut = cuts.get(framing, self._cut_text)
 
     @property
     def silent_at(self) -> float | None:
-        """The time at which silence will end the frame in the buffer."""
+        """The time in s at which silence will end the buffered frame; None if no frame is buffered."""
         return self._end + self.most_gap if self._buffer else None
 
     def feed(self, chunk: bytes, now: float) -> list[Frame]:
-        """Return the frames that this chunk completes. The chunk's first bit came at `now` or later."""
+        """Return the frames that this chunk completes. Its first bit came at `now` s or later."""
         frames = self.silence(now)
         self._end = max(now, self._end) + len(chunk) * self.character
         self._buffer += chunk
@@ -73,14 +72,14 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return the frame that a silence up to `now` has ended, if any; it is not a complete request."""
+        """Return the frame, if any, that silence until `now` has ended; it is not a valid request."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
         self._buffer.clear()
         if self.framing is not Framing.RTU or not LEAST_RTU <= len(rest) <= MOST_RTU:
             return []
-        if _first_request(rest) is not None:  # a request with further bytes after it
+        if _first_request(rest) is not None:  # a valid request with further bytes after it
             return []
         intact = crc16(rest[:-2], len(rest) - 2) == int.from_bytes(rest[-2:], "little")
         return [self._frame(rest[:-2], None, intact, 0, len(rest))]
@@ -89,12 +88,12 @@ class Receiver:
         self._buffer.clear()
 
     def _frame(self, body: bytes, message: Message | None, intact: bool, after: int, length: int) -> Frame:
-        """Return a frame of `length` characters; `after` further characters came after it."""
+        """Return a frame of `length` characters, after which `after` further characters were received."""
         end = self._end - after * self.character
         return Frame(body, message, intact, end - length * self.character, end)
 
     def _cut_rtu(self) -> Frame | None:
-        """Return the next request; None while the bytes after it may still become a request."""
+        """Return the next request; None if there is none, or while the bytes after it may become a request."""
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:
             at, used, message = found
@@ -110,7 +109,7 @@ class Receiver:
         return None
 
     def _cut_tcp(self) -> Frame | None:
-        """Return the next frame; after an invalid header, drop all bytes."""
+        """Return the next frame, or None; if the header is invalid, drop all bytes."""
         data = bytes(self._buffer)
         if len(data) < TCP_HEAD:
             return None
@@ -155,10 +154,10 @@ class Receiver:
 
 
 def _first_request(data: bytes) -> tuple[int, int, Message] | None:
-    """Return index, length and content of the first valid request; None if there is none.
+    """Return index, length and message of the first valid request in `data`; None if there is none.
 
-    If an earlier byte may start a request that is still incomplete, a later request counts only if it ends
-    with the last byte.
+    If an earlier byte may start a request that is still incomplete, a later request counts only if it ends at
+    the end of `data`.
     """
     pending = False
     for at, code in enumerate(data[1:]):

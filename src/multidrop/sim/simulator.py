@@ -1,4 +1,4 @@
-"""Simulator: runs any number of wires in one thread. No other file of this package reads a clock."""
+"""Simulator: runs any number of wires in one thread. No other file of `multidrop.sim` reads a clock."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _log = logging.getLogger("multidrop.sim")
 class Simulator:
     """Runs wires during a `with` block: `with Simulator([wire]) as sim: sim.wires[0].path`.
 
-    With `speed` 10, all simulated times pass ten times as fast: of the wire, the drives and their motors.
+    With `speed=10`, simulated time passes ten times as fast for wires, drives and motors.
     """
 
     def __init__(self, wires: Sequence[Wire], *, speed: float = 1.0) -> None:
@@ -36,18 +36,18 @@ class Simulator:
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
         self.failure: BaseException | None = None
         """The first exception of a simulated drive, or of the thread itself; None: there was none."""
-        self._failed: set[int] = set()  # wires with a logged failure
+        self._failed: set[int] = set()  # numbers of wires whose first failure was logged
         self._changing = threading.Lock()
         self._is_over = False
         self._is_open = False
-        self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
-        self._planned: dict[int, float] = {}  # each wire's valid wake-up; others in the heap are outdated
-        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # each wire's registered port
+        self._wakes: list[tuple[float, int]] = []  # heap of (time, number of the wire)
+        self._planned: dict[int, float] = {}  # valid wake-up by wire; other heap entries are outdated
+        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # by wire, the registered port
 
     def __enter__(self) -> Self:
         try:
             self._start()
-        except BaseException:  # in this case __exit__ is not called
+        except BaseException:  # __exit__ is not called if __enter__ fails
             self._end()
             raise
         return self
@@ -55,7 +55,7 @@ class Simulator:
     @undisturbed
     def _start(self) -> None:
         with self._changing:
-            if not self._is_over:  # an interruption may have ended it already
+            if not self._is_over:  # not if the thread has ended already
                 self.open()
                 self._is_open = True
                 self._thread.start()
@@ -79,12 +79,12 @@ class Simulator:
     def _run_in_thread(self) -> None:
         try:
             self.run()
-        except BaseException as failure:  # the simulator failed: all wires are silent now
+        except BaseException as failure:  # all wires are silent from now on
             self.failure = self.failure or failure
             _log.critical("the simulator has ended: no drive answers any more", exc_info=failure)
 
     def open(self) -> None:
-        """Open all ports, which makes their paths known; if one fails, close all again."""
+        """Open all ports, so that their paths are known; if one fails, close all and raise its error."""
         self._selector = selectors.DefaultSelector()
         self._interrupted, self._interrupter = socket.socketpair()
         self._interrupter.setblocking(False)
@@ -99,7 +99,7 @@ class Simulator:
             raise
 
     def forked(self) -> None:
-        """Give a forked child its own wake-up pair, so that it cannot interrupt its parent's simulator."""
+        """Give a forked child its own wake-up sockets, so that it cannot interrupt its parent's simulator."""
         self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
@@ -110,7 +110,7 @@ class Simulator:
         self._interrupter.close()
 
     def interrupt(self) -> None:
-        """Make `run` return. May be called from any thread."""
+        """Make `run` return. Callable from any thread."""
         self._interrupter.send(b"!")
 
     @property
@@ -121,8 +121,8 @@ class Simulator:
     def run(self) -> None:
         """Run the wires until interrupted. Blocks.
 
-        A simulated drive that raises an exception leaves that request without an answer. The first one of
-        each wire is logged.
+        If a simulated drive raises an exception, its request gets no reply. The first exception of each wire
+        is logged.
         """
         while True:
             self._sleep()
@@ -141,10 +141,10 @@ class Simulator:
         return monotonic() * self._speed
 
     def _sleep(self) -> None:
-        """Wait for bytes or the next wake-up.
+        """Wait for received bytes or the next wake-up time.
 
-        Uses select() on the selector's own descriptor, because select() is exact to the microsecond and
-        epoll_wait() only to the millisecond.
+        Calls select() on the selector's own descriptor, because select() is accurate to a microsecond and
+        epoll_wait() only to a millisecond.
         """
         limit = max(0.0, self._wakes[0][0] - self._now()) / self._speed if self._wakes else None
         if isinstance(self._selector, selectors.SelectSelector):
@@ -153,7 +153,7 @@ class Simulator:
             select.select([self._selector], [], [], limit)
 
     def _note(self, number: int, failure: Exception) -> None:
-        """Log the first failure of a wire; all wires continue."""
+        """Log a wire's failure if it is the wire's first; all wires continue."""
         self.failure = self.failure or failure
         if number not in self._failed:
             self._failed.add(number)
@@ -172,7 +172,7 @@ class Simulator:
             self._advance(number)
 
     def _advance(self, number: int) -> None:
-        """Send the bytes that have reached the client by now, and plan the wire's next wake-up."""
+        """Deliver the bytes due at the client, and plan the wire's next wake-up."""
         wire = self.wires[number]
         try:
             data = wire.advance(self._now())
@@ -188,7 +188,7 @@ class Simulator:
             heapq.heappush(self._wakes, (wake, number))
 
     def _attend(self, number: int) -> None:
-        """Let the selector wait for the wire's current port, which may have been closed or reopened."""
+        """Register the wire's present port with the selector; the port may have been closed or reopened."""
         port, before = self.wires[number].port, self._attended.get(number)
         now = (port, port.fileno()) if port else None
         if now == before:
@@ -207,14 +207,15 @@ def serve(
     *,
     speed: float = 1.0,
 ) -> None:
-    """Run wires in this process's main thread until it is interrupted or terminated.
+    """Run wires in the main thread until the process is interrupted or terminated.
 
-    `announce` is called once, when the wires' paths are known.
+    `announce` is called once, as soon as the wires' paths are known.
     """
     simulator = Simulator(wires, speed=speed)
     simulator.open()
     before = signal.signal(signal.SIGTERM, lambda *_: None)
-    # Python runs no handler of a signal that comes just before the sleep: the signal's byte ends the sleep.
+    # Python does not run the handler of a signal that comes just before the sleep. The byte that the signal
+    # writes ends the sleep.
     wakeup = signal.set_wakeup_fd(simulator.wakeup)
     try:
         announce(simulator)

@@ -1,4 +1,4 @@
-"""Wire: a line with its drives, and the time that transmission takes.
+"""Wire: a simulated line with its drives and its transmission times.
 
 Input and output are bytes with times; the port at the line's end is in port.py.
 """
@@ -16,14 +16,14 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
 
-CHUNK = 1e-3  # s; characters that end within this time are sent to the client together
-ROUNDING = 1e-6  # part of a character; lets a wake-up find its byte despite rounding errors
-UNPACED_GAP = 20e-3  # s of silence that end a frame if characters take no time
+CHUNK = 1e-3  # s; characters that end within this time are delivered together
+ROUNDING = 1e-6  # fraction of a character; keeps rounding errors from delaying a due byte
+UNPACED_GAP = 20e-3  # s of silence that end a frame on an unpaced wire
 
 
 @dataclass
 class Transmission:
-    """A reply in transmission: the n-th character ends n character times after `begin`."""
+    """A reply in transmission: its n-th character ends n character times after `begin`."""
 
     data: bytes
     begin: float
@@ -40,7 +40,7 @@ class Transmission:
         return self.begin + min(len(self.data), self.sent + group) * self.character
 
     def take(self, now: float) -> bytes:
-        """Return the characters that have ended by `now` and were not returned before."""
+        """Return the characters that have ended by `now` and were not yet returned."""
         if now < self.begin:
             return b""
         passed = len(self.data)
@@ -66,11 +66,11 @@ class ReceiverGroup:
 
 
 class Wire:
-    """One line of simulated drives.
+    """One line with simulated drives.
 
-    `port` is "pty", a path for a link to the pty, "socket://host:port" (port 0: any free one), or
-    "tcp://host:port" for drives behind a gateway of Modbus TCP. A client opens `path`. On an `unpaced` wire
-    nothing takes time.
+    `port` is "pty", a path for a link to the pty, "socket://host:port" (port 0: any free port), or
+    "tcp://host:port" for drives behind a Modbus TCP gateway. A client opens `path`. On an `unpaced` wire
+    characters and response delays take no time.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class Wire:
             sim.drive.take_framing_of(port)
         self.name = name
         self.where = port
-        self.port: SimulatedEnd | None = None  # None while it is closed
-        self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
+        self.port: SimulatedEnd | None = None  # None while closed
+        self._pace = 0.0 if unpaced else 1.0  # factor of every duration
         self._groups = self._group()
-        self._outgoing: list[Transmission] = []  # ordered by start
-        self._quiet_since = -math.inf  # end of the last reply
+        self._outgoing: list[Transmission] = []  # replies to send, ordered by start time
+        self._quiet_since = -math.inf  # s, end of the last reply
         self._baudrate: int | None = None
 
     def _group(self) -> list[ReceiverGroup]:
@@ -115,7 +115,7 @@ class Wire:
         return f"<Wire {self.name} of {len(self.drives)} drives>"
 
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        """Receive bytes from the client; `baudrate` None: the client's baud rate is unknown."""
+        """Receive bytes from the client at `now` s; `baudrate` is None if the client's is unknown."""
         if baudrate != self._baudrate:
             for group in self._groups:
                 group.receiver.forget()
@@ -125,7 +125,7 @@ class Wire:
                 self._deliver(group, group.receiver.feed(chunk, now))
 
     def advance(self, now: float) -> bytes:
-        """Let time pass until `now`; return the bytes that reach the client until then."""
+        """Advance to `now` s; return the bytes that reach the client until then."""
         for group in self._groups:
             if frames := group.receiver.silence(now):
                 self._deliver(group, frames)
@@ -137,27 +137,27 @@ class Wire:
             if now < self._outgoing[0].end:
                 break
             self._quiet_since = self._outgoing.pop(0).end
-            if self._outgoing:  # two replies never overlap: the second waits
+            if self._outgoing:  # a second reply waits for the first to end
                 self._outgoing[0].begin = max(self._outgoing[0].begin, self._quiet_since)
         return bytes(received)
 
     @property
     def wake(self) -> float | None:
-        """The time at which to call `advance` next; None: not before the next bytes come."""
+        """The time in s at which to call `advance` next; None if only received bytes require it."""
         times = [at for group in self._groups if (at := group.receiver.silent_at) is not None]
         if self._outgoing:
             times.append(self._outgoing[0].next_at)
         return min(times, default=None)
 
     def distort(self, reply: bytes) -> bytes:
-        """Return the reply as it reaches the client. Tests with noise override this."""
+        """Return the reply as it reaches the client. Tests override this to damage replies."""
         return reply
 
     def _deliver(self, group: ReceiverGroup, frames: Sequence[Frame]) -> None:
         for frame in frames:
             for sim in group.addressed(frame):
                 if self._keeps_silence(sim, frame) and (reply := sim.receive(frame)) is not None:
-                    if frame.transaction:  # only Modbus TCP has a transaction
+                    if frame.transaction:  # only Modbus TCP has transaction ids
                         reply = replace(reply, transaction=frame.transaction)
                     begin = frame.end + sim.delay * self._pace
                     self._reply(sim, build_reply(sim.drive.framing, reply), begin, group.receiver.character)
@@ -169,11 +169,11 @@ class Wire:
         bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda reply: reply.begin)
 
     def _keeps_silence(self, sim: SimulatedDrive, frame: Frame) -> bool:
-        """Return whether a drive accepts a frame; count it if it came before the drive's silence was over.
+        """Return True if a drive accepts the frame; count a frame that came too soon after a reply.
 
         A frame that starts during a reply is lost. Silence is measured only from the end of a reply, because
-        the simulator knows that time exactly. So a late wake-up of this process is never counted against a
-        client.
+        the simulator knows that time exactly. So a late wake-up of this process never counts as an early
+        frame.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
         silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)
@@ -185,7 +185,7 @@ class Wire:
 
     @property
     def path(self) -> str:
-        """The path that a client opens while a simulator runs the line."""
+        """The path that a client opens, while a simulator runs the line."""
         if self.port is None:
             raise RuntimeError(f"{self.name} is not open: run it in a Simulator")
         return self.port.path

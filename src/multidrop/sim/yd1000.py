@@ -1,4 +1,4 @@
-"""YD1000, simulated (communication notes, sections 4 to 8)."""
+"""Simulated YD1000 (communication notes, sections 4 to 8)."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ TIMEOUT_SETTING = 0x0803
 COMMANDED, BY_FREQUENCY, RESET, EMERGENCY_STOP, COAST, RUN, REVERSE, JOG, DC_BRAKE, SECOND_RAMP = (
     1 << bit for bit in range(15, 5, -1)
 )
-PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # their part of the preset speed's number
-PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # Sr1 to Sr7
+PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # control bit: part of the preset's number
+PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # addresses of Sr1 to Sr7
 PANEL_ONLY = (0x0001, 0x0007, 0x0015)
-BAUDRATES = (1200, 2400, 4800, 9600)  # by the codes of F800
-RESTART_TIME = 2.0  # s after a reset during which the line is ignored
+BAUDRATES = (1200, 2400, 4800, 9600)  # indexed by F800
+RESTART_TIME = 2.0  # s for which requests are ignored after a reset
 EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18
-HELD = (0x1200, 0x1201)  # frozen at a trip until the reset
+HELD = (0x1200, 0x1201)  # addresses frozen from a trip until the reset
 
 
 class SimulatedYD1000(MotorDrive):
     """YD1000. Without bit 15 the panel is in control: the motor runs while `panel_runs` is set.
 
-    A value outside its limits in section 6 is refused, also if the limit is another parameter. A write to a
-    parameter that works only from the panel is confirmed but not stored (6.1; by section 8.1, 0007H
+    A value outside its limits in section 6 is refused, also if the limit is another parameter's value. A
+    write to a parameter marked "panel only" is confirmed but not stored (6.1; by section 8.1, 0007H
     initialises).
 
     The notes leave some facts open, which are taken from related drives. From the VF-S15: exception codes are
@@ -42,15 +42,15 @@ class SimulatedYD1000(MotorDrive):
     needs_silence = True  # 4.3
 
     _panel_runs = False
-    _in_force = 0  # the control word in force
-    _message_at = math.inf  # the timeout starts with the first message
+    _in_force = 0  # control word in force
+    _message_at = math.inf  # s, time of the last message; no timeout before the first
 
     def prepare(self) -> None:
         self.memory.make_readable(HOLDING, [CONTROL])
 
     @property
     def panel_runs(self) -> bool:
-        """True while the panel commands run. This has an effect only while the line is not in control."""
+        """True while the panel commands run; has an effect only while the line is not in control."""
         return self._panel_runs
 
     @panel_runs.setter
@@ -89,7 +89,7 @@ class SimulatedYD1000(MotorDrive):
         return cell.address not in PANEL_ONLY and super().wears(cell, function, address)
 
     def pass_time(self, now: float) -> None:
-        limit = self.word(TIMEOUT_SETTING) or math.inf  # F803, 0 is off
+        limit = self.word(TIMEOUT_SETTING) or math.inf  # F803; 0 disables the timeout
         if now > self._message_at + limit and not self.motor.fault:
             self.motor.run_to(self._message_at + limit)
             self.trip(COMMUNICATION_LOST)
@@ -97,7 +97,7 @@ class SimulatedYD1000(MotorDrive):
         super().pass_time(now)
 
     def trip(self, code: int) -> None:
-        """Freeze 1200H and 1201H, then trip."""
+        """Freeze registers 1200H and 1201H, then trip."""
         for address in HELD:
             cell = self.memory.readable(0x03, address)
             if cell:
@@ -110,7 +110,7 @@ class SimulatedYD1000(MotorDrive):
 
     def _control(self, word: int) -> None:
         direction = -1 if word & REVERSE else 1
-        if not word & COMMANDED:  # then no other bit works (8.1)
+        if not word & COMMANDED:  # without bit 15 no other bit has an effect (8.1)
             panel = self.motor.run if self.panel_runs else self.motor.stop
             panel()
         elif word & RESET:
@@ -131,7 +131,7 @@ class SimulatedYD1000(MotorDrive):
         self._in_force = word if word & COMMANDED else 0
 
     def _restart(self) -> None:
-        """Lose everything that is not in the EEPROM, and ignore the line for RESTART_TIME."""
+        """Drop all state except the EEPROM's, and ignore the line for RESTART_TIME."""
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + RESTART_TIME
@@ -146,7 +146,7 @@ class SimulatedYD1000(MotorDrive):
         bits = self._in_force & SECOND_RAMP | (REVERSE if self.motor.direction < 0 else 0)
         if not self.motor.energised:
             return bits
-        return bits | RUN | self._in_force & (JOG | DC_BRAKE)  # braking is run too (8.2, table 2)
+        return bits | RUN | self._in_force & (JOG | DC_BRAKE)  # RUN is set while braking too (8.2, table 2)
 
     obeys = {"control": _control}
     shows = {
