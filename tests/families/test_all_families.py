@@ -50,7 +50,7 @@ def told(one: type[Drive] | Register[Any]) -> str:
     return one.name if isinstance(one, Register) else one.model
 
 
-def test_the_models_by_name() -> None:
+def test_built_in_models_are_found_by_name() -> None:
     assert list(MODELS) == [
         "erman-er-g-220",
         "invt-che",
@@ -64,7 +64,7 @@ def test_the_models_by_name() -> None:
 
 
 @family
-def test_each_family_has_a_title_and_a_manual(family: type[Drive]) -> None:
+def test_every_family_has_a_title_and_a_manual(family: type[Drive]) -> None:
     assert family.__doc__
     assert len(family.__doc__) > 500
     assert family.manual
@@ -75,7 +75,7 @@ def test_each_family_has_a_title_and_a_manual(family: type[Drive]) -> None:
 
 @family
 @table("given", [True, 1.0, None, "1", 0, 248, -1])
-def test_an_address_is_a_whole_number_that_the_family_has(family: type[Drive], given: object) -> None:
+def test_invalid_address_is_refused(family: type[Drive], given: object) -> None:
     with pytest.raises(ValueError, match=rf"^address {given!r} is not one of "):
         family(given)  # type: ignore[arg-type]
 
@@ -91,11 +91,11 @@ TERMINALS = {  # as each document names them; CHE's does not
 
 
 @family
-def test_a_family_names_its_terminals(family: type[Drive]) -> None:
+def test_every_family_names_its_line_terminals(family: type[Drive]) -> None:
     assert family.line_terminals == TERMINALS[family.model]
 
 
-def test_unknown_framing_is_refused_with_the_right_one() -> None:
+def test_unknown_framing_is_refused_and_the_error_names_a_valid_one() -> None:
     with pytest.raises(
         ValueError, match=r"^framing 'ascii' is not one of .*: delixi; write delixi, or leave"
     ):
@@ -110,7 +110,7 @@ def test_delixi_units_not_in_the_manual_are_marked_as_inferred(family: type[Driv
 
 
 @family
-def test_a_framing_by_its_number_is_the_framing(family: type[Drive]) -> None:
+def test_framing_can_be_given_by_its_number(family: type[Drive]) -> None:
     first = family.framings[0]
     assert family(1, framing=int(first)).framing is first  # type: ignore[arg-type]
 
@@ -123,7 +123,9 @@ def test_drive_base_class_cannot_be_used_as_a_family() -> None:
 @family
 @table("name", ["start", "jog"])
 @table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
-def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
+def test_value_that_is_not_a_direction_raises_type_error(
+    family: type[Drive], name: str, given: object
+) -> None:
     """A value other than a Direction must not turn the motor; no frame is sent."""
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
@@ -137,7 +139,7 @@ def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: obj
 
 @family
 @table("given", ["25", None, True, Direction.FORWARD])
-def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
+def test_frequency_that_is_not_a_number_raises_type_error(family: type[Drive], given: object) -> None:
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
     with pytest.raises(TypeError, match=r"^set_frequency of pump takes a number in Hz, not "):
@@ -145,18 +147,18 @@ def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
 
 
 @family
-def test_a_register_is_not_called_as_a_verb_is(family: type[Drive]) -> None:
+def test_no_register_has_the_name_of_a_verb(family: type[Drive]) -> None:
     assert not set(family.registers) & set(VERBS)
     assert not [name for name in family.registers if name in vars(Drive)]
 
 
 @family
-def test_verbs_have_docstrings(family: type[Drive]) -> None:
+def test_every_verb_has_a_docstring(family: type[Drive]) -> None:
     assert all(getattr(family, name).__doc__ for name in (*VERBS, "identify"))
 
 
 @family
-def test_no_two_registers_share_an_address(family: type[Drive]) -> None:
+def test_no_two_registers_have_the_same_address(family: type[Drive]) -> None:
     """But for a command and the reading that shows it."""
     places = [
         (register.table, register.address + at, register.access is Access.COMMAND)
@@ -167,7 +169,7 @@ def test_no_two_registers_share_an_address(family: type[Drive]) -> None:
 
 
 @family
-def test_every_framing_has_its_formats(family: type[Drive]) -> None:
+def test_every_framing_has_character_formats(family: type[Drive]) -> None:
     assert set(family.formats) == set(family.framings)
     for framing in family.framings:
         for format in family.formats[framing]:
@@ -177,13 +179,13 @@ def test_every_framing_has_its_formats(family: type[Drive]) -> None:
 
 
 @family
-def test_limits_hold_for_tables_that_the_family_has(family: type[Drive]) -> None:
+def test_read_limits_name_only_tables_of_the_family(family: type[Drive]) -> None:
     tables = {register.table for register in family.registers.values()}
     assert {*family.most_registers, *family.readable_gaps} <= tables
 
 
 @family
-def test_each_register_has_a_source(family: type[Drive]) -> None:
+def test_every_register_has_a_source(family: type[Drive]) -> None:
     for name, register in family.registers.items():
         assert register.place or register.outside, name
         assert getattr(family, name) is register
@@ -204,12 +206,12 @@ def test_span_ends_can_be_encoded_and_values_beyond_cannot(
 
 
 @table("family, register", registers(lambda each: each.span and each.default is not None))
-def test_the_default_is_inside_the_span(family: type[Drive], register: Register[Any]) -> None:
+def test_every_default_is_within_its_span(family: type[Drive], register: Register[Any]) -> None:
     assert register.decode(register.encode(register.default)) == register.default
 
 
 @table("family, register", registers(lambda each: each.values))
-def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[Any]) -> None:
+def test_named_values_survive_encoding_and_decoding(family: type[Drive], register: Register[Any]) -> None:
     assert register.values
     for member in register.values:
         assert register.decode(register.encode(member)) is member
@@ -232,7 +234,7 @@ def test_register_with_never_is_not_writable(family: type[Drive]) -> None:
 
 
 @table("family, register", registers(lambda each: each.broadcast))
-def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], register: Register[Any]) -> None:
+def test_every_broadcast_is_a_stop_or_a_setpoint_of_0(family: type[Drive], register: Register[Any]) -> None:
     for raw in register.broadcast:
         assert family.broadcasts
         value = register.decode(raw)
@@ -243,7 +245,7 @@ def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], regist
 
 
 @family
-def test_an_unknown_scale_is_not_written(family: type[Drive]) -> None:
+def test_register_of_unknown_scale_is_never_writable(family: type[Drive]) -> None:
     assert not [
         register for register in family.registers.values() if register.step is None and register.writable
     ]
@@ -251,7 +253,7 @@ def test_an_unknown_scale_is_not_written(family: type[Drive]) -> None:
 
 @pytest.mark.slow
 @table("family, register", registers(lambda each: not each.values))
-def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[Any]) -> None:
+def test_raw_count_survives_decoding_and_encoding(family: type[Drive], register: Register[Any]) -> None:
     low, high = (0, 1) if register.number_format is NumberFormat.BIT else (0, 0xFFFF)
     if register.number_format is NumberFormat.I16:
         low, high = -0x8000, 0x7FFF
@@ -270,7 +272,9 @@ def test_a_raw_count_survives_its_value(family: type[Drive], register: Register[
 @pytest.mark.parametrize(("family", "register"), registers(lambda each: each.writable), ids=told)
 @settings(max_examples=examples(10))
 @given(data=st.data())
-def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
+def test_value_survives_a_write_and_a_read(
+    family: type[Drive], register: Register[Any], data: st.DataObject
+) -> None:
     """Written in any framing, held by the drive as sent, and read back."""
     drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
     value = data.draw(_values(register))
@@ -351,7 +355,7 @@ def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
     return found
 
 
-def test_each_script_is_run_with_yield_from() -> None:
+def test_every_script_call_uses_yield_from() -> None:
     """Without `yield from` a script silently does not run."""
     rooms = (Path(multidrop.families.__file__).parent, Path(multidrop.drive.__file__).parent)
     trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.glob("*.py")}
@@ -372,7 +376,7 @@ def test_each_script_is_run_with_yield_from() -> None:
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 
 
-def test_a_family_without_a_verb_says_so() -> None:
+def test_verb_that_a_family_lacks_raises_unsupported() -> None:
     class Mute(Drive):
         """Can only be read."""
 
@@ -386,7 +390,7 @@ def test_a_family_without_a_verb_says_so() -> None:
             next(getattr(Mute(1), name).script(*given))
 
 
-def test_state_as_text_has_all_its_facts() -> None:
+def test_state_as_text_shows_condition_direction_fault_and_note() -> None:
     said = State(Condition.FAULT, Direction.REVERSE, "OVERCURRENT", "watchdog is off")
     assert str(said) == "fault reverse (OVERCURRENT) - watchdog is off"
     assert str(State(Condition.UNKNOWN)) == "unknown"

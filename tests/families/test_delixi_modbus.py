@@ -46,12 +46,12 @@ TABLE = """
 """
 
 
-def test_the_registers_are_those_of_part_2() -> None:
+def test_registers_equal_the_typed_table_of_part_2() -> None:
     shared = "\n".join(f"03/06 {line}" for line in DELIXI_MONITORS.strip().splitlines())
     assert rows(DelixiModbus) == typed(TABLE + shared)
 
 
-def test_the_line_and_its_limits() -> None:
+def test_line_settings_and_limits_are_those_of_the_document() -> None:
     assert str(DelixiModbus(31).settings) == "9600 8N2"
     assert str(DelixiModbus(1, framing="ascii").settings) == "9600 7N2"
     assert DelixiModbus.formats[Framing.RTU] == ("8N2", "8E1", "8O1")
@@ -67,13 +67,13 @@ def test_run_words_have_a_direction_and_never_the_toggle() -> None:
     assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
 
 
-def test_formats_are_named_as_the_manual_has_them() -> None:
+def test_character_formats_have_the_codes_of_the_manual() -> None:
     """P04.29: 0 to 2 are ASCII with seven bits, 3 to 5 RTU with eight."""
     names = ["ASCII_7N2", "ASCII_7E1", "ASCII_7O1", "RTU_8N2", "RTU_8E1", "RTU_8O1"]
     assert [DelixiModbus.format_setting.decode(raw).name for raw in range(6)] == names
 
 
-def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
+def test_start_after_a_jog_requires_a_stop() -> None:
     jog = frame(DelixiModbus(1), DelixiModbus.control, DelixiModbusControl.JOG_FORWARD)
     wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING} | TURNS)
     wire.drive.jog()
@@ -85,13 +85,13 @@ def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
     assert wire.sent == [jog, STOP[Framing.RTU], FORWARD[Framing.RTU], REVERSE[Framing.RTU]]
 
 
-def test_faults() -> None:
+def test_fault_codes_decode_to_the_documented_names() -> None:
     assert [each.value for each in DelixiFault] == list(range(15))
     assert DelixiModbus.fault.decode(14) is DelixiFault.FLT_MODULE
 
 
 @pytest.mark.parametrize("framing", DelixiModbus.framings)
-def test_commands(framing: Framing) -> None:
+def test_each_verb_sends_the_documented_frame(framing: Framing) -> None:
     wire = Wire(DelixiModbus(1, framing=framing), STANDING, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -102,7 +102,7 @@ def test_commands(framing: Framing) -> None:
     assert wire.sent == [FIFTY[framing], forward, forward, REVERSE[framing], STOP[framing]]
 
 
-def test_jog_has_its_direction_too() -> None:
+def test_jog_sends_the_word_of_its_direction() -> None:
     jogs = [
         frame(DelixiModbus(1), DelixiModbus.control, word)
         for word in (DelixiModbusControl.JOG_FORWARD, DelixiModbusControl.JOG_REVERSE)
@@ -125,7 +125,7 @@ def test_start_is_unconfirmed_if_the_motor_does_not_run(name: str) -> None:
     assert len(wire.sent) == 1
 
 
-def test_a_motor_that_turns_is_not_started_without_a_direction() -> None:
+def test_start_of_a_turning_motor_without_a_direction_is_refused() -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, **TURNING})
     with pytest.raises(WriteForbidden, match="name the direction"):
         wire.drive.start()
@@ -134,7 +134,7 @@ def test_a_motor_that_turns_is_not_started_without_a_direction() -> None:
     assert wire.sent == [FORWARD[Framing.RTU]]
 
 
-def test_stop_waits_and_says_when_it_is_not_seen() -> None:
+def test_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
     wire = Wire(DelixiModbus(1), {"output_frequency": [30.0, 10.0, 0.0]})
     wire.drive.stop()
     assert len(wire.reads) == 3
@@ -144,7 +144,7 @@ def test_stop_waits_and_says_when_it_is_not_seen() -> None:
     assert wire.sent == [STOP[Framing.RTU]]
 
 
-def test_the_only_setpoint_wears_the_eeprom() -> None:
+def test_setpoint_wears_the_eeprom_and_a_differing_one_is_reported() -> None:
     assert DelixiModbus.frequency.kept is Kept.EEPROM
     assert "EEPROM" in DelixiModbus.frequency.note
     wire = Wire(DelixiModbus(1), {"frequency": 40.0})
@@ -160,15 +160,15 @@ def test_the_only_setpoint_wears_the_eeprom() -> None:
         ({"fault": 99}, State(Condition.FAULT, fault="99")),
     ],
 )
-def test_state(says: dict[str, object], state: State) -> None:
+def test_state_shows_the_fault_or_that_the_motor_turns(says: dict[str, object], state: State) -> None:
     assert Wire(DelixiModbus(1), says).drive.state() == state
 
 
-def test_at_rest_the_state_is_unknown() -> None:
+def test_state_at_0_hz_is_unknown() -> None:
     assert Wire(DelixiModbus(1), STANDING).drive.state().condition is Condition.UNKNOWN
 
 
-def test_identify() -> None:
+def test_identify_checks_address_and_baud_rate() -> None:
     Wire(DelixiModbus(1), STANDING).drive.identify()
     for name, other, sentence in (
         ("fault", 99, "0063H"),
@@ -188,7 +188,7 @@ def test_identify() -> None:
         ("frequency", 0.0, "set_frequency"),
     ],
 )
-def test_start_is_refused(name: str, held: float, sentence: str) -> None:
+def test_start_is_refused_in_a_fault_or_without_line_control(name: str, held: float, sentence: str) -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, name: held})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()

@@ -55,13 +55,13 @@ TABLE = """
 """
 
 
-def test_the_registers_are_those_of_part_3() -> None:
+def test_registers_equal_the_typed_tables_of_part_3() -> None:
     own = DELIXI_MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
     shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
     assert rows(DelixiNative) == typed(TABLE + shared)
 
 
-def test_what_carries_a_value() -> None:
+def test_registers_of_each_function_code_have_the_documented_size() -> None:
     carriers = {
         register.table.write or register.table.read: register.table.carrier
         for register in DelixiNative.registers.values()
@@ -70,24 +70,24 @@ def test_what_carries_a_value() -> None:
     assert (PARAMETER_RAM.read, PARAMETER_RAM.write) == (7, 5)
 
 
-def test_the_line_and_its_limits() -> None:
+def test_line_settings_and_limits_are_those_of_the_document() -> None:
     assert DelixiNative(31).framing is Framing.DELIXI
     assert DelixiNative.formats == {Framing.DELIXI: ("8N1", "8E1", "8O1")}
     assert set(DelixiNative.exceptions) == {0xF0, 0xFC, 0xFD, 0xFE, 0xFF}
     assert DelixiNative(1).needed_silence() == 0
 
 
-def test_formats_are_named_as_the_manual_has_them() -> None:
+def test_character_formats_have_the_codes_of_the_manual() -> None:
     """P04.29 has other codes than in standard Modbus."""
     assert [DelixiNative.format_setting.decode(raw).name for raw in range(3)] == ["N81", "E81", "O81"]
 
 
-def test_only_a_stop_is_broadcast_and_only_by_k_02() -> None:
+def test_only_a_stop_with_k_02_is_broadcast() -> None:
     broadcast = {name: each.broadcast for name, each in DelixiNative.registers.items() if each.broadcast}
     assert broadcast == {"control": (1,)}
 
 
-def test_commands() -> None:
+def test_each_verb_sends_the_printed_frame() -> None:
     wire = Wire(DelixiNative(1), STANDING, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -97,7 +97,7 @@ def test_commands() -> None:
     assert wire.sent == [FIFTY, FORWARD, REVERSE, STOP, RESET]
 
 
-def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -137,7 +137,7 @@ def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: 
         ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: see to it"),
     ],
 )
-def test_a_drive_that_would_not_obey_is_not_started(says: dict[str, object], sentence: str) -> None:
+def test_start_is_refused_in_a_fault_or_without_line_control(says: dict[str, object], sentence: str) -> None:
     wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
     wire.drive.set_frequency(50)
     with pytest.raises(WriteForbidden, match=sentence):
@@ -153,7 +153,7 @@ def test_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
     assert wire.sent == [FIFTY, FORWARD]
 
 
-def test_the_stored_setpoint() -> None:
+def test_stored_setpoint_is_written_with_k_06() -> None:
     drive = DelixiNative(1)
     assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED
     assert DelixiNative.stored_frequency.kept is Kept.EEPROM
@@ -221,11 +221,11 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
         ({"status": 9}, State(Condition.UNKNOWN, note="K = 03 says 0009H, which is not explained")),
     ],
 )
-def test_state(says: dict[str, object], state: State) -> None:
+def test_state_shows_run_state_direction_and_fault(says: dict[str, object], state: State) -> None:
     assert Wire(DelixiNative(1), says).drive.state() == state
 
 
-def test_identify_is_a_read() -> None:
+def test_identify_reads_address_and_baud_rate() -> None:
     wire = Wire(DelixiNative(1), STANDING)
     wire.drive.identify()
     assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])
@@ -235,7 +235,7 @@ def test_identify_is_a_read() -> None:
         Wire(DelixiNative(2), STANDING).drive.identify()
 
 
-def test_a_subclass_keeps_its_tables_and_adds_its_own() -> None:
+def test_subclass_keeps_the_registers_and_adds_its_own() -> None:
     class Mine(DelixiNative):
         """A Delixi whose owner has its list of parameters."""
 
@@ -253,7 +253,7 @@ class Owned(DelixiNative):
     stored_ramp = setting(parameter(0, 18), "s", step=0.1, table=PARAMETER)
 
 
-def test_the_function_code_says_whether_a_parameter_is_stored() -> None:
+def test_table_of_a_parameter_decides_whether_it_is_stored() -> None:
     assert (Owned.ramp.kept, Owned.stored_ramp.kept) == (Kept.RAM, Kept.EEPROM)
     kept = {name: each.kept for name, each in DelixiNative.registers.items() if each.writable}
     assert kept == {

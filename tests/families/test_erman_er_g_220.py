@@ -68,11 +68,11 @@ TABLE = """
 """
 
 
-def test_the_registers_are_those_of_section_10() -> None:
+def test_registers_equal_the_typed_table_of_section_10() -> None:
     assert rows(ErmanERG220) == typed(TABLE)
 
 
-def test_the_line_and_its_limits() -> None:
+def test_line_settings_and_limits_are_those_of_the_document() -> None:
     drive = ErmanERG220(1)
     assert str(drive.settings) == "38400 8N1"
     assert ErmanERG220.addresses == range(1, 32)
@@ -89,7 +89,7 @@ def test_the_line_and_its_limits() -> None:
         ErmanERG220(32)
 
 
-def test_bits() -> None:
+def test_status_and_fault_bits_have_the_documented_names() -> None:
     assert [bit.value for bit in ErmanFault] == [1 << at for at in (0, 1, 2, 3, 4, 5, 6, 7, 10, 11)]
     assert [bit.value for bit in Modes] == [1 << 0, 1 << 4, 1 << 8]
     assert ErmanERG220.status.number_format is ErmanERG220.last_fault.number_format is NumberFormat.U32_EITHER
@@ -98,12 +98,12 @@ def test_bits() -> None:
     assert all(register.kept is Kept.UNKNOWN for register in ErmanERG220.registers.values())
 
 
-def test_0001h_is_read_and_never_written() -> None:
+def test_register_0001h_is_read_and_never_written() -> None:
     assert ErmanERG220.control_register.readable
     assert not ErmanERG220.control_register.writable
 
 
-def test_start_clears_both_stops_and_leaves_the_setpoint_alone() -> None:
+def test_start_clears_both_stop_coils_and_writes_no_setpoint() -> None:
     wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
     wire.drive.start()
     assert wire.sent == [STOP_OFF, frame(wire.drive, ErmanERG220.emergency_stop_coil, Coil.OFF), START_ON]
@@ -140,7 +140,7 @@ def test_fault_must_be_acknowledged_explicitly(fault: ErmanFault) -> None:
     assert wire.sent == []
 
 
-def test_a_fault_that_its_owner_has_dealt_with() -> None:
+def test_acknowledged_fault_option_allows_a_start() -> None:
     wire = Wire(
         ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS
     )
@@ -162,7 +162,7 @@ def test_stop_sets_stop_and_clears_start_and_waits() -> None:
     assert wire.reads.count("status") == 4  # stopped, but 0.4 Hz at the third
 
 
-def test_stop_ends_in_an_emergency_stop_and_then_in_an_error() -> None:
+def test_stop_escalates_to_emergency_stop_and_then_raises() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING})
     with pytest.raises(Unconfirmed, match="not seen to have stopped"):
         wire.drive.stop()
@@ -198,7 +198,7 @@ def test_start_coil_is_written_off_after_an_unconfirmed_stop() -> None:
         assert wire.sent == [*[stop] * 3, START_OFF]
 
 
-def test_a_drive_that_refuses_its_stop_is_stopped_by_the_emergency_stop() -> None:
+def test_refused_stop_is_followed_by_the_emergency_stop() -> None:
     refusal = DriveException("drive", 3, "")
     for refused, begun in ((STOP_ON, [STOP_ON] * 3), (START_OFF, [STOP_ON, *[START_OFF] * 3])):
         wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
@@ -217,14 +217,14 @@ def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
         wire.drive.stop()
 
 
-def test_start_is_sent_once() -> None:
+def test_start_is_sent_only_once_if_its_reply_is_lost() -> None:
     wire = Wire(ErmanERG220(1), STOPPED, {START_ON: [Unconfirmed("drive", "start", "no reply")]})
     with pytest.raises(Unconfirmed):
         wire.drive.start()
     assert wire.sent.count(START_ON) == 1
 
 
-def test_start_needs_a_setpoint_that_is_still_there() -> None:
+def test_start_is_refused_if_the_setpoint_is_0_or_was_changed() -> None:
     wire = Wire(
         ErmanERG220(1), {**STOPPED, "frequency": 0.0, "maximum_frequency": 50.0, "minimum_frequency": 0.0}
     )
@@ -246,7 +246,7 @@ def test_start_without_effect_is_unconfirmed_and_names_the_setting() -> None:
     assert wire.sent.count(START_ON) == 1
 
 
-def test_emergency_stop() -> None:
+def test_emergency_stop_writes_its_coil_on_and_start_off() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.emergency_stop()
     assert wire.sent == [EMERGENCY_ON, START_OFF]
@@ -255,7 +255,7 @@ def test_emergency_stop() -> None:
         wire.drive.emergency_stop()
 
 
-def test_reset_cannot_start_and_leaves_its_coil_off() -> None:
+def test_reset_clears_start_first_and_leaves_its_own_coil_off() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.reset_fault()
     assert wire.sent == [START_OFF, RESET_ON, RESET_OFF]
@@ -269,7 +269,7 @@ def test_reset_cannot_start_and_leaves_its_coil_off() -> None:
     assert wire.sent == []
 
 
-def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
+def test_setpoint_is_written_to_0002h_within_minimum_and_maximum() -> None:
     wire = Wire(ErmanERG220(1), {"maximum_frequency": 50.0, "minimum_frequency": 5.0})
     wire.drive.set_frequency(28.5)
     assert wire.sent == [FREQUENCY_28_5]
@@ -303,13 +303,15 @@ def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
         ),
     ],
 )
-def test_state(status: int, fault: int, condition: Condition, note: str) -> None:
+def test_state_shows_the_ramp_phase_and_the_last_fault(
+    status: int, fault: int, condition: Condition, note: str
+) -> None:
     says = {"status": ErmanERG220.status.decode(status), "last_fault": ErmanERG220.last_fault.decode(fault)}
     state = Wire(ErmanERG220(1), says).drive.state()
     assert (state.condition, state.note, state.fault) == (condition, note, None)
 
 
-def test_a_last_fault_of_unnamed_bits_is_a_fault() -> None:
+def test_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
     """Bits 8, 9 and 12 to 31 are reserved (section 10, state: 1026-1027)."""
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
     assert "last fault bit 8, bit 12" in wire.drive.state().note
@@ -334,7 +336,7 @@ def test_undocumented_verbs_are_unsupported(name: str) -> None:
     assert wire.sent == []
 
 
-def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
+def test_coils_are_read_within_one_byte_and_only_on_request(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The order of two bytes would be doubtful (section 6, the example of function 01)."""
@@ -358,7 +360,7 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
             drive.write(register, Coil.ON)
 
 
-def test_diagnostics_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_printed_diagnostics_can_be_sent_raw(monkeypatch: pytest.MonkeyPatch) -> None:
     """Function 08 by raw (section 8), its error reply as printed and as it should be."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     assert drive.send_raw(0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"

@@ -475,7 +475,9 @@ class Mine(InvtCHE):
 
 
 @pytest.mark.parametrize("hazard", HAZARDS, ids=lambda each: each.place)
-def test_only_the_safe_frames_are_sent(monkeypatch: pytest.MonkeyPatch, hazard: Hazard) -> None:
+def test_action_sends_only_the_safe_frames_or_is_refused(
+    monkeypatch: pytest.MonkeyPatch, hazard: Hazard
+) -> None:
     line, drive, sim = one(monkeypatch, hazard.drive())
     for name, value in hazard.shows.items():
         sim[name] = value
@@ -497,7 +499,7 @@ def body(frame: str) -> str:
     return frame[:-2] if frame.startswith(":") else frame[:-6]
 
 
-def test_y2_the_low_byte_of_the_checksum_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_y2_low_byte_of_the_checksum_is_sent_first(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     run(line, drive, sim)
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
@@ -510,7 +512,7 @@ def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
     return parse_reply(Framing.RTU, bytes.fromhex(frame), request)
 
 
-def test_e1_the_checksum_is_computed_and_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_e1_checksum_is_computed_not_copied_from_the_example(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
     assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
@@ -530,7 +532,7 @@ def test_e12_bad_address_is_not_a_device_failure(code: int) -> None:
     assert "fail" not in ErmanERG220(1).exception(code)
 
 
-def test_e9_e10_the_state_is_one_number_in_either_word() -> None:
+def test_e9_e10_state_is_decoded_from_either_word() -> None:
     assert ErmanERG220.status.number_format is NumberFormat.U32_EITHER
     assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
@@ -543,7 +545,7 @@ def test_e13_e16_diagnostics_and_unknown_addresses_are_not_used() -> None:
     )
 
 
-def test_i4_a_fault_frame_for_a_damaged_request_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_i4_request_refused_as_damaged_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
     line.answers = lambda request: damaged if len(line.frames) == 1 else None
@@ -551,7 +553,7 @@ def test_i4_a_fault_frame_for_a_damaged_request_is_asked_again(monkeypatch: pyte
     assert len(line.frames) == 2
 
 
-def test_i2_e_identity_of_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_i2_e_identify_refuses_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) -> None:
     """Function 04 does not exist on them; its exception is an identity that is refused."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
@@ -561,23 +563,23 @@ def test_i2_e_identity_of_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) 
     assert line.written == []
 
 
-def test_e7_a_byte_count_of_coils_is_rounded_up() -> None:
+def test_e7_byte_count_of_coils_is_rounded_up() -> None:
     request = Message(1, 1, 0, 12)
     assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0  # as printed: 12 coils in 2 bytes
     assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0  # as 12 / 8 would be
 
 
-def test_e8_the_state_s_reserved_registers_are_no_readings() -> None:
+def test_e8_reserved_state_registers_are_not_readings() -> None:
     state = {register.address for register in ErmanERG220.registers.values() if register.table.read == 4}
     assert not state & set(range(0x0007, 0x000C))
 
 
-def test_e14_08_has_a_subfunction_of_two_bytes() -> None:
+def test_e14_function_08_has_a_subfunction_of_two_bytes() -> None:
     printed = "01 08 00 00 A5 37 DA 8D"
     assert build_request(Framing.RTU, Message(1, 8, 0x0000, data=b"\xa5\x37")).hex(" ").upper() == printed
 
 
-def test_i3_parity_and_stop_bits_are_the_user_s_to_say() -> None:
+def test_i3_user_can_choose_parity_and_stop_bits() -> None:
     assert {"8N1", "8N2", "8E1", "8E2"} <= set(InvtCHE.formats[Framing.RTU])
     assert InvtCHE(1, format="8E2").settings.format == "8E2"
 
@@ -586,7 +588,7 @@ def test_i6_unexplained_example_cannot_be_sent() -> None:
     assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
-def test_n3_n6_at_most_four_registers_of_an_ibd(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_n3_n6_at_most_four_ibd_registers_are_read_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     drive.read_many([register for register in drive.registers.values() if register.readable])
     assert max(request.count for request, _ in line.frames) <= 4
@@ -599,7 +601,9 @@ def test_n9_ibd_without_programmed_outputs_is_never_reported_stopped(monkeypatch
     assert drive.state().condition is Condition.UNKNOWN
 
 
-def test_d2_d15_running_is_running_and_a_changed_echo_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_d2_d15_states_2_and_3_are_running_and_a_changed_copy_is_rejected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     _, drive, sim = one(monkeypatch, DelixiNative(1))
     sim["status"] = DelixiNativeStatus.FORWARD
     assert drive.state().condition is Condition.RUNNING
@@ -609,7 +613,7 @@ def test_d2_d15_running_is_running_and_a_changed_echo_is_rejected(monkeypatch: p
     assert parse_reply(Framing.DELIXI, swapped, request)[0] < 0
 
 
-def test_d1_d3_d6_d9_misprints_about_the_line() -> None:
+def test_d1_d3_d6_d9_line_settings_correct_the_misprints() -> None:
     assert 4800 in DelixiModbus.baudrates
     assert 3800 not in DelixiModbus.baudrates
     assert DelixiModbus.formats[Framing.ASCII][0] == "7N2"
@@ -618,13 +622,13 @@ def test_d1_d3_d6_d9_misprints_about_the_line() -> None:
     assert DelixiModbus.response_timeout >= 0.08
 
 
-def test_d8_04_is_ou_which_the_standard_section_lost() -> None:
+def test_d8_fault_04_is_ou() -> None:
     (ou,) = {drive.fault.decode(4) for drive in (DelixiModbus, DelixiNative)}
     assert ou.name == "OU_OVERVOLTAGE"
 
 
 @pytest.mark.parametrize("code", [1, 2, 0x42])
-def test_d13_y15_any_exception_is_a_refusal(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+def test_d13_y15_any_exception_code_is_a_refusal(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     for make in (delixi, yd):
         line, drive, _ = one(monkeypatch, make())
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
@@ -634,27 +638,27 @@ def test_d13_y15_any_exception_is_a_refusal(monkeypatch: pytest.MonkeyPatch, cod
         assert told.value.code == code
 
 
-def test_d7_the_faults_10_to_14_in_both_spellings() -> None:
+def test_d7_faults_10_to_14_are_decoded_in_decimal_and_hex() -> None:
     assert [DelixiNative.fault.decode(0x0A + at) for at in range(5)] == [
         DelixiNative.fault.decode(0x10 + at) for at in range(5)
     ]
 
 
-def test_y5_y6_only_two_functions_and_no_address_0() -> None:
+def test_y5_y6_only_functions_03_and_06_and_no_address_0() -> None:
     assert {(register.table.read, register.table.write) for register in YD1000.registers.values()} == {(3, 6)}
     assert YD1000.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="1 to 63"):
         YD1000(0)
 
 
-def test_y3_y4_frames_have_the_lengths_that_their_fields_make() -> None:
+def test_y3_y4_frame_lengths_follow_from_their_fields() -> None:
     assert len(build_request(Framing.RTU, Message(1, 6, 0x1001, data=b"\x1f\x40"))) == 8
     request = Message(1, 3, 0x1100, 1)
     used, reply = reply_to(request, checksums.rtu("01 03 02 13 88").hex())
     assert (used, reply and reply.data) == (7, b"\x13\x88")
 
 
-def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_y8_frozen_state_is_not_reported_as_running(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     run(line, drive, sim)
     line.sleep(2)
@@ -666,7 +670,7 @@ def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPa
     drive.stop()
 
 
-def test_y12_what_the_watchdog_does_is_read_for_no_factory_setting_is_stated(
+def test_y12_watchdog_setting_is_readable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
@@ -677,7 +681,7 @@ def test_y12_what_the_watchdog_does_is_read_for_no_factory_setting_is_stated(
     assert drive.communication_timeout.default is None
 
 
-def test_0_8_eeprom_registers_are_declared() -> None:
+def test_0_8_registers_kept_in_eeprom_are_declared_so() -> None:
     for register in YD1000.registers.values():
         in_ram = 0x1000 <= register.address <= 0x12FF
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
@@ -686,7 +690,7 @@ def test_0_8_eeprom_registers_are_declared() -> None:
 # ---- an echo, and another family ----
 
 
-def test_0_3_adapter_echo_is_not_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_0_3_adapter_echo_is_not_accepted_as_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only copies of requests arrive: no write is sent, because no read is answered."""
     line = SimulatedBus(monkeypatch)
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
@@ -711,7 +715,7 @@ OF_PRINT_ALONE = {
 }
 
 
-def test_every_erratum_has_its_row_or_a_reason_for_none() -> None:
+def test_every_erratum_has_a_test_or_a_reason_for_having_none() -> None:
     told = [hazard.place for hazard in HAZARDS] + [
         name.upper() for name in globals() if name.startswith("test_")
     ]

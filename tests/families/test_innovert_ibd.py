@@ -70,7 +70,7 @@ TABLE = """
 """
 
 
-def test_the_registers_are_those_of_appendix_2() -> None:
+def test_registers_equal_the_typed_table_of_appendix_2() -> None:
     assert rows(InnovertIBD) == typed(TABLE)
 
 
@@ -78,11 +78,11 @@ def test_the_registers_are_those_of_appendix_2() -> None:
     ("name", "address"),
     [("PrA.03", 3), ("PrA.04", 4), ("Prb.00", 0x64), ("Prb.01", 0x65), ("Prb.07", 0x6B), ("Prb.08", 0x6C)],
 )
-def test_a_parameter_has_its_letter_and_number_as_address(name: str, address: int) -> None:
+def test_parameter_address_follows_from_its_letter_and_number(name: str, address: int) -> None:
     assert parameter(name) == address
 
 
-def test_the_line_and_its_limits() -> None:
+def test_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert str(InnovertIBD(240).settings) == "9600 8N1"
     assert sorted(InnovertIBD.baudrates) == [4800, 9600, 19200, 38400]
     assert InnovertIBD.formats == dict.fromkeys((Framing.RTU, Framing.ASCII), ("8N1", "8E1", "8O1"))
@@ -92,18 +92,18 @@ def test_the_line_and_its_limits() -> None:
     assert InnovertIBD(1).exception(2) == "a code that the document does not explain"
 
 
-def test_words_never_have_the_toggle_or_reserved_bits() -> None:
+def test_control_words_never_have_the_toggle_or_reserved_bits() -> None:
     assert {each.value for each in IBDControl} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
 
 
-def test_terminals() -> None:
+def test_terminal_bits_have_the_documented_names() -> None:
     assert [bit.value for bit in Terminals] == [1 << at for at in (*range(11), 13)]
     printed = InnovertIBD.terminals.decode(0x1800)  # in the example; bits 11 and 12 have no name
     assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
 
 
 @pytest.mark.parametrize("framing", InnovertIBD.framings)
-def test_printed_commands(framing: Framing) -> None:
+def test_each_verb_sends_the_printed_frame(framing: Framing) -> None:
     wire = Wire(InnovertIBD(1, framing=framing), {**STANDING, "terminals": Terminals(0)}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -111,7 +111,7 @@ def test_printed_commands(framing: Framing) -> None:
     assert wire.sent == [FIFTY[framing], RUN[framing], STOP[framing]]
 
 
-def test_reset_and_zero() -> None:
+def test_reset_and_a_setpoint_of_0_send_the_documented_frames() -> None:
     wire = Wire(InnovertIBD(1), STANDING)
     wire.drive.reset_fault()
     wire.drive.set_frequency(0)
@@ -134,7 +134,7 @@ def test_stop_is_sent_before_the_fault_reset() -> None:
 
 
 @pytest.mark.parametrize("direction", Direction)
-def test_a_direction_is_refused(direction: Direction) -> None:
+def test_direction_without_forward_bit_is_refused(direction: Direction) -> None:
     wire = Wire(InnovertIBD(1))
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(WriteForbidden, match="ambiguous"):
@@ -143,7 +143,7 @@ def test_a_direction_is_refused(direction: Direction) -> None:
 
 
 @pytest.mark.parametrize(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
-def test_a_direction_that_was_tried_on_site(forward_bit: int, forward: str, reverse: str) -> None:
+def test_forward_bit_option_selects_the_direction_word(forward_bit: int, forward: str, reverse: str) -> None:
     says = {**STANDING, "terminals": Terminals(0)}
     drive = InnovertIBD(1, forward_bit=forward_bit)
     words = [frame(drive, drive.control, IBDControl(int(each, 16))) for each in (forward, reverse, "02")]
@@ -158,7 +158,7 @@ def test_a_direction_that_was_tried_on_site(forward_bit: int, forward: str, reve
 JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # table 3, bits 1 and 0
 
 
-def test_jog() -> None:
+def test_jog_sends_the_word_of_table_3() -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0)}, turns={JOG: {"output_current": 0.4}})
     wire.drive.jog()
     assert wire.sent == [JOG]
@@ -169,7 +169,7 @@ def test_jog() -> None:
     [{"motor_speed": 120.0}, {"output_current": 0.4}, {**PROGRAMMED, "terminals": Terminals.M01}],
     ids=["speed", "current", "outputs"],
 )
-def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[str, object]) -> None:
+def test_start_and_jog_of_a_turning_motor_are_refused(turning: dict[str, object]) -> None:
     """A jog is left by a stop and a new start (table 3)."""
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **turning})
     wire.drive.set_frequency(50)
@@ -181,7 +181,7 @@ def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[
     assert wire.sent == [FIFTY[Framing.RTU]]
 
 
-def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_after_jog_and_stop_runs_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InnovertIBD(1))
     drive.jog()
     drive.set_frequency(50)
@@ -202,14 +202,14 @@ def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch)
         ({}, "set_frequency"),
     ],
 )
-def test_start_is_refused(says: dict[str, object], sentence: str) -> None:
+def test_start_is_refused_without_its_conditions(says: dict[str, object], sentence: str) -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
+def test_identify_requires_its_own_address_or_the_confirmed_option() -> None:
     says = {"baudrate_setting": IBDBaudrate.B9600, "address_setting": 1}
     Wire(InnovertIBD(1), says).drive.identify()
     for other in (
@@ -271,7 +271,7 @@ def test_stop_is_confirmed_by_programmed_outputs() -> None:
     assert "motor_speed" not in wire.reads
 
 
-def test_the_setpoint_is_limited_by_the_owner() -> None:
+def test_setpoint_is_limited_by_the_maximum_frequency_option() -> None:
     wire = Wire(InnovertIBD(1, maximum_frequency=50))
     with pytest.raises(WriteForbidden, match=r"50\.50 Hz is above maximum_frequency, which is 50 Hz"):
         wire.drive.set_frequency(50.5)
@@ -280,7 +280,7 @@ def test_the_setpoint_is_limited_by_the_owner() -> None:
     assert wire.sent == []
 
 
-def test_the_state_is_unknown_unless_the_outputs_are_programmed() -> None:
+def test_state_is_unknown_unless_the_outputs_are_programmed() -> None:
     refusal = DriveException("drive", 2, "")
     for says in (
         {**PROGRAMMED, "output_m01": 0},
@@ -303,12 +303,12 @@ def test_the_state_is_unknown_unless_the_outputs_are_programmed() -> None:
         (0x3900, Condition.FAULT),
     ],
 )
-def test_state_from_the_outputs(raw: int, condition: Condition) -> None:
+def test_programmed_outputs_decode_to_the_state(raw: int, condition: Condition) -> None:
     says = {"terminals": InnovertIBD.terminals.decode(raw), **PROGRAMMED}
     assert Wire(InnovertIBD(1), says).drive.state().condition is condition
 
 
-def test_registers_that_are_never_written() -> None:
+def test_registers_never_written_are_inferred_or_select_the_source() -> None:
     never = {name for name, each in InnovertIBD.registers.items() if each.never}
     inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
     assert inferred <= never

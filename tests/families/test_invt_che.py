@@ -78,14 +78,14 @@ TABLE = """
 """
 
 
-def test_the_registers_are_those_of_the_che100() -> None:
+def test_registers_equal_the_typed_table_of_the_che100() -> None:
     assert rows(InvtCHE) == typed(TABLE)
     assert all(register.outside for register in InvtCHE.registers.values())
     signed = {name for name, each in InvtCHE.registers.items() if each.number_format is NumberFormat.I16}
     assert signed == {"setpoint", "output_power", "output_torque"}
 
 
-def test_scales_of_which_sources_differ_are_open() -> None:
+def test_scales_on_which_sources_differ_are_not_stated() -> None:
     """3006H: 0.01 kW on a CHF100A, by its owner's log of 26 rows; 0.1 % in the Goodrive300L manual."""
     for register, raw in ((InvtCHE.output_power, 262), (InvtCHE.dc_bus_voltage, 5370)):
         assert register.value_unit == "raw count"
@@ -93,7 +93,7 @@ def test_scales_of_which_sources_differ_are_open() -> None:
         assert "CHF100A" in register.note
 
 
-def test_numbers() -> None:
+def test_control_and_status_numbers_have_the_documented_names() -> None:
     assert [(each.value, each.name) for each in CHEControl] == [
         (1, "FORWARD"),
         (2, "REVERSE"),
@@ -110,7 +110,7 @@ def test_numbers() -> None:
     assert CHEFault(10) is CHEFault.UV_UNDERVOLTAGE
 
 
-def test_the_line_and_its_limits() -> None:
+def test_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert str(InvtCHE(247).settings) == "9600 8N1"
     assert InvtCHE.most_registers == {HOLDING: 16}
     assert set(InvtCHE.exceptions) == {1, 2, 3, 6, 0x10, 0x11, 0x12, 0x13}
@@ -118,7 +118,7 @@ def test_the_line_and_its_limits() -> None:
     assert "PC.05" in InvtCHE.watchdog
 
 
-def test_start() -> None:
+def test_start_sends_the_word_of_its_direction() -> None:
     wire = Wire(InvtCHE(1), STANDBY, turns=TURNS)
     wire.drive.start(Direction.FORWARD)
     wire.drive.start()
@@ -127,7 +127,7 @@ def test_start() -> None:
     assert wire.sent[2].startswith("01 06 10 00 00 02")
 
 
-def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     wire = Wire(InvtCHE(1), {"status": CHEStatus.REVERSE, "setpoint": 40.0})
     wire.drive.start()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 00 02"]
@@ -142,7 +142,9 @@ def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None
     ],
 )
 @pytest.mark.parametrize("direction", [None, *Direction])
-def test_a_motor_that_may_turn_is_not_jogged(status: int, sentence: str, direction: Direction | None) -> None:
+def test_jog_is_refused_if_the_motor_may_turn(
+    status: int, sentence: str, direction: Direction | None
+) -> None:
     wire = Wire(InvtCHE(1), {**STANDBY, "status": status})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.jog(direction)
@@ -150,7 +152,7 @@ def test_a_motor_that_may_turn_is_not_jogged(status: int, sentence: str, directi
 
 
 @pytest.mark.parametrize("direction", [None, *Direction])
-def test_a_state_that_is_not_explained_is_not_started_from(direction: Direction | None) -> None:
+def test_start_is_refused_in_an_undocumented_state(direction: Direction | None) -> None:
     """The manual has 1 to 4 at 1001H: 5 may be anything, and the motor may turn the other way."""
     wire = Wire(InvtCHE(1), {**STANDBY, "status": 5})
     with pytest.raises(WriteForbidden, match="has 0005H at 1001H, which is not explained"):
@@ -165,7 +167,7 @@ def test_stop_waits_for_standby() -> None:
     assert wire.reads == ["status"] * 3
 
 
-def test_a_jog_that_goes_on_through_the_stop_is_stopped_at_once() -> None:
+def test_stop_jog_follows_immediately_if_a_jog_continues() -> None:
     """For any caller: neither only after `stop_time`, nor only if more time is given."""
     wire = Wire(
         InvtCHE(1),
@@ -181,7 +183,7 @@ def test_a_jog_that_goes_on_through_the_stop_is_stopped_at_once() -> None:
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_stop_is_unconfirmed_while_the_motor_coasts() -> None:
+def test_coast_is_unconfirmed_while_the_motor_turns() -> None:
     wire = Wire(InvtCHE(1, stop_time=20), {"status": CHEStatus.FORWARD})
     with pytest.raises(Unconfirmed, match="20 s"):
         wire.drive.coast()
@@ -250,7 +252,7 @@ def test_stop_refused_at_rest_counts_as_stopped() -> None:
     assert wire.reads == ["status"] * 2
 
 
-def test_coast_and_reset() -> None:
+def test_coast_and_reset_send_the_documented_words() -> None:
     wire = Wire(InvtCHE(1), STANDBY)
     wire.drive.coast()
     wire.drive.reset_fault()
@@ -261,7 +263,7 @@ def test_coast_and_reset() -> None:
     assert wire.sent == [RESET]
 
 
-def test_a_fault_is_reset_before_a_start_and_not_by_it() -> None:
+def test_start_in_a_fault_is_refused_until_a_reset() -> None:
     says = {**STANDBY, "status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
     wire = Wire(InvtCHE(1), says, turns=TURNS)
     for verb in (wire.drive.start, wire.drive.jog):
@@ -288,7 +290,7 @@ def test_trip_during_start_is_reported(name: str, word: CHEControl) -> None:
     assert wire.sent == [sent]
 
 
-def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
+def test_setpoint_is_written_in_percent_of_the_maximum_frequency() -> None:
     wire = Wire(InvtCHE(1, maximum_frequency=80))
     wire.drive.set_frequency(40)
     wire.drive.set_frequency(0)
@@ -305,7 +307,7 @@ def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
 
 
 @table(("most", "hz", "count"), [(50, 20.03, 4006), (30, 10, 3333), (60, 40, 6667), (60, 60, 10000)])
-def test_the_setpoint_is_the_nearest_hundredth_of_a_percent(
+def test_setpoint_is_rounded_to_a_hundredth_of_a_percent(
     monkeypatch: pytest.MonkeyPatch, most: float, hz: float, count: int
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=most))
@@ -314,7 +316,7 @@ def test_the_setpoint_is_the_nearest_hundredth_of_a_percent(
     assert int(written[12:17].replace(" ", ""), 16) == count
 
 
-def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
+def test_negative_setpoint_is_refused() -> None:
     with pytest.raises(ValueError, match="0 to 100 %"):
         InvtCHE.setpoint.encode(-1)
 
@@ -334,7 +336,7 @@ def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
         ({"status": 9}, State(Condition.UNKNOWN, note="1001H = 9 is not explained")),
     ],
 )
-def test_state(says: dict[str, object], state: State) -> None:
+def test_status_word_decodes_to_the_state(says: dict[str, object], state: State) -> None:
     assert Wire(InvtCHE(1), says).drive.state() == state
 
 
@@ -345,7 +347,7 @@ def test_identify_refuses_other_makes() -> None:
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(0x010A)}).drive.identify()
 
 
-def test_a_parameter_of_ones_own_is_written_to_ram() -> None:
+def test_users_parameter_is_written_to_its_ram_alias() -> None:
     class Mine(InvtCHE):
         """A CHE whose owner has its manual."""
 
@@ -362,7 +364,9 @@ def test_a_parameter_of_ones_own_is_written_to_ram() -> None:
             parameter(wrong)
 
 
-def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_stored_parameter_is_written_to_eeprom_and_counted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Written to EEPROM, and counted; 11.6.2 has the frame, with an unexplained value."""
 
     class Mine(InvtCHE):
@@ -385,7 +389,7 @@ def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, 
     assert sim.counters.eeprom_writes == {"jump": 1}
 
 
-def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
+def test_start_after_a_jog_requires_a_stop() -> None:
     jog = checksums.rtu("01 06 10 00 00 03").hex(" ").upper()
     wire = Wire(
         InvtCHE(1),

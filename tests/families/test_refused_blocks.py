@@ -52,7 +52,9 @@ def values(rows: list[Row]) -> set[str]:
     "name, refusal, lost",
     [("yaskawa-a1000", more_than_four, set()), ("delta-cp2000", at_210b, {"output_torque"})],
 )
-def test_a_refusal_costs_no_other_value(name: str, refusal: Callable[[Message], int], lost: set[str]) -> None:
+def test_refused_read_costs_no_other_value(
+    name: str, refusal: Callable[[Message], int], lost: set[str]
+) -> None:
     drive = shipped(name, 1)
     choosy = Choosy(drive, refusal)
     readings = drive.readings()

@@ -199,7 +199,7 @@ class Responder:
 
 
 @table("name", SHEETS)
-def test_start_stop_reset_and_readings(name: str) -> None:
+def test_start_stop_and_reset_send_the_documented_words_and_readings_match(name: str) -> None:
     sheet, drive = SHEETS[name], shipped(name, 1)
     there: Any = Responder(drive, sheet)
     with pytest.MonkeyPatch.context() as monkeypatch:

@@ -98,7 +98,7 @@ def test_no_command_is_sent_to_another_make(
 @pytest.mark.parametrize("turns", [False, True], ids=["at rest", "turning"])
 @pytest.mark.parametrize("declared", DECLARED)
 @table("there", THERE)
-def test_stop_never_runs_another_make_and_is_never_reported_done_while_it_turns(
+def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
     monkeypatch: pytest.MonkeyPatch, declared: str, turns: bool, there: str
 ) -> None:
     if declared == there or same_words(declared, there):
@@ -129,7 +129,7 @@ def test_stop_never_runs_another_make_and_is_never_reported_done_while_it_turns(
 
 
 @table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
-def test_documents_list_the_stops_that_are_withheld(declared: str, there: str) -> None:
+def test_documentation_lists_the_withheld_stops(declared: str, there: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "profiles.md").read_text("utf-8")
     rows = [row.split("|") for row in page.splitlines() if re.search(r"\| 000[16]H \|", row)]
     assert any(f"`{declared}`" in row[1] and f"`{there}`" in row[3] for row in rows)
@@ -156,7 +156,7 @@ def replace_data(request: Any, value: int) -> Any:
     return type(request)(request.address, request.function, data=value.to_bytes(2))
 
 
-def test_a_confirmed_ibd_does_not_run_a_goodrive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_confirmed_ibd_family_does_not_run_a_goodrive(monkeypatch: pytest.MonkeyPatch) -> None:
     """As after a drive was replaced: its owner has confirmed the former one."""
     sim: Any = simulated(shipped("invt-goodrive", 1))
     bus = SimulatedBus(monkeypatch, sim)
@@ -169,7 +169,7 @@ def test_a_confirmed_ibd_does_not_run_a_goodrive(monkeypatch: pytest.MonkeyPatch
     assert not sim.motor.energised
 
 
-def test_a_goodrive_stops_a_delta_but_does_not_coast_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_goodrive_family_stops_a_delta_and_sends_it_no_coast(monkeypatch: pytest.MonkeyPatch) -> None:
     """0005H stops both; 0006H, which coasts a Goodrive, would run a Delta."""
     pair = Pair(monkeypatch, "invt-goodrive", "delta-vfd-el", turns=True)
     with pytest.raises(WriteForbidden, match="multidrop stop PORT delta-vfd-el 1"):
@@ -180,7 +180,7 @@ def test_a_goodrive_stops_a_delta_but_does_not_coast_it(monkeypatch: pytest.Monk
     assert pair.bus.written != []
 
 
-def test_a_chf100a_declared_as_a_che_is_told_its_model_and_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chf100a_declared_as_a_che_is_stopped_and_its_model_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = Pair(monkeypatch, "invt-che", "invt-chf100a", turns=True)
     with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
         pair.drive.start()
@@ -189,7 +189,7 @@ def test_a_chf100a_declared_as_a_che_is_told_its_model_and_stopped(monkeypatch: 
     assert not pair.turns
 
 
-def test_an_optidrive_on_an_erman_reports_that_it_cannot_know(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optidrive_family_at_an_erman_reports_an_unknown_state(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = Pair(monkeypatch, "optidrive-e3", "erman-er-g-220", turns=True)
     with pytest.raises(Unconfirmed, match=r"all read 0, as unused registers .*: look at the motor"):
         pair.drive.stop()
@@ -211,7 +211,7 @@ def ask(sim: Any, drive: Drive, request: Message) -> Message:
 
 
 @table("there", [*RECOGNISABLE, "invt-che", "yd1000", "delixi-modbus"])
-def test_scan_recognises_the_drives_that_identify_themselves(there: str) -> None:
+def test_scan_finds_the_drives_that_identify_themselves(there: str) -> None:
     drive = THERE[there](1)
     sweep = Sweep(drive.settings, drive.framing, (), ScanRequest(3, 0, 1), (1,), 0.0, 0.0)
     found, doubt = identify(sweep, 1, SCANNED, partial(ask, simulated(drive)))

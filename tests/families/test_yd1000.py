@@ -120,20 +120,20 @@ def parameters() -> list[tuple[str, ...]]:
     return [tuple(line.split()) for line in PARAMETERS.strip().splitlines()]
 
 
-def test_the_registers_are_those_of_sections_6_and_7() -> None:
+def test_registers_equal_the_typed_tables_of_sections_6_and_7() -> None:
     basic = "\n".join(f"03/06 {' '.join(row[:-2])}" for row in parameters())
     assert rows(YD1000) == typed(basic + OTHERS)
 
 
 @table("row", parameters())
-def test_factory_settings_and_what_may_be_changed_while_running(row: tuple[str, ...]) -> None:
+def test_factory_values_and_locks_while_running_are_those_of_the_notes(row: tuple[str, ...]) -> None:
     register = YD1000.registers[row[1]]
     assert register.default == (None if row[-2] == "X" else float(row[-2]))
     assert register.while_running == (row[-1] == "Y")
     assert register.kept is Kept.EEPROM
 
 
-def test_spans() -> None:
+def test_spans_are_those_of_the_notes() -> None:
     spans = {name: each.span for name, each in YD1000.registers.items() if each.span}
     assert spans["acceleration_time"] == spans["deceleration_time"] == (0.1, 3600)
     assert spans["maximum_frequency"] == (30, 320)
@@ -144,12 +144,12 @@ def test_spans() -> None:
     assert (spans["thermal_protection"], spans["automatic_environment"]) == ((0, 7), (0, 2))
 
 
-def test_ram_and_eeprom() -> None:
+def test_registers_are_declared_as_ram_or_eeprom() -> None:
     ram = {name for name, each in YD1000.registers.items() if each.kept is Kept.RAM}
     assert ram == {"control", "frequency", "panel_frequency"}
 
 
-def test_registers_that_are_never_written() -> None:
+def test_registers_never_written_are_those_of_the_notes() -> None:
     never: dict[str, set[int]] = {}
     for register in YD1000.registers.values():
         never.setdefault(register.never, set()).add(register.address)
@@ -181,7 +181,7 @@ def test_line_parameters_are_read_only() -> None:
     assert YD1000.communication_timeout.span == (0, 100)
 
 
-def test_an_extended_parameter_has_its_name_s_number() -> None:
+def test_extended_parameter_address_follows_from_its_name() -> None:
     """F is put as 0 (section 6.2), as the table itself has it."""
 
     class Mine(YD1000):
@@ -202,7 +202,7 @@ def test_an_extended_parameter_has_its_name_s_number() -> None:
             extended(wrong)
 
 
-def test_bits() -> None:
+def test_control_and_status_bits_have_the_documented_names() -> None:
     assert {bit.name: bit.value.bit_length() - 1 for bit in YD1000Control} == {
         "COMMAND_VALID": 15,
         "FREQUENCY_VALID": 14,
@@ -225,7 +225,7 @@ def test_bits() -> None:
     assert Outputs.OUT1 | Outputs.OUT2 == 3
 
 
-def test_reset_and_run_never_travel_together() -> None:
+def test_no_control_word_has_both_reset_and_run() -> None:
     for turning in (YD1000Control.RUN, YD1000Control.JOG):
         with pytest.raises(ValueError, match=r"RESET.* are never written together"):
             YD1000.control.encode(YD1000Control.COMMAND_VALID | YD1000Control.RESET | turning)
@@ -233,7 +233,7 @@ def test_reset_and_run_never_travel_together() -> None:
         YD1000.control.encode(YD1000Control(0x8010))
 
 
-def test_the_line_and_its_limits() -> None:
+def test_line_settings_and_limits_are_those_of_the_notes() -> None:
     drive = YD1000(63)
     assert str(drive.settings) == "9600 8E1"
     assert drive.needed_silence() == pytest.approx(24 * 11 / 9600)
@@ -258,11 +258,11 @@ def test_the_line_and_its_limits() -> None:
         (YD1000Control(0), "01 06 10 00 00 00 8D 0A"),
     ],
 )
-def test_words_without_bit_14(word: YD1000Control, printed: str) -> None:
+def test_control_words_without_bit_14_are_encoded_as_printed(word: YD1000Control, printed: str) -> None:
     assert frame(YD1000(1), YD1000.control, word) == printed
 
 
-def test_start() -> None:
+def test_start_sends_the_run_word() -> None:
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)
@@ -270,7 +270,7 @@ def test_start() -> None:
     assert wire.sent == [FORWARD, FORWARD, REVERSE]
 
 
-def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     wire = Wire(YD1000(1), {**AT_30_HZ, **TURNS[REVERSE]})
     wire.drive.start()
     assert wire.sent == [REVERSE]
@@ -290,7 +290,7 @@ def yd_word(word: int) -> str:
         ({"second_ramp": 0, "setpoint_by_fnod": 0}, 0xC400, 0xC600),
     ],
 )
-def test_options_of_start(options: dict[str, float], forward: int, reverse: int) -> None:
+def test_start_options_select_the_control_bits(options: dict[str, float], forward: int, reverse: int) -> None:
     words = [yd_word(forward), yd_word(reverse)]
     turns = dict(zip(words, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
     wire = Wire(YD1000(1, **options), AT_30_HZ, turns=turns)
@@ -299,14 +299,14 @@ def test_options_of_start(options: dict[str, float], forward: int, reverse: int)
     assert wire.sent == words
 
 
-def test_a_motor_without_a_setpoint_is_not_started() -> None:
+def test_start_without_a_setpoint_is_refused() -> None:
     wire = Wire(YD1000(1), STANDING | {"frequency": 0.0}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=r"the setpoint of .* is 0: call set_frequency before start"):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_1001h_is_ignored_if_fnod_has_the_setpoint() -> None:
+def test_start_ignores_1001h_with_setpoint_by_fnod() -> None:
     wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
     wire.drive.start()
     assert wire.sent == [yd_word(0x8400)]
@@ -323,7 +323,7 @@ AT_PRESET = {
 
 
 @table(("number", "bits"), [(1, 0x8), (2, 0x4), (3, 0xC), (4, 0x2), (5, 0xA), (6, 0x6), (7, 0xE)])
-def test_a_preset_speed_is_seen_at_rest_before_the_motor_is_started(number: int, bits: int) -> None:
+def test_start_waits_until_1202h_shows_the_preset_speed(number: int, bits: int) -> None:
     select, run = yd_word(0xC000 | bits), yd_word(0xC600 | bits)
     wire = Wire(
         YD1000(1, preset_speed=number),
@@ -344,7 +344,7 @@ def test_a_preset_speed_is_seen_at_rest_before_the_motor_is_started(number: int,
         ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
     ],
 )
-def test_start_is_refused_if_the_preset_speed_is_not_seen(
+def test_start_is_refused_if_1202h_does_not_show_the_preset_speed(
     says: dict[str, object], sent: list[str], sentence: str
 ) -> None:
     wire = Wire(YD1000(1, preset_speed=3), {**AT_PRESET, **says})
@@ -390,7 +390,7 @@ def test_no_other_verb_releases_control() -> None:
     assert all(word & 0xC000 == 0xC000 for word in words)
 
 
-def test_emergency_stop_is_taken_back_when_it_has_worked() -> None:
+def test_emergency_stop_bit_is_cleared_once_it_is_confirmed() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.emergency_stop()
     assert [wire.sent[0][:17], *wire.sent[1:]] == ["01 06 10 00 D0 00", STOP]
@@ -410,7 +410,7 @@ def test_emergency_stop_is_a_pulse_and_sent_once(failure: Exception) -> None:
     assert wire.sent == [pulse, STOP]
 
 
-def test_coast() -> None:
+def test_coast_sends_its_bit_and_waits_for_two_zero_readings() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
@@ -437,7 +437,7 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
     assert turning.sent == []
 
 
-def test_a_start_after_a_reset_is_at_the_setpoint_that_was_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_after_a_reset_requires_a_new_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     """The restart loses it: a start at the drive's own setpoint was not requested."""
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.set_frequency(30)
@@ -474,9 +474,7 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
         ({"always_on_function": 3.0}, "F110"),
     ],
 )
-def test_a_reset_that_a_terminal_could_make_a_start_is_not_sent(
-    says: dict[str, object], terminal: str
-) -> None:
+def test_reset_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
     """Bit 15 goes with a power-on (section 8.1), and may with the restart: then the terminals command."""
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
     with pytest.raises(WriteForbidden, match=f"^{terminal}.* says run, and may start its motor"):
@@ -491,7 +489,7 @@ def test_other_terminals_do_not_block_a_reset(closed: Inputs) -> None:
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_limit_from_outside_the_manual_names_its_source() -> None:
+def test_limit_from_outside_the_notes_names_its_source() -> None:
     """It has 0.5 to FH for UL, and of FH only 30.0 to 320.0."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
@@ -504,7 +502,7 @@ def test_limit_from_outside_the_manual_names_its_source() -> None:
 RELEASE = checksums.rtu("01 06 10 00 00 00").hex(" ").upper()  # section 8.1: bits 15 and 14 off
 
 
-def test_the_command_is_given_back_at_rest_alone() -> None:
+def test_release_control_is_refused_unless_the_motor_is_at_rest() -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS})
     wire.drive.release_control()
     assert wire.sent == [RELEASE]
@@ -523,7 +521,7 @@ def test_the_command_is_given_back_at_rest_alone() -> None:
         ({"always_on_function": 3.0}, "F110"),
     ],
 )
-def test_the_command_is_not_given_to_a_terminal_that_says_run(says: dict[str, object], terminal: str) -> None:
+def test_release_control_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
     with pytest.raises(
         WriteForbidden, match=f"^{terminal}.* says run, .* once the line no longer commands it"
@@ -532,7 +530,7 @@ def test_the_command_is_not_given_to_a_terminal_that_says_run(says: dict[str, ob
     assert wire.sent == []
 
 
-def test_a_motor_that_turns_once_its_command_is_given_back_is_stopped_again() -> None:
+def test_motor_that_turns_after_release_control_is_stopped_again() -> None:
     turns = {RELEASE: {"output_frequency": [0.0, 0.0, 1.5]}}
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, turns=TURNS | turns)
     with pytest.raises(
@@ -543,7 +541,7 @@ def test_a_motor_that_turns_once_its_command_is_given_back_is_stopped_again() ->
 
 
 @pytest.mark.parametrize("is_sent", [True, False])
-def test_the_line_keeps_the_command_if_its_release_is_in_doubt(is_sent: bool) -> None:
+def test_stop_is_written_again_if_release_control_is_unconfirmed(is_sent: bool) -> None:
     lost = Unconfirmed("drive", "control", "no reply") if is_sent else Expired("drive", "control", 1.0)
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, loses={RELEASE: [lost]})
     with pytest.raises(type(lost)):
@@ -555,7 +553,7 @@ def test_the_line_keeps_the_command_if_its_release_is_in_doubt(is_sent: bool) ->
     assert wire.sent == [RELEASE, STOP]
 
 
-def test_the_panel_commands_the_motor_again_once_it_has_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert isinstance(sim, SimulatedYD1000)
     drive.write(drive.panel_frequency, 20.0)
@@ -574,7 +572,7 @@ def test_the_panel_commands_the_motor_again_once_it_has_the_command(monkeypatch:
         one(monkeypatch, DelixiModbus(1))[1].release_control()
 
 
-def test_the_setpoint() -> None:
+def test_setpoint_is_written_to_1001h_up_to_fh() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.set_frequency(80)
     assert wire.sent == [EIGHTY]
@@ -586,7 +584,7 @@ def test_the_setpoint() -> None:
         wire.drive.set_frequency(80)
 
 
-def test_state() -> None:
+def test_state_shows_whether_the_motor_turns_or_a_fault() -> None:
     turning = {"output_frequency": 20.0, "status": YD1000Status.RUN}
     assert Wire(YD1000(1), turning).drive.state() == State(Condition.RUNNING, Direction.FORWARD)
     wire = Wire(YD1000(1), STANDING)
@@ -598,7 +596,7 @@ def test_state() -> None:
     assert wire.drive.state().condition is Condition.STOPPED
 
 
-def test_identify() -> None:
+def test_identify_checks_address_and_maximum_frequency() -> None:
     says = {"address_setting": 5.0, "maximum_frequency": 80.0}
     wire = Wire(YD1000(5), says)
     wire.drive.identify()
@@ -609,7 +607,7 @@ def test_identify() -> None:
         Wire(YD1000(5), {**says, "maximum_frequency": 0.1}).drive.identify()
 
 
-def test_a_motor_with_a_fault_is_not_started() -> None:
+def test_start_in_a_fault_is_refused() -> None:
     wire = Wire(YD1000(1), AT_30_HZ)
     wire.drive.state()
     wire.says["fault_record_1"] = [0x0A]  # since then
@@ -621,7 +619,7 @@ def test_a_motor_with_a_fault_is_not_started() -> None:
     assert wire.sent == []
 
 
-def test_trip_shows_in_the_frozen_registers() -> None:
+def test_trip_is_detected_by_the_frozen_registers() -> None:
     """Section 8.2: 1200H is held while the drive has tripped, and 1100H is not."""
     wire = Wire(YD1000(1), {**STANDING, "held_frequency": 30.0, "fault_record_1": 0x0A})
     assert wire.drive.state() == State(Condition.FAULT, fault="code 0AH")
@@ -648,7 +646,7 @@ def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.Monk
     assert sim.motor.energised
 
 
-def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
+def test_start_after_an_emergency_stop_at_rest_advises_reset_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """No register is frozen then, and the record is new only to an object that read it before."""
@@ -659,7 +657,7 @@ def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
         drive.start()
 
 
-def test_watchdog_is_written_only_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert drive.write(drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
@@ -673,7 +671,7 @@ def test_watchdog_is_written_only_at_rest(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("speed", range(1, 8))
-def test_a_preset_speed_on_a_simulated_drive(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
+def test_simulated_drive_runs_at_the_preset_speed(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
     sim[f"preset_speed_{speed}"] = 12.5
     drive.start()

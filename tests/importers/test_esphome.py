@@ -26,10 +26,13 @@ def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
     ("keys", "expected"),
     [
         ("value_type: U_WORD, bitmask: 0x00F0", {"part": "4-7"}),
-        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # a masked number has no sign there
+        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # ESPHome ignores a masked number's sign
         ("value_type: S_WORD, bitmask: 0xFFFF", {"number_format": "I16"}),
         ("value_type: U_DWORD, bitmask: 0xFFFF", {"number_format": "U32", "part": "0-15"}),
-        ("value_type: U_QWORD, bitmask: 0xFFFF", {"number_format": "U64"}),  # ignored there
+        (
+            "value_type: U_QWORD, bitmask: 0xFFFF",
+            {"number_format": "U64"},
+        ),  # ESPHome ignores a mask of 64 bits
         ("value_type: S_DWORD_R", {"number_format": "I32", "order": "CDAB"}),
         ("offset: 4", {"at": 7}),
         ("byte_offset: 2", {"at": 6}),
@@ -38,7 +41,7 @@ def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
         ("filters: {multiply: 0.5}", {"step": 0.5}),
     ],
 )
-def test_an_entity_is_carried_over(tmp_path: Path, keys: str, expected: dict[str, object]) -> None:
+def test_entity_becomes_a_register(tmp_path: Path, keys: str, expected: dict[str, object]) -> None:
     device = entity(tmp_path, keys)
     assert entries(device)["a"] == {"at": 5} | expected
     assert gaps(device, "a") == []
@@ -58,16 +61,16 @@ def test_an_entity_is_carried_over(tmp_path: Path, keys: str, expected: dict[str
         ("unit_of_measurement: '${unit}'", "its unit is ${unit}"),
     ],
 )
-def test_other_value_changes_are_gaps(tmp_path: Path, keys: str, gap: str) -> None:
+def test_unsupported_changes_of_the_value_are_gaps(tmp_path: Path, keys: str, gap: str) -> None:
     assert gaps(entity(tmp_path, keys), "a") == [gap]
 
 
-def test_a_number_is_divided_by_its_multiply(tmp_path: Path) -> None:
-    """`multiply` multiplies written values there."""
+def test_multiply_of_a_number_entity_becomes_a_divisor(tmp_path: Path) -> None:
+    """ESPHome multiplies written values by `multiply`, so reading divides by it."""
     assert entries(entity(tmp_path, "multiply: 10", "number"))["a"] == {"at": 5, "step": 0.1}
 
 
-def test_a_flag_of_several_bits_is_a_gap_and_one_of_a_single_bit_is_not(tmp_path: Path) -> None:
+def test_binary_sensor_with_several_mask_bits_is_a_gap(tmp_path: Path) -> None:
     one = entity(tmp_path, "bitmask: 0x8", "binary_sensor")
     assert (entries(one)["a"], gaps(one, "a")) == ({"at": 5, "part": "3"}, [])
     several = entity(tmp_path, "bitmask: 0xC", "binary_sensor")
@@ -77,11 +80,11 @@ def test_a_flag_of_several_bits_is_a_gap_and_one_of_a_single_bit_is_not(tmp_path
     )
 
 
-def test_an_inverted_switch_is_a_gap(tmp_path: Path) -> None:
+def test_inverted_switch_is_a_gap(tmp_path: Path) -> None:
     assert "inverted was not carried over" in gaps(entity(tmp_path, "inverted: true", "switch"), "a")
 
 
-def test_a_text_without_its_size_is_a_gap(tmp_path: Path) -> None:
+def test_text_sensor_without_response_size_is_a_gap(tmp_path: Path) -> None:
     device = entity(tmp_path, "register_count: 4", "text_sensor")
     assert entries(device)["a"]["length"] == 4
     assert gaps(device, "a") == ["its response_size is not stated; 8 bytes were assumed"]
@@ -112,11 +115,11 @@ VOLTS, AMPS = ONE.format("modbus_controller_id: fast, ", "volts", 3), ONE.format
 FAST = "  - {id: fast, address: 1, modbus_id: m}\n"
 
 
-def test_an_entity_without_an_id_is_of_the_only_controller(tmp_path: Path) -> None:
+def test_entity_without_a_controller_id_belongs_to_the_only_controller(tmp_path: Path) -> None:
     assert list(entries(only(tmp_path, "node.yaml", node(FAST, VOLTS, AMPS)))) == ["volts", "amps"]
 
 
-def test_controllers_of_one_address_on_one_bus_are_one_device(tmp_path: Path) -> None:
+def test_controllers_with_the_same_bus_and_address_are_one_device(tmp_path: Path) -> None:
     slow = ONE.format("modbus_controller_id: slow, ", "amps", 4)
     controllers = FAST + "  - {id: slow, address: 0x01, modbus_id: m}\n"
     assert list(entries(only(tmp_path, "node.yaml", node(controllers, VOLTS, slow)))) == ["volts", "amps"]
@@ -126,7 +129,7 @@ def test_controllers_of_one_address_on_one_bus_are_one_device(tmp_path: Path) ->
     assert (first.title, second.title) == ("node", "node 2")
 
 
-def test_an_entity_of_one_of_several_controllers_names_it(tmp_path: Path) -> None:
+def test_entity_without_a_controller_id_is_lost_if_there_are_several(tmp_path: Path) -> None:
     controllers = FAST + "  - {id: slow, address: 2, modbus_id: m}\n"
     device = only(tmp_path, "node.yaml", node(controllers, VOLTS, AMPS))
     assert omissions(device) == [
@@ -134,7 +137,7 @@ def test_an_entity_of_one_of_several_controllers_names_it(tmp_path: Path) -> Non
     ]
 
 
-def test_the_bus_of_a_controller_names_its_uart(tmp_path: Path) -> None:
+def test_line_settings_come_from_the_uart_of_the_controllers_bus(tmp_path: Path) -> None:
     text = (
         "uart: [{id: u, baud_rate: 4800, parity: EVEN}, {id: w, baud_rate: 19200, parity: NONE}]\n"
         "modbus: [{id: m, uart_id: w}, {id: n, uart_id: u}]\n"
@@ -142,7 +145,7 @@ def test_the_bus_of_a_controller_names_its_uart(tmp_path: Path) -> None:
     assert str(only(tmp_path, "node.yaml", text + node(FAST, VOLTS)).line) == "19200, 8N1"
 
 
-def test_substitutions_and_packages_in_the_file_are_read(tmp_path: Path) -> None:
+def test_substitutions_and_packages_in_the_file_are_resolved(tmp_path: Path) -> None:
     text = """
 substitutions: { unit_id: 7, volt: 0x10, u: V }
 packages:
@@ -158,9 +161,7 @@ packages:
 
 
 @pytest.mark.parametrize("text", [f"sensor:\n  - {VOLTS}\n", f"- {VOLTS}\n"])
-def test_a_package_without_its_controller_is_read_at_an_unknown_address(
-    run: Run, tmp_path: Path, text: str
-) -> None:
+def test_package_without_its_controller_has_an_unknown_address(run: Run, tmp_path: Path, text: str) -> None:
     device = only(tmp_path, "package.yaml", text)
     assert (device.title, device.address, list(entries(device))) == ("fast", None, ["volts"])
     source, family, plant = (tmp_path / name for name in ("package.yaml", "m.toml", "plant.toml"))
@@ -177,7 +178,7 @@ def test_a_package_without_its_controller_is_read_at_an_unknown_address(
         (node(FAST, VOLTS.replace("address: 3", "id: 3")), "volts: it has no address"),
     ],
 )
-def test_a_refusal_says_why(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_document_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")

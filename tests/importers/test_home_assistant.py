@@ -17,7 +17,7 @@ pytest.importorskip("yaml")
 
 
 def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
-    """Return the device of a hub with one entity, `a` at 5, that has these keys."""
+    """Return the device of a hub with one entity, `a` at address 5, that has these keys."""
     hub = f"modbus:\n  - name: hub\n    {kind}:\n      - {{name: a, slave: 1, address: 5, {keys}}}\n"
     return only(folder, "configuration.yaml", hub)
 
@@ -43,7 +43,7 @@ def test_width_may_be_in_count_or_in_structure(tmp_path: Path, keys: str, number
     assert gaps(device, "a") == []
 
 
-def test_a_width_that_is_not_stated_or_contradicted_is_a_gap(tmp_path: Path) -> None:
+def test_missing_or_contradictory_width_is_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "data_type: float")
     assert entries(device)["a"]["number_format"] == "F16"
     assert "the width of its type float is not stated" in gaps(device, "a")[0]
@@ -52,12 +52,12 @@ def test_a_width_that_is_not_stated_or_contradicted_is_a_gap(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("keys", ["data_type: int, count: 3", "data_type: uint8", "data_type: custom"])
-def test_a_type_without_a_number_format_is_lost_with_its_name(tmp_path: Path, keys: str) -> None:
+def test_entity_of_unsupported_type_is_lost_and_the_error_names_the_type(tmp_path: Path, keys: str) -> None:
     with pytest.raises(ValueError, match=r"a: its type \w+ has no number format"):
         sensor(tmp_path, keys)
 
 
-def test_reverse_order_is_the_order_of_words(tmp_path: Path) -> None:
+def test_reverse_order_swaps_the_words(tmp_path: Path) -> None:
     number = "data_type: float, count: 2"
     assert entries(sensor(tmp_path, f"{number}, reverse_order: true"))["a"]["order"] == "CDAB"
     assert "order" not in entries(sensor(tmp_path, f"{number}, reverse_order: false"))["a"]
@@ -65,18 +65,18 @@ def test_reverse_order_is_the_order_of_words(tmp_path: Path) -> None:
     assert gaps(both, "a") == ["only its count is read: it has both swap byte and reverse_order"]
 
 
-def test_a_nan_value_may_be_hex_without_a_prefix(tmp_path: Path) -> None:
+def test_nan_value_text_is_parsed_as_hex_without_a_prefix(tmp_path: Path) -> None:
     assert entries(sensor(tmp_path, 'nan_value: "7FFF"'))["a"]["invalid"] == 0x7FFF
     assert entries(sensor(tmp_path, 'nan_value: "0x8000"'))["a"]["invalid"] == 0x8000
     assert entries(sensor(tmp_path, "nan_value: 8000"))["a"]["invalid"] == 8000
 
 
-def test_a_clamp_at_0_is_a_gap(tmp_path: Path) -> None:
+def test_min_value_0_and_precision_0_are_gaps(tmp_path: Path) -> None:
     assert gaps(sensor(tmp_path, "min_value: 0"), "a") == ["min_value was not carried over"]
     assert gaps(sensor(tmp_path, "precision: 0"), "a") == ["precision was not carried over"]
 
 
-def test_unit_defined_elsewhere_is_a_gap(tmp_path: Path) -> None:
+def test_unit_given_as_a_secret_is_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "unit_of_measurement: !secret unit")
     assert "unit" not in entries(device)["a"]
     assert gaps(device, "a") == ["its unit is !secret unit"]
@@ -86,7 +86,7 @@ WRITTEN = "it is written there; what a write does is not known here"
 
 
 @pytest.mark.parametrize("plural", ["holdings", "coils"])
-def test_a_switch_written_by_a_multiple_function_is_in_the_same_table(tmp_path: Path, plural: str) -> None:
+def test_write_type_of_a_switch_does_not_change_its_table(tmp_path: Path, plural: str) -> None:
     device = sensor(tmp_path, f"write_type: {plural}", "switches")
     assert entries(device)["a"].get("table", "holding") == plural.rstrip("s")
     assert gaps(device, "a") == [WRITTEN]
@@ -103,7 +103,7 @@ def test_switch_is_read_at_its_verify_address(tmp_path: Path) -> None:
     ]
 
 
-def test_the_registers_of_a_light_that_are_not_read_are_gaps(tmp_path: Path) -> None:
+def test_brightness_and_colour_registers_of_a_light_are_gaps(tmp_path: Path) -> None:
     device = sensor(tmp_path, "brightness_address: 7, color_temp_address: 0", "lights")
     assert gaps(device, "a")[1:] == [
         "brightness_address was not carried over",
@@ -133,7 +133,7 @@ def indented(text: str, by: int) -> str:
         ("modbus:\n  - sensors: {name: volts, slave: 1, address: 1, data_type: float32}\n", "/dev/ttyUSB0"),
     ],
 )
-def test_a_hub_is_found_in_every_layout(tmp_path: Path, text: str, port: str) -> None:
+def test_hub_is_found_in_every_layout(tmp_path: Path, text: str, port: str) -> None:
     device = only(tmp_path, "a.yaml", text)
     assert entries(device)["volts"] == {"at": 1, "number_format": "F32"}
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
@@ -158,7 +158,7 @@ switch:
 """
 
 
-def test_platforms_of_before_2021_are_read(tmp_path: Path) -> None:
+def test_platform_layout_of_before_2021_is_imported(tmp_path: Path) -> None:
     found: dict[str, Any] = {}
     for device in devices(tmp_path, "old.yaml", LEGACY):
         assert (device.address, device.line.port) == (2, "/dev/ttyS0")
@@ -188,13 +188,13 @@ def test_platforms_of_before_2021_are_read(tmp_path: Path) -> None:
         ("- {name: a, address: 1, data_type: string}\n", "a: it has no count"),
     ],
 )
-def test_a_refusal_says_why(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_document_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")
 
 
-# ---- lines ----
+# ---- line settings of hubs ----
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,9 @@ def test_unknown_host_never_becomes_a_serial_port(tmp_path: Path, hub: str, port
 
 
 @pytest.mark.parametrize("unit", [0, 248, 255])
-def test_a_unit_id_of_modbus_tcp_gets_a_family_and_a_plant(run: Run, tmp_path: Path, unit: int) -> None:
+def test_slave_outside_1_to_247_behind_modbus_tcp_gets_a_family_and_a_plant(
+    run: Run, tmp_path: Path, unit: int
+) -> None:
     source, family, plant = (tmp_path / name for name in ("a.yaml", "m.toml", "plant.toml"))
     hub = f"type: tcp, host: 10.0.0.5, sensors: [{{name: a, slave: {unit}, address: 1}}]"
     source.write_text(f"modbus:\n  - {{{hub}}}\n")
@@ -226,7 +228,7 @@ def test_a_unit_id_of_modbus_tcp_gets_a_family_and_a_plant(run: Run, tmp_path: P
         plant_text(read_devices(source)[0], "m.toml")
 
 
-def test_hubs_of_one_name_can_be_chosen(run: Run, tmp_path: Path) -> None:
+def test_hubs_with_the_same_name_can_be_selected(run: Run, tmp_path: Path) -> None:
     source = tmp_path / "a.yaml"
     source.write_text(
         "modbus:\n"

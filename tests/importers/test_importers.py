@@ -1,4 +1,4 @@
-"""Importers: files of each layout, written here, become families that load, with every gap marked."""
+"""Importers: an example file of each layout becomes a family that loads, with every gap marked."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from multidrop.importers.family_writer import declare
 
 
 def loaded(folder: Path, device: ImportedDevice, *names: str) -> dict[str, Register[Any]]:
-    """Return these registers of the family that the file makes."""
+    """Return these registers of the family file written for the device."""
     device.registers = [register for register in device.registers if register.name in names]
     device.texts = []
     path = folder / "imported.toml"
@@ -44,7 +44,7 @@ def loaded(folder: Path, device: ImportedDevice, *names: str) -> dict[str, Regis
     return dict(registers)
 
 
-def test_iobroker(tmp_path: Path) -> None:
+def test_iobroker_table_becomes_a_loadable_family(tmp_path: Path) -> None:
     device = only(tmp_path, "table.tsv", IOBROKER)
     found = entries(device)
     assert found["voltage_l1"] == {
@@ -59,7 +59,7 @@ def test_iobroker(tmp_path: Path) -> None:
     assert (registers["setpoint"].address, registers["setpoint"].step) == (10, 0.5)
 
 
-def test_modpoll(tmp_path: Path) -> None:
+def test_modpoll_table_becomes_loadable_families(tmp_path: Path) -> None:
     device = only(tmp_path, "config.csv", MODPOLL)
     assert (device.title, device.address) == ("meter", 7)
     assert entries(device)["energy"] == {
@@ -72,7 +72,7 @@ def test_modpoll(tmp_path: Path) -> None:
     assert (registers["voltage"].table.name, registers["voltage"].step) == ("input register", 0.1)
 
 
-def test_neuron(tmp_path: Path) -> None:
+def test_neuron_table_becomes_loadable_families(tmp_path: Path) -> None:
     device = only(tmp_path, "tags.csv", NEURON)
     found = entries(device)
     assert device.address == 1
@@ -93,7 +93,7 @@ def test_neuron(tmp_path: Path) -> None:
     assert loaded(tmp_path, device, "volt", "power")["power"].words == 2
 
 
-def test_table_with_own_columns(tmp_path: Path) -> None:
+def test_table_with_other_column_names_becomes_a_loadable_family(tmp_path: Path) -> None:
     device = only(tmp_path, "own.csv", OWN)
     text = family_text(device, "own.csv")
     assert "# gap: speed: whether its address counts from 0 or 1; 0 was assumed" in text
@@ -103,7 +103,7 @@ def test_table_with_own_columns(tmp_path: Path) -> None:
     assert list(loaded(tmp_path, device, "speed", "temp_1", "r_1st")) == ["speed", "temp_1", "r_1st"]
 
 
-def test_telegraf(tmp_path: Path) -> None:
+def test_telegraf_configuration_becomes_loadable_families(tmp_path: Path) -> None:
     meter, other = devices(tmp_path, "telegraf.conf", TELEGRAF)
     assert (meter.address, other.address) == (3, 4)
     assert entries(meter)["long"] == {"at": 16, "number_format": "U64", "order": "CDAB"}
@@ -123,7 +123,7 @@ def test_telegraf(tmp_path: Path) -> None:
     assert (registers["power"].number_format.name, registers["energy"].words) == ("I16", 2)
 
 
-def test_home_assistant(tmp_path: Path) -> None:
+def test_home_assistant_document_becomes_loadable_families(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     device = only(tmp_path, "configuration.yaml", HOME)
     found = entries(device)
@@ -155,7 +155,7 @@ def test_home_assistant(tmp_path: Path) -> None:
     assert loaded(tmp_path, device, "room_temperature", "work", "pump")["pump"].table.name == "coil"
 
 
-def test_sunspec(tmp_path: Path) -> None:
+def test_sunspec_model_becomes_a_loadable_family(tmp_path: Path) -> None:
     device = only(tmp_path, "model_103.json", SUNSPEC)
     found = entries(device)
     assert found["a"]["scale_register"] == "a_sf"
@@ -172,7 +172,7 @@ def test_sunspec(tmp_path: Path) -> None:
 
 
 def test_scale_register_out_of_reach_is_reported_and_left_out(tmp_path: Path) -> None:
-    """One request reads both, and reads 125 registers at most."""
+    """A register and its scale register must fit into one request, which reads at most 125 registers."""
     points = [
         {"name": "A", "type": "int16", "size": 1, "sf": "S"},
         {"name": "gap", "type": "pad", "size": 130},
@@ -186,7 +186,7 @@ def test_scale_register_out_of_reach_is_reported_and_left_out(tmp_path: Path) ->
     assert loaded(tmp_path, device, "a", "s")["a"].address == 40000
 
 
-def test_wb(tmp_path: Path) -> None:
+def test_wb_template_becomes_a_loadable_family(tmp_path: Path) -> None:
     device = only(tmp_path, "config-own.json", WB)
     found = entries(device)
     assert found["voltage"] == {
@@ -204,7 +204,7 @@ def test_wb(tmp_path: Path) -> None:
     assert loaded(tmp_path, device, "voltage", "relay")["voltage"].words == 2
 
 
-def test_esphome(tmp_path: Path) -> None:
+def test_esphome_document_becomes_a_loadable_family(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     device = only(tmp_path, "pump.yaml", ESPHOME)
     found = entries(device)
@@ -231,7 +231,7 @@ def test_esphome(tmp_path: Path) -> None:
 
 
 def bomb(levels: int) -> str:
-    """Return YAML in which each list has the one before it ten times."""
+    """Return YAML in which each list contains the previous list ten times."""
     lists = "".join(
         f"a{at}: &a{at} [{', '.join([f'*a{at - 1}' if at else '1'] * 10)}]\n" for at in range(levels)
     )
@@ -253,17 +253,17 @@ def bomb(levels: int) -> str:
         ("modbus: [}", "is not YAML"),
     ],
 )
-def test_costly_yaml_is_refused(tmp_path: Path, text: str, told: str) -> None:
+def test_costly_or_unsafe_yaml_is_refused(tmp_path: Path, text: str, told: str) -> None:
     pytest.importorskip("yaml")
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(told)):
         read_devices(tmp_path / "a.yaml")
 
 
-def test_at_most_the_registers_of_one_family_are_declared(
+def test_registers_beyond_the_limit_of_a_family_are_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Further entries are not examined: a large file has ten times as many."""
+    """Entries beyond the limit are not checked, because that would be slow for a large file."""
     declared: list[str] = []
 
     def noted(found: ImportedRegister) -> Register[Any]:
@@ -279,7 +279,7 @@ def test_at_most_the_registers_of_one_family_are_declared(
     assert declared[-1] == "r2"
 
 
-# ---- of any file ----
+# ---- all kinds of files ----
 
 
 @pytest.mark.parametrize(
@@ -305,7 +305,7 @@ def test_file_that_is_not_a_table_is_refused(tmp_path: Path, name: str, text: st
         read_devices(path)
 
 
-def test_texts_of_a_file_cannot_leave_their_places(tmp_path: Path) -> None:
+def test_texts_from_a_file_cannot_inject_toml(tmp_path: Path) -> None:
     name = 'a"]\n[command]\nrun = { at = 1 }\n'
     document = {"device": {"channels": [{"name": name, "reg_type": "holding", "address": 1, "units": name}]}}
     device = only(tmp_path, "x.json", document)
@@ -313,7 +313,7 @@ def test_texts_of_a_file_cannot_leave_their_places(tmp_path: Path) -> None:
     assert list(tomllib.loads(family_text(device, "x\n[command]\n"))) == ["family", "reading"]
 
 
-# ---- the line ----
+# ---- line settings ----
 
 HUBS = """
 modbus:
@@ -326,7 +326,7 @@ modbus:
 """
 
 
-def test_the_settings_of_a_line_are_carried_into_the_plant_file(tmp_path: Path) -> None:
+def test_line_settings_are_written_into_the_plant_file(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     north, south, west, east = devices(tmp_path, "configuration.yaml", HUBS)
     assert [list(entries(hub)) for hub in (north, south, west)] == [["volt"], ["amp"], ["watt"]]
@@ -345,7 +345,7 @@ def test_the_settings_of_a_line_are_carried_into_the_plant_file(tmp_path: Path) 
     )
 
 
-def test_the_line_of_telegraf_and_esphome(tmp_path: Path) -> None:
+def test_line_settings_of_telegraf_and_esphome_are_imported(tmp_path: Path) -> None:
     plugin = (
         '[[inputs.modbus]]\nslave_id = 1\ncontroller = "{}"\n{}\n'
         'holding_registers = [{{ name = "a", byte_order = "AB", data_type = "INT16", address = [7] }}]\n'
@@ -374,7 +374,7 @@ def test_invalid_controller_address_is_reported(tmp_path: Path) -> None:
             devices(tmp_path, "t.conf", plugin.format("tcp://hall") + plugin.format(controller))
 
 
-def test_scattered_addresses_are_lost(tmp_path: Path) -> None:
+def test_telegraf_register_with_scattered_addresses_is_lost(tmp_path: Path) -> None:
     field = '{{ name = "{}", byte_order = "ABCD", data_type = "UINT32", address = {} }}'
     listed = ", ".join(
         field.format(*each) for each in (("good", [4, 5]), ("split", [4, 9]), ("one", [4, 5, 6]))
@@ -387,7 +387,7 @@ def test_scattered_addresses_are_lost(tmp_path: Path) -> None:
     ]
 
 
-def test_read_limits_are_carried_over(tmp_path: Path) -> None:
+def test_read_limits_are_imported(tmp_path: Path) -> None:
     template = '{{"device": {{"max_read_registers": {}, "channels": [{}]}}}}'
     channels = ", ".join(
         f'{{"name": "{name}", "address": {at}, "format": "{kind}"}}'
@@ -400,10 +400,10 @@ def test_read_limits_are_carried_over(tmp_path: Path) -> None:
     assert "together =" not in family_text(only(tmp_path, "t.json", template.format(0, channels)), "x")
 
 
-# ---- the command ----
+# ---- the command `multidrop import` ----
 
 
-def test_hubs_with_a_device_of_one_address_each(run: Run, tmp_path: Path) -> None:
+def test_devices_with_the_same_address_on_two_hubs_are_separate(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     source = tmp_path / "configuration.yaml"
     source.write_text(HUBS)
@@ -434,7 +434,7 @@ def test_device_with_only_texts_gets_no_plant_file(run: Run, tmp_path: Path) -> 
     assert not family.exists()
 
 
-def test_import_asks_which_device(run: Run, tmp_path: Path) -> None:
+def test_import_of_several_devices_asks_which_device(run: Run, tmp_path: Path) -> None:
     source = tmp_path / "telegraf.conf"
     source.write_text(TELEGRAF)
     status, _, err = run("import", source)

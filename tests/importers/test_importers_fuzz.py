@@ -1,4 +1,4 @@
-"""Damaged and hostile files of other programs give a family that loads, or one sentence, in bounded time."""
+"""Damaged and hostile files give a family that loads, or a one-sentence error, in bounded time."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ ODD = (
         b"1!",
     ),
 )
-ENOUGH = 20.0  # s of CPU, on a slow machine
+ENOUGH = 20.0  # limit of CPU time in s, generous for a slow machine
 
 
 def damaged(seed: int) -> bytes:
-    """Return one of the files with some of its words replaced, doubled, swapped or left out."""
+    """Return one of the example files with some words replaced, doubled, swapped or removed."""
     draw = random.Random(seed)
     words = TOKENS.findall(draw.choice(ALL))
     for _ in range(draw.randint(1, 6)):
@@ -97,7 +97,7 @@ def test_damaged_file_gives_a_family_or_one_error(tmp_path: Path, seed: int) -> 
     read("import", damaged(seed), tmp_path)
 
 
-# ---- anything that such a file may say ----
+# ---- generated files with random entries ----
 
 
 LARGE = st.sampled_from(
@@ -149,7 +149,7 @@ PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
 
 
 def entries_of(needed: str, keys: str) -> st.SearchStrategy[list[dict[str, Any]]]:
-    """Return lists of entries with the required keys, and some other keys with values or null."""
+    """Return a strategy for lists of entries: the required keys, and other keys with random values or null."""
     value = {key: PLAUSIBLE.get(key, ANYTHING) for key in (*needed.split(), *keys.split())}
     plausible = st.fixed_dictionaries(
         {key: value[key] for key in needed.split()}, optional={key: value[key] for key in keys.split()}
@@ -185,7 +185,7 @@ ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), 
 def test_imported_device_gives_a_family_that_loads(
     tmp_path: Path, channels: Any, points: Any, sensors: Any, entities: Any, rows: Any
 ) -> None:
-    """YAML takes JSON, which has no tags and no aliases."""
+    """The YAML files are written as JSON, which YAML parsers accept."""
     platform = [{"platform": "modbus_controller", **entity} for entity in entities]
     documents = {
         ".json": (
@@ -208,7 +208,7 @@ def test_imported_device_gives_a_family_that_loads(
         read("import", f".csv\n{table}".encode(), tmp_path)
 
 
-# ---- bounds of time and memory ----
+# ---- limits of time and memory ----
 
 
 def csv(rows: str) -> bytes:
@@ -241,7 +241,7 @@ HOSTILE = {
 }
 
 
-COSTLY = (  # up to a second each; the first is always tried
+COSTLY = (  # up to a second each; the first always runs
     "a row of a million cells",
     "aliases",
     *(
@@ -259,7 +259,7 @@ COSTLY = (  # up to a second each; the first is always tried
 @pytest.mark.long
 @pytest.mark.uncounted
 @pytest.mark.parametrize("name", [*(name for name in HOSTILE if name not in COSTLY), *usually(*COSTLY)])
-def test_a_hostile_file_takes_bounded_time(tmp_path: Path, name: str) -> None:
+def test_hostile_file_is_read_or_refused_in_bounded_time(tmp_path: Path, name: str) -> None:
     begin = process_time()
     read("import", HOSTILE[name], tmp_path)
     assert process_time() - begin < ENOUGH
@@ -274,13 +274,13 @@ before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 read("import", Path(sys.argv[1]).read_bytes(), Path(sys.argv[2]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-MOST_MEMORY = 400_000  # KiB for 5 MB at most: a row of a million empty cells takes 150,000
+MOST_MEMORY = 400_000  # KiB, for a file of at most 5 MB; a row of a million empty cells takes 150,000
 
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="getrusage tells memory on POSIX alone")
 @pytest.mark.parametrize("name", usually("aliases", "a row of a million cells", "many entries", "deep lists"))
-def test_a_hostile_file_takes_bounded_memory(tmp_path: Path, name: str) -> None:
+def test_hostile_file_is_read_or_refused_in_bounded_memory(tmp_path: Path, name: str) -> None:
     (tmp_path / "given").write_bytes(HOSTILE[name])
     tests = Path(__file__).parents[1]
     folders = [tests / "fuzz", *(tests / "support").iterdir()]

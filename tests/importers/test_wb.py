@@ -1,4 +1,4 @@
-"""wb-mqtt-serial: subdevices at their shifts, bits, counts that mean no value, texts, and configurations."""
+"""wb-mqtt-serial: shifted subdevices, bits, counts that mean "no value", texts, and configurations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from multidrop.importers import ImportedDevice, read_devices
 
 
 def channel(folder: Path, **keys: Any) -> ImportedDevice:
-    """Return the device of an input register `a` at 5."""
+    """Return the device of a template with one channel: the input register `a` at address 5."""
     given = {"name": "a", "reg_type": "input", "address": 5, **keys}
     return only(folder, "w.json", {"device": {"channels": [given]}})
 
@@ -31,20 +31,20 @@ def places(device: ImportedDevice) -> list[tuple[str, int]]:
     return [(register.name, register.address) for register in device.registers]
 
 
-def test_a_subdevice_is_at_the_shift_of_each_channel_that_uses_it(tmp_path: Path) -> None:
+def test_registers_of_a_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_path: Path) -> None:
     first = {"name": "First", "device_type": "ch", "shift": 256}
     second = {"name": "Second", "device_type": "ch", "shift": "0x200", "stride": 2}
     device = only(tmp_path, "w.json", with_subdevice(first, second))
     assert places(device) == [
         ("first_voltage", 0x110),
         ("first_energy", 0x120),
-        ("second_voltage", 0x210 + 2),  # a stride counts numbers
+        ("second_voltage", 0x210 + 2),  # a stride counts subdevices
         ("second_energy", 0x220 + 4),
     ]
     assert omissions(device) == []
 
 
-def test_subdevices_in_subdevices_add_their_shifts(tmp_path: Path) -> None:
+def test_shifts_of_nested_subdevices_are_added(tmp_path: Path) -> None:
     inner = {"device_type": "in", "device": {"channels": [VOLTAGE]}}
     used = {"name": "Inner", "device_type": "in", "shift": 3}
     document = with_subdevice(
@@ -53,7 +53,7 @@ def test_subdevices_in_subdevices_add_their_shifts(tmp_path: Path) -> None:
     assert places(only(tmp_path, "w.json", document)) == [("outer_inner_voltage", 16 + 103)]
 
 
-def test_a_subdevice_that_contains_itself_ends(tmp_path: Path) -> None:
+def test_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
     again = {"name": "Again", "device_type": "ch", "shift": 1}
     device = only(tmp_path, "w.json", with_subdevice(again, channels=[VOLTAGE, again]))
     assert len(device.registers) == 8
@@ -71,7 +71,7 @@ def test_a_subdevice_that_contains_itself_ends(tmp_path: Path) -> None:
         ({"name": "X", "address": 1}, "subdevice ch: no channel uses it, so its address is not known"),
     ],
 )
-def test_entries_without_a_place_are_lost(tmp_path: Path, used: dict[str, Any], reason: str) -> None:
+def test_subdevices_of_unknown_address_are_lost(tmp_path: Path, used: dict[str, Any], reason: str) -> None:
     document = with_subdevice({"name": "Known", "address": 7}, used)
     device = only(tmp_path, "w.json", document)
     assert ("known", 7) in places(device)
@@ -83,27 +83,32 @@ def test_entries_without_a_place_are_lost(tmp_path: Path, used: dict[str, Any], 
     ("keys", "expected"),
     [
         ({"address": "5:4:2"}, {"part": "4-5"}),
-        ({"address": "5:0"}, {}),  # without a width it has all bits of its format
+        ({"address": "5:0"}, {}),  # no width: all bits of the format
         ({"address": "5:8", "format": "u8"}, {"part": "8-15"}),
-        ({"address": "5:8:4", "format": "s16"}, {"part": "8-11"}),  # a part has no sign there
+        (
+            {"address": "5:8:4", "format": "s16"},
+            {"part": "8-11"},
+        ),  # wb-mqtt-serial ignores the sign of a part
         ({"address": "5:8:16", "format": "s16"}, {"number_format": "I32", "part": "8-23"}),
         ({"format": "s24"}, {"number_format": "I32", "part": "0-23"}),
         ({"format": "u8"}, {"part": "0-7"}),
         ({"format": "s8"}, {"number_format": "I8"}),
     ],
 )
-def test_bits_of_registers(tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]) -> None:
+def test_bits_of_a_register_become_its_part(
+    tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]
+) -> None:
     device = channel(tmp_path, **keys)
     assert entries(device)["a"] == {"at": 5, "table": "input"} | expected
     assert gaps(device, "a") == []
 
 
-def test_bits_of_three_registers_are_a_gap(tmp_path: Path) -> None:
+def test_bits_across_three_registers_are_a_gap(tmp_path: Path) -> None:
     device = channel(tmp_path, address="5:30:4")
     assert gaps(device, "a") == ["only its count is read: its bits 30 to 33 of the format u16"]
 
 
-def test_the_low_byte_of_a_written_register_is_its_low_byte(tmp_path: Path) -> None:
+def test_low_byte_format_of_a_written_register_selects_its_low_byte(tmp_path: Path) -> None:
     assert entries(channel(tmp_path, reg_type="holding", format="u8"))["a"] == {"at": 5, "part": "0-7"}
 
 
@@ -116,7 +121,9 @@ def test_the_low_byte_of_a_written_register_is_its_low_byte(tmp_path: Path) -> N
         ({"format": "s16", "error_value": "0x7FFF", "unsupported_value": "0xFFFE"}, [0x7FFF, 0xFFFE]),
     ],
 )
-def test_an_error_value_is_the_bits_of_its_format(tmp_path: Path, keys: dict[str, Any], invalid: Any) -> None:
+def test_error_value_is_decoded_in_the_registers_format(
+    tmp_path: Path, keys: dict[str, Any], invalid: Any
+) -> None:
     device = channel(tmp_path, **keys)
     assert (entries(device)["a"]["invalid"], gaps(device, "a")) == (invalid, [])
 
@@ -138,22 +145,22 @@ def test_an_error_value_is_the_bits_of_its_format(tmp_path: Path, keys: dict[str
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_keys_not_carried_over_are_gaps(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
+def test_keys_that_are_not_imported_are_gaps(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
-def test_a_text_without_its_size_is_a_gap(tmp_path: Path) -> None:
+def test_text_without_its_size_is_a_gap(tmp_path: Path) -> None:
     assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
 
 
-def test_the_parts_of_a_channel_are_gaps(tmp_path: Path) -> None:
+def test_parts_of_a_composite_channel_are_gaps(tmp_path: Path) -> None:
     parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
     device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})
     assert places(device) == [("a", 5), ("a_2", 7)]
     assert gaps(device, "a") == ["its place in a larger channel was not carried over"]
 
 
-def test_names_of_values_given_as_text_are_carried_over(tmp_path: Path) -> None:
+def test_value_names_with_text_numbers_are_imported(tmp_path: Path) -> None:
     named = channel(tmp_path, enum=["0", "2"], enum_titles=["off", "on"])
     assert entries(named)["a"]["values"] == {"off": 0, "on": 2}
 
@@ -201,7 +208,7 @@ CONFIG = {
 }
 
 
-def test_a_configuration_has_a_device_for_each_slave(tmp_path: Path) -> None:
+def test_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
     meter, relay, net = devices(tmp_path, "wb-mqtt-serial.json", CONFIG)
     assert [(each.title, each.address, each.line.port) for each in (meter, relay, net)] == [
         ("Meter", 10, "/dev/ttyRS485-1"),
@@ -226,12 +233,14 @@ def test_a_configuration_has_a_device_for_each_slave(tmp_path: Path) -> None:
         ({"device": {"channels": [{"address": 1, "word_order": "x"}]}}, "word_order = 'x' is none of"),
     ],
 )
-def test_a_refusal_says_why(tmp_path: Path, document: dict[str, Any], reason: str) -> None:
+def test_invalid_document_raises_value_error_with_the_reason(
+    tmp_path: Path, document: dict[str, Any], reason: str
+) -> None:
     with pytest.raises(ValueError, match=re.escape(reason)):
         only(tmp_path, "w.json", document)
 
 
-def test_the_file_is_named_in_a_refusal(tmp_path: Path) -> None:
+def test_refusal_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "w.json").write_text("{}")
     with pytest.raises(ValueError, match=re.escape(str(tmp_path / "w.json"))):
         read_devices(tmp_path / "w.json")

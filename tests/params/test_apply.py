@@ -1,4 +1,4 @@
-"""Applying parameters: only what differs, only to a motor that stands, and never the line's own."""
+"""Apply parameters: only those that differ, only while the motor is at rest, no communication parameters."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def made(family: type[Drive]) -> Drive:
-    """Return a drive whose run source, if it has one, is the line."""
+    """Return a drive of the family whose run source, if it has one, is the line."""
     return family(1, **({"confirmed": 1} if family.declared_in else {}))
 
 
@@ -83,11 +83,13 @@ def test_saved_parameters_are_restored_after_a_factory_reset(
     assert line.written[sent:] == []
 
 
-# ---- what refuses all ----
+# ---- reasons to write nothing at all ----
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_running_motor_refuses_all(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
+def test_running_motor_makes_apply_raise_and_write_nothing(
+    monkeypatch: pytest.MonkeyPatch, family: type[Drive]
+) -> None:
     line, drive, sim = attached(monkeypatch, made(family), EXTRA[family])
     first = writable(drive, EXTRA[family])[0]
     sim.motor.target = 50.0
@@ -98,7 +100,7 @@ def test_running_motor_refuses_all(monkeypatch: pytest.MonkeyPatch, family: type
     assert line.written == []
 
 
-def test_run_command_at_zero_speed_refuses_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_command_at_zero_speed_makes_apply_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = attached(monkeypatch, YD1000(1), [])
     sim.motor.target = 0.0
     sim.motor.run()
@@ -107,7 +109,7 @@ def test_run_command_at_zero_speed_refuses_all(monkeypatch: pytest.MonkeyPatch) 
     assert line.written == []
 
 
-def test_drive_of_unknown_state_gets_a_stop_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_of_unknown_state_is_sent_a_stop_first(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = attached(monkeypatch, DelixiModbus(1), ["P01.00"])
     params.plan(drive, {"P01.00": 5})
     assert line.written == []
@@ -116,7 +118,7 @@ def test_drive_of_unknown_state_gets_a_stop_first(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
-def test_drive_that_obeys_its_panel_is_not_written(
+def test_drive_that_obeys_its_panel_makes_apply_raise(
     monkeypatch: pytest.MonkeyPatch, family: type[Drive]
 ) -> None:
     line, drive, sim = attached(monkeypatch, family(1), ["P01.00"])
@@ -134,7 +136,7 @@ def test_drive_that_obeys_its_panel_is_not_written(
         ({"0009": 0, "0010": 1}, "values that are not written, and nothing was"),
     ],
 )
-def test_one_mistake_refuses_the_whole_set(
+def test_one_invalid_value_refuses_the_whole_set(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, int], sentence: str
 ) -> None:
     line, drive, _ = attached(monkeypatch, YD1000(1), [])
@@ -143,28 +145,31 @@ def test_one_mistake_refuses_the_whole_set(
     assert line.written == []
 
 
-def test_another_models_parameters_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_of_another_model_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     other = params.ParameterSet("delixi-modbus", {"P01.00": 1}, source="other.toml")
     with pytest.raises(ValueError, match=r"parameters of yd1000, and other\.toml of delixi-modbus"):
         params.apply(drive, other)
 
 
-# ---- what is left out ----
+# ---- parameters that are left out ----
 
 
-def test_parameters_of_the_line_are_written_only_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_communication_parameters_are_written_only_if_named_in_also(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = attached(monkeypatch, YD1000(1), [])
     left = params.apply(drive, {"F803": 30, "F801": 0, "F111": 3}, also=["F801"])
     assert left.plan.left == {"F111": f"{COMMAND} (2 -> 3)"}
-    assert [change.parameter.code for change in left.plan.writes] == ["F803", "F801"]  # the line's last
+    assert [change.parameter.code for change in left.plan.writes] == [
+        "F803",
+        "F801",
+    ]  # communication parameters in the order of the family
     with pytest.raises(ValueError, match="--also F803: it is not the drive's address"):
         params.plan(drive, {"F803": 20}, also=["F803"])
     assert list(params.plan(drive, {"F802": 5}).left) == ["F802"]
     assert sim["communication_timeout"] == 30
 
 
-def test_backup_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_backup_file_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     _, drive, _ = attached(monkeypatch, made(GOODRIVE), ["P00.03", "P14.01", "P00.18"])
     rows = ["0;3;6000", "0;18;1", "14;1;3", "7;13;104", "17;0;5000"]
     text = "\n".join(["GRUPO_PARAMETRO;CODIGO_FUNCAO;VALOR_PARAMETRO", *rows])
@@ -174,7 +179,7 @@ def test_backup_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatch, tm
     assert [*done.plan.left] == ["P00.18", "P14.01"]
 
 
-def test_missing_parameter_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameter_that_the_drive_lacks_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     assert params.plan(drive, {"F240": 5}).left == {"F240": "the drive does not have it"}
 
@@ -186,7 +191,7 @@ def test_missing_parameter_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"0011": 12000, "0012": 10000, "0013": 9000}, ["0011", "0012", "0013"]),
     ],
 )
-def test_parameters_are_written_within_their_limits(
+def test_writes_are_ordered_so_that_each_is_within_its_limits(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, int], order: list[str]
 ) -> None:
     _, drive, sim = attached(monkeypatch, YD1000(1), [])
@@ -202,10 +207,10 @@ def test_value_outside_all_limits_is_left_out(monkeypatch: pytest.MonkeyPatch) -
     assert left == {"0013": "90.00 Hz is outside its limits, which are upper_limit_frequency of yd1000@1"}
 
 
-# ---- the ledger and the journal ----
+# ---- the EEPROM ledger and the journal of writes ----
 
 
-def test_second_write_within_a_minute_needs_commissioning(
+def test_second_write_within_a_minute_is_refused_without_commissioning(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     sim = with_parameters(YD1000(1))
@@ -251,7 +256,7 @@ def test_interrupted_application_is_reported_by_the_next(monkeypatch: pytest.Mon
     assert params.apply(drive, {"0009": 200}).earlier == []
 
 
-def test_motor_that_starts_ends_the_application(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_motor_that_starts_meanwhile_ends_the_application(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = attached(monkeypatch, YD1000(1), [])
 
     def start(number: int, total: int, change: params.ParameterChange, said: str) -> None:
@@ -263,7 +268,7 @@ def test_motor_that_starts_ends_the_application(monkeypatch: pytest.MonkeyPatch)
     assert isinstance(done.failure, WriteForbidden)
 
 
-def test_refused_ramp_time_names_ways_that_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refusal_of_a_ramp_time_suggests_only_existing_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     drive.write("acceleration_time", 20.0)
     with pytest.raises(WriteForbidden, match=r"params\.apply") as refusal:

@@ -1,4 +1,4 @@
-"""Killed applications: another one writes the rest, each parameter is written once, and all are reported."""
+"""If `apply` is killed, the next call writes the rest; no parameter is written twice, all are reported."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ CODES = [f"P0{group}.{index:02}" for group in (1, 2) for index in range(10)]
 
 
 class Lives:
-    """Applies a file again and again, in processes that are killed after some seconds."""
+    """Applies a parameter file repeatedly, in processes that are killed after some seconds."""
 
     def __init__(self, process: subprocess.Popen[str], port: str, file: Path, report: Path) -> None:
         self._process = process
         self._line = f"{port} {file} {report}\n"
 
     def live(self, seconds: float) -> int:
-        """Return the wait status of one life: 0, or SIGKILL after `seconds`."""
+        """Apply the file in a new process; return its wait status: 0, or SIGKILL after `seconds`."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(self._line)

@@ -1,4 +1,4 @@
-"""Parameter files: what is written is read again, and a wrong file gets one sentence."""
+"""Parameter files: saved values load again, and an invalid file raises a one-sentence error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FOUND = params.ParameterSet(
 
 
 @pytest.mark.parametrize("name", ["pump.toml", "pump.csv"])
-def test_written_files_are_read_again(tmp_path: Path, name: str) -> None:
+def test_saved_files_load_with_the_same_values(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     params.save(FOUND, path, YD1000)
     found = params.load(path)
@@ -26,7 +26,7 @@ def test_written_files_are_read_again(tmp_path: Path, name: str) -> None:
     assert params.is_parameter_file(path)
 
 
-def test_files_are_not_replaced(tmp_path: Path) -> None:
+def test_saving_to_an_existing_file_raises(tmp_path: Path) -> None:
     (tmp_path / "pump.toml").write_text("")
     with pytest.raises(ValueError, match="exists already, and is not replaced"):
         params.save(FOUND, tmp_path / "pump.toml")
@@ -35,7 +35,7 @@ def test_files_are_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quote", ["", '"'])
-def test_backups_of_the_gd20_tool_are_read(tmp_path: Path, quote: str) -> None:
+def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) -> None:
     rows = [("CODIGO_FUNCAO", "GRUPO_PARAMETRO", "VALOR_PARAMETRO"), (3, 0, 5000), (12, 14, 3)]
     text = "\r\n".join(";".join(f"{quote}{cell}{quote}" for cell in row) for row in rows)
     (tmp_path / "bkp_result.csv").write_text(text)
@@ -62,7 +62,9 @@ def test_backups_of_the_gd20_tool_are_read(tmp_path: Path, quote: str) -> None:
         ("a.csv", "", "is not a parameter file"),
     ],
 )
-def test_wrong_files_get_one_sentence(tmp_path: Path, name: str, text: str, sentence: str) -> None:
+def test_invalid_file_raises_a_one_sentence_error(
+    tmp_path: Path, name: str, text: str, sentence: str
+) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=sentence) as raised:
         params.load(tmp_path / name)
@@ -70,7 +72,7 @@ def test_wrong_files_get_one_sentence(tmp_path: Path, name: str, text: str, sent
     assert "\n" not in str(raised.value)
 
 
-def test_missing_file_gets_one_sentence(tmp_path: Path) -> None:
+def test_missing_file_raises_a_one_sentence_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be read: No such file"):
         params.load(tmp_path / "a.toml")
     assert not params.is_parameter_file(tmp_path / "a.toml")

@@ -1,4 +1,4 @@
-"""Reading and comparing parameters."""
+"""Read parameters in blocks, and compare parameter sets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.sim import SimulatedDrive
 
 
 class Blocky(Drive):
-    """A drive with two groups of parameters, which may be read in blocks."""
+    """A drive with two groups of parameters that can be read in blocks."""
 
     model = "blocky"
     parameter_space = ParameterSpace(
@@ -27,7 +27,7 @@ CODES = [*parameters_of(Blocky)]
 
 
 class Limited(SimulatedDrive):
-    """Refuses reads of more than `longest` words."""
+    """A simulated drive that refuses reads of more than `longest` registers."""
 
     longest = 16
 
@@ -59,19 +59,19 @@ def test_parameters_are_read_in_few_blocks(monkeypatch: pytest.MonkeyPatch) -> N
     assert counts(line) == [16, 16]
 
 
-def test_refused_block_does_not_cost_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused_block_does_not_prevent_reading_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = blocky(monkeypatch, {"P00.05"})
     assert set(params.read(drive).values) == {*CODES} - {"P00.05"}
     assert counts(line) == [16, 8, 4, 4, 2, 1, 1, 2, 8, 16]
 
 
-def test_longest_block_is_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_longest_accepted_block_length_is_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = blocky(monkeypatch, set(), longest=8)
     assert len(params.read(drive).values) == 32
     assert counts(line) == [16, 8, 8, 8, 8]
 
 
-def test_only_the_given_codes_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_with_codes_reads_only_these_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = blocky(monkeypatch, set())
     assert dict(params.read(drive, ["P01.02"]).values) == {"P01.02": 18}
     assert counts(line) == [1]
@@ -79,14 +79,14 @@ def test_only_the_given_codes_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
         params.read(drive, ["P09.00"])
 
 
-def test_silent_group_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_group_without_replies_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1))
     found = params.read(drive).values
     assert [*found] == ["P00.00", "P00.01", "P00.02", "P04.28", "P04.29", "P04.30"]
     assert len(line.frames) < 5 * 10 * 8
 
 
-def test_silent_drive_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_drive_raises_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, DelixiNative(1))
     asked: list[Message] = []
     line.deafens = lambda request: bool(asked.append(request)) or len(asked) > 20
@@ -94,13 +94,13 @@ def test_silent_drive_raises(monkeypatch: pytest.MonkeyPatch) -> None:
         params.read(drive)
 
 
-def test_family_without_a_rule_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_family_without_an_address_rule_raises_unsupported(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = one(monkeypatch, InvtCHE(1))
     with pytest.raises(Unsupported, match="follow no known rule"):
         params.read(drive)
 
 
-def test_differences_have_names_and_units() -> None:
+def test_differences_show_names_and_units() -> None:
     first = params.ParameterSet("yd1000", {"0009": 100, "F240": 5}, source="a")
     second = params.ParameterSet("yd1000", {"0009": 150, "F240": 5, "F241": 1}, source="b")
     assert params.compare(first, second, YD1000) == [
@@ -116,7 +116,7 @@ def test_factory_values_are_those_of_the_manual() -> None:
         params.defaults(DelixiModbus)
 
 
-def test_monitors_are_no_parameters() -> None:
+def test_monitors_are_not_listed_as_parameters() -> None:
     assert not any(code.startswith("P05.") for code in parameters_of(DelixiModbus))
 
 

@@ -1,4 +1,4 @@
-"""Scanning a simulated line on the test's clock: drives that are found, the time, drives that are missed."""
+"""Scan a simulated line on simulated time: drives found, drives missed, duration."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ ALL_EIGHT = (
 
 
 class Pair(Wire):
-    """A line on which a drive receives only bytes in its own format, as on a real one.
+    """A line on which a drive receives only bytes in its own character format, as on a real line.
 
-    A second stop bit is silence to the other side: it does not matter.
+    The number of stop bits does not matter, because a second stop bit looks like silence to the receiver.
     """
 
     def __init__(self, drives: Sequence[SimulatedDrive]) -> None:
@@ -67,14 +67,14 @@ def _alike(one: Settings, other: Settings) -> bool:
 
 
 class Line:
-    """Carries exchanges out on a wire; time passes only as far as the line wants it to."""
+    """Carries out exchanges on a wire; simulated time passes only as far as the line's waits require."""
 
     def __init__(self, wire: Pair) -> None:
         self.wire = wire
         self.driver = LineDriver()
         self.begun = self.driver.now
         self.sent: list[tuple[Framing, bytes]] = []
-        self.seen = bytearray()  # and not read yet
+        self.seen = bytearray()  # received bytes that were not read yet
 
     @property
     def seconds(self) -> float:
@@ -110,7 +110,7 @@ class Line:
 
 
 def found(line: Line, plan: Sequence[Sweep], families: Sequence[type] = FAMILIES) -> list[object]:
-    """All findings but the progress."""
+    """Return all findings of a scan except progress reports."""
     return [each for each in scan(line.carry_out, plan, families) if not isinstance(each, Progress)]
 
 
@@ -128,7 +128,7 @@ def declared(*drives: object) -> set[tuple[int, str, str, str]]:
 
 @pytest.fixture(scope="module")
 def whole_scan() -> tuple[Line, list[object]]:
-    """Scan a line with all eight drives completely; return the sweeps and their results."""
+    """Scan a line with all eight drives completely; return the line and the findings."""
     line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
     return line, found(line, sweeps(FAMILIES))
 
@@ -146,7 +146,7 @@ def test_all_eight_drives_are_found_at_their_settings(
 
 @pytest.mark.slow
 @pytest.mark.story
-def test_only_reads_are_sent(whole_scan: tuple[Line, list[object]]) -> None:
+def test_scan_sends_only_reads(whole_scan: tuple[Line, list[object]]) -> None:
     line, _ = whole_scan
     functions = {(framing, parse_request(framing, frame)[1].function) for framing, frame in line.sent}
     assert all(function in READS[framing] for framing, function in functions)
@@ -154,7 +154,7 @@ def test_only_reads_are_sent(whole_scan: tuple[Line, list[object]]) -> None:
 
 
 @pytest.mark.slow
-def test_the_usual_settings_come_first() -> None:
+def test_drives_at_usual_settings_are_found_within_15_s() -> None:
     line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
     soon = [each for each in ALL_EIGHT if each.settings == type(each)(1, framing=each.framing).settings]
     assert len(soon) == 4
@@ -169,7 +169,7 @@ def test_the_usual_settings_come_first() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("format", ["8N1", "8E1"])
-def test_a_sweep_takes_its_silences_and_timeouts(format: str) -> None:
+def test_sweep_of_a_silent_line_takes_no_longer_than_needed(format: str) -> None:
     nobody = Pair([simulated(YD1000(9))])
     line = Line(nobody)
     plan = sweeps(FAMILIES, addresses=range(10, 248), baudrates=[9600], formats=[format])
@@ -177,7 +177,7 @@ def test_a_sweep_takes_its_silences_and_timeouts(format: str) -> None:
     assert line.seconds <= 1.02 * sum(sweep.needed for sweep in plan)
 
 
-def test_a_sweep_s_time_is_its_silences_requests_and_timeouts() -> None:
+def test_needed_time_of_a_sweep_sums_silences_requests_and_timeouts() -> None:
     (sweep, patient) = sweeps([InvtCHE], addresses=[1, 2], baudrates=[9600], formats=["8N1"])
     character = 10 / 9600
     each = 3.5 * character + 1 / 9600 + 8 * character
@@ -185,7 +185,7 @@ def test_a_sweep_s_time_is_its_silences_requests_and_timeouts() -> None:
     assert patient.needed == pytest.approx(2 * (each + InvtCHE.response_timeout))
 
 
-def test_the_progress_counts_down_to_zero() -> None:
+def test_remaining_time_in_progress_reports_falls_to_zero() -> None:
     line = Line(Pair([simulated(InvtCHE(3))]))
     plan = sweeps([InvtCHE], addresses=range(1, 5), baudrates=[9600], formats=["8N1"])
     left = [each.left for each in scan(line.carry_out, plan, [InvtCHE]) if isinstance(each, Progress)]
@@ -203,7 +203,7 @@ class Echo(Line):
 
 @pytest.mark.long
 @pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
-def test_an_echo_is_not_a_drive_and_hides_none(families: list[type]) -> None:
+def test_adapter_echo_is_no_drive_and_hides_no_drive(families: list[type]) -> None:
     there = [each for each in ALL_EIGHT if type(each) in families and each.settings.baudrate in (9600, 19200)]
     line = Echo(Pair([simulated(each) for each in ALL_EIGHT]))
     plan = sweeps(families, addresses=range(1, 12), baudrates=[9600, 19200])
@@ -211,14 +211,14 @@ def test_an_echo_is_not_a_drive_and_hides_none(families: list[type]) -> None:
 
 
 @pytest.mark.long
-def test_a_line_without_drives_has_none() -> None:
+def test_scan_of_a_line_without_drives_finds_none() -> None:
     quiet = Pair([simulated(InvtCHE(31))])
     for line in (Line(quiet), Echo(quiet)):
         assert found(line, sweeps(FAMILIES, addresses=range(1, 31), baudrates=[9600])) == []
 
 
 class Junk(Line):
-    """A stray byte before every reply, and noise of its own every few requests."""
+    """A line with stray bytes after every few requests."""
 
     every = 4
 
@@ -229,7 +229,7 @@ class Junk(Line):
 
 
 @pytest.mark.long
-def test_some_noise_is_not_a_drive() -> None:
+def test_occasional_noise_is_not_reported_as_a_drive() -> None:
     line = Junk(Pair([simulated(each) for each in ALL_EIGHT]))
     findings = found(line, sweeps(FAMILIES, addresses=range(1, 12), baudrates=[9600, 38400]))
     assert drives(findings) == declared(
@@ -238,7 +238,7 @@ def test_some_noise_is_not_a_drive() -> None:
     assert not any(isinstance(finding, Crowd) for finding in findings)
 
 
-def test_a_line_that_is_never_quiet_is_called_noisy() -> None:
+def test_constant_noise_is_reported_and_does_not_hide_a_drive() -> None:
     class Always(Junk):
         every = 1
 
@@ -252,7 +252,7 @@ def test_a_line_that_is_never_quiet_is_called_noisy() -> None:
 
 
 class Shared(Pair):
-    """A line where two drives have one address and both answer: a bit is 0 if either drive sends 0."""
+    """A line on which two drives with the same address reply together: a bit is 0 if either drive sends 0."""
 
     def __init__(self, drives: Sequence[SimulatedDrive], twin: SimulatedDrive) -> None:
         super().__init__(drives)
@@ -268,7 +268,7 @@ class Shared(Pair):
         return bytes(one & two for one, two in itertools.zip_longest(reply, other, fillvalue=0xFF))
 
 
-def test_two_drives_at_one_address_are_recognised() -> None:
+def test_two_drives_at_one_address_are_reported_as_a_crowd() -> None:
     one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
     one["output_current"], twin["output_current"] = 41.1, 77.7
     line = Line(Shared([simulated(InvtCHE(1)), one, simulated(InnovertIBD(4))], twin))
@@ -280,20 +280,20 @@ def test_two_drives_at_one_address_are_recognised() -> None:
 
 
 class Misaddressed(Pair):
-    """Every reply is a whole frame that comes from another address."""
+    """A line on which every reply is a valid frame from another address."""
 
     def distort(self, reply: bytes) -> bytes:
         return checksums.rtu(b"\x63" + reply[1:-2])
 
 
-def test_valid_frames_that_match_no_request_are_reported() -> None:
+def test_valid_frames_from_another_address_are_reported_with_their_bytes() -> None:
     findings = found(Line(Misaddressed([simulated(InvtCHE(1))])), sweeps([InvtCHE], baudrates=[9600]))
     (crowd, *_) = [finding for finding in findings if isinstance(finding, Crowd)]
     assert crowd.reply.startswith("reply from another address (received 63 ")
 
 
 class Everything(Echo, Junk):
-    """Echo, stray bytes and noise together."""
+    """A line with echo and stray bytes."""
 
 
 @pytest.mark.story
@@ -309,7 +309,7 @@ def test_all_eight_drives_are_found_with_echo_noise_and_a_crowd() -> None:
 
 
 class OneAfterTheOther(Shared):
-    """The second drive at the address is slower: it answers when the first one has done."""
+    """A line on which the second drive with the same address replies right after the first."""
 
     def distort(self, reply: bytes) -> bytes:
         _, request = parse_request(self.twin.drive.framing, self.request)
@@ -317,7 +317,7 @@ class OneAfterTheOther(Shared):
         return reply if answer is None else reply + build_reply(self.twin.drive.framing, answer)
 
 
-def test_two_drives_that_answer_one_after_the_other_are_doubted() -> None:
+def test_second_reply_after_the_first_raises_a_doubt_about_a_second_drive() -> None:
     one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
     line = Line(OneAfterTheOther([one, simulated(InnovertIBD(4))], twin))
     findings = found(line, sweeps([InnovertIBD], baudrates=[9600], formats=["8N1"]), [InnovertIBD])
@@ -327,7 +327,7 @@ def test_two_drives_that_answer_one_after_the_other_are_doubted() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.05, 0.15, 0.3])
-def test_a_drive_that_answers_late_is_found(delay: float) -> None:
+def test_drive_with_a_long_response_delay_is_found(delay: float) -> None:
     slow = simulated(InvtCHE(3), response_delay=delay)
     line = Line(Pair([slow, simulated(InvtCHE(5))]))
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
@@ -338,22 +338,22 @@ def test_a_drive_that_answers_late_is_found(delay: float) -> None:
 
 
 class Hesitant(SimulatedCHE):
-    """Answers a scan's first request at once and all others late, as a converter or a busy computer does."""
+    """A CHE that replies fast to the sweep and its probe, then slowly, like a busy converter or computer."""
 
-    hurried = 3  # tries of a probe, after the sweep's own question
+    hurried = 3  # fast replies to the probe, after the one to the sweep
 
     @property
     def delay(self) -> float:
         return super().delay if self.counters.requests <= 1 + self.hurried else 0.4
 
 
-def test_a_drive_that_becomes_slow_is_identified() -> None:
+def test_drive_that_becomes_slow_during_its_probe_is_identified() -> None:
     line = Line(Pair([Hesitant(InvtCHE(3))]))
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
     assert drives(found(line, plan, FAMILIES)) == declared(InvtCHE(3))
 
 
-def test_a_slow_line_is_waited_for_longer_once_it_is_known() -> None:
+def test_slow_replies_lengthen_the_timeouts_of_later_sweeps() -> None:
     line = Line(Pair([simulated(InvtCHE(at), response_delay=0.04) for at in (1, 9)]))
     brisk = sweeps([InvtCHE], baudrates=[9600])
     brisk = brisk[: len(brisk) // 2]
@@ -363,7 +363,7 @@ def test_a_slow_line_is_waited_for_longer_once_it_is_known() -> None:
     assert left[31] > usual[31]
 
 
-def test_a_drive_of_no_family_is_unknown() -> None:
+def test_drive_that_fits_no_family_is_found_without_a_model() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7))]))
     (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
     assert isinstance(answering, Found)
@@ -371,7 +371,7 @@ def test_a_drive_of_no_family_is_unknown() -> None:
 
 
 @pytest.mark.slow
-def test_a_user_s_family_is_found() -> None:
+def test_drive_of_a_users_family_is_found() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
     families = [*FAMILIES, Unsure]
     findings = found(line, sweeps(families, baudrates=[9600, 19200], formats=["8N1"]), families)
@@ -379,14 +379,14 @@ def test_a_user_s_family_is_found() -> None:
 
 
 class Addressed(Toy):
-    """A family of one's own, whose drives hold their address."""
+    """A user's family with a register that holds the drive's address."""
 
     model = "addressed"
     address_setting = setting(0x20, span=(1, 31), kept=Kept.EEPROM)
 
 
 class Older(SimulatedDrive):
-    """Its firmware does not have the address yet."""
+    """A drive whose older firmware lacks the address register."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         if start == Addressed.address_setting.address:
@@ -398,7 +398,7 @@ class Older(SimulatedDrive):
     ("kind", "held", "models"),
     [(SimulatedDrive, 7, ("addressed",)), (SimulatedDrive, 9, ()), (Older, 0, ("addressed",))],
 )
-def test_a_drive_with_another_address_register_is_another_family(
+def test_drive_whose_address_register_differs_does_not_fit_the_family(
     kind: type[SimulatedDrive], held: int, models: tuple[str, ...]
 ) -> None:
     drive = kind(Addressed(7))
@@ -411,7 +411,7 @@ def test_a_drive_with_another_address_register_is_another_family(
 
 
 class Meddler(Toy):
-    """A user's family, whose author used a write as a read."""
+    """A user's family whose identification scripts mistakenly write."""
 
     model = "meddler"
 
@@ -424,7 +424,7 @@ class Meddler(Toy):
         return True
 
 
-def test_an_identification_that_would_write_is_skipped() -> None:
+def test_identify_script_that_would_write_is_not_carried_out() -> None:
     drive = SimulatedDrive(Meddler(7))
     plan = sweeps([Meddler], baudrates=[9600], formats=["8N1"])
     findings = found(Line(Pair([drive])), plan, [Meddler])
@@ -444,14 +444,14 @@ def test_a_family_without_readable_registers_is_skipped() -> None:
     assert {family for sweep in plan for family in sweep.families} == {InvtCHE}
 
 
-def test_a_found_drive_is_reported_once() -> None:
+def test_drive_that_answers_in_two_formats_is_reported_once() -> None:
     line = Line(Pair([simulated(InvtCHE(2, format="8N2"))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1", "8N2"]), [InvtCHE])
     assert len(drives(findings)) == 1
 
 
 class Stubborn(Line):
-    """A port that has no parity."""
+    """A port that does not support parity."""
 
     def carry_out(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion:
         if exchange.settings[1][1] != "N":
@@ -459,7 +459,7 @@ class Stubborn(Line):
         return super().carry_out(exchange, not_before_ns=not_before_ns)
 
 
-def test_unsupported_settings_are_skipped_and_reported() -> None:
+def test_settings_that_the_port_does_not_support_are_skipped_and_reported() -> None:
     line = Stubborn(Pair([simulated(InvtCHE(2))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600]), [InvtCHE])
     assert drives(findings) == declared(InvtCHE(2))
@@ -476,7 +476,7 @@ class Vanishing(Line):
         return super().carry_out(exchange, not_before_ns=not_before_ns)
 
 
-def test_a_lost_port_ends_the_scan_after_its_findings() -> None:
+def test_lost_port_raises_line_error_after_the_findings_so_far() -> None:
     line = Vanishing(Pair([simulated(InvtCHE(2))]))
     findings = scan(line.carry_out, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
     assert drives([next(finding for finding in findings if isinstance(finding, Found))]) == declared(
@@ -486,7 +486,7 @@ def test_a_lost_port_ends_the_scan_after_its_findings() -> None:
         list(findings)
 
 
-def test_a_port_without_supported_settings_is_an_error() -> None:
+def test_port_that_supports_no_setting_raises_line_error() -> None:
     line = Stubborn(Pair([simulated(InvtCHE(2))]))
     with pytest.raises(LineError, match="parity"):
         found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8E1"]))
@@ -501,7 +501,7 @@ def test_a_port_without_supported_settings_is_an_error() -> None:
         ({"baudrates": [1200], "formats": ["7E1"], "addresses": [40]}, "no family has such an address"),
     ],
 )
-def test_a_request_that_no_family_answers_is_a_mistake(asked: dict[str, list[object]], sentence: str) -> None:
+def test_settings_that_no_family_has_raise_value_error(asked: dict[str, list[object]], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         sweeps(FAMILIES, **asked)
 
@@ -512,7 +512,7 @@ def questions(plan: Sequence[Sweep]) -> Iterator[bytes]:
 
 
 @pytest.mark.slow
-def test_every_request_is_a_documented_read() -> None:
+def test_every_sweep_request_is_a_read_of_its_families() -> None:
     for sweep in sweeps(FAMILIES):
         assert sweep.request.function in READS[sweep.framing]
         for family in sweep.families:
@@ -522,7 +522,7 @@ def test_every_request_is_a_documented_read() -> None:
 
 
 class Bare(SimulatedIBD):
-    """An IBD with only the registers in its manual's examples; the addresses above are inferred."""
+    """An IBD with only the registers below address 200, which the manual's examples show."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         if start >= 200:
@@ -531,7 +531,7 @@ class Bare(SimulatedIBD):
 
 
 @pytest.mark.slow
-def test_an_ibd_without_line_registers_is_named_with_doubt() -> None:
+def test_ibd_without_line_registers_is_reported_with_a_doubt() -> None:
     bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
     line = Line(Pair([Bare(each) for each in bare]))
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
@@ -544,7 +544,7 @@ def test_an_ibd_without_line_registers_is_named_with_doubt() -> None:
 
 
 @pytest.mark.long
-def test_bits_besides_terminals_exclude_an_ibd() -> None:
+def test_unusual_upper_bits_of_the_terminals_exclude_an_ibd() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))
         drive.shows = {(0x03, 22): lambda self, bits=bits: bits}
@@ -555,14 +555,14 @@ def test_bits_besides_terminals_exclude_an_ibd() -> None:
 
 
 class Anything(SimulatedDrive):
-    """Answers every read with 0, as some gateways do."""
+    """A device that answers every read with 0, as some gateways do."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         return [0] * count
 
 
 @pytest.mark.slow
-def test_a_device_that_answers_every_read_has_no_family() -> None:
+def test_device_that_answers_every_read_with_0_fits_no_family() -> None:
     line = Line(Pair([Anything(Toy(7))]))
     (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
     assert isinstance(answering, Found)

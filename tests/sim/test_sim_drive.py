@@ -82,7 +82,7 @@ def exception_of(reply: Message | None) -> int:
         ("relay", 1, 1, 4, 3, "02"),
     ],
 )
-def test_a_value_that_is_set_is_read(
+def test_value_set_on_a_simulated_drive_is_read_over_the_line(
     sim: SimulatedDrive, name: str, value: float, function: int, start: int, count: int, words: str
 ) -> None:
     if name == "relay":
@@ -92,11 +92,11 @@ def test_a_value_that_is_set_is_read(
     assert sim[name] == value
 
 
-def test_defaults_and_readable_gaps(sim: SimulatedDrive) -> None:
+def test_read_returns_default_values_and_0_in_readable_gaps(sim: SimulatedDrive) -> None:
     assert data_of(ask(sim, 3, 0x10, 4)) == "00 32 00 00 00 00 00 00"
 
 
-def test_one_register_is_written_and_read_back(sim: SimulatedDrive) -> None:
+def test_written_register_is_read_back_and_recorded(sim: SimulatedDrive) -> None:
     request = Message(7, 6, 0x10, data=b"\x00\xc8")
     assert sim.answer(request, 3.5) == request
     assert sim["acceleration_time"] == 20
@@ -105,19 +105,19 @@ def test_one_register_is_written_and_read_back(sim: SimulatedDrive) -> None:
     assert written == (3.5, "acceleration_time", 0x10, 200)
 
 
-def test_several_registers_are_written(sim: SimulatedDrive) -> None:
+def test_write_of_several_registers_sets_a_32_bit_value(sim: SimulatedDrive) -> None:
     assert ask(sim, 0x10, 0x12, 2, b"\x00\x12\xd6\x87") == Message(7, 0x10, 0x12, 2)
     assert sim["total"] == 1234567
 
 
-def test_coils(sim: SimulatedDrive) -> None:
+def test_coil_writes_set_values_and_reject_invalid_data(sim: SimulatedDrive) -> None:
     assert ask(sim, 5, 5, data=ON) == Message(7, 5, 5, data=ON)
     assert ask(sim, 0x0F, 5, 2, b"\x02") == Message(7, 0x0F, 5, 2)
     assert (sim["relay"], sim["lamp"]) == (0, 1)
     assert exception_of(ask(sim, 5, 5, data=b"\x12\x34")) == 3
 
 
-def test_a_write_of_several_happens_whole_or_not_at_all(sim: SimulatedDrive) -> None:
+def test_refused_write_of_several_registers_changes_none(sim: SimulatedDrive) -> None:
     assert exception_of(ask(sim, 0x10, 0x12, 3, bytes(range(1, 7)))) == 2
     assert sim["total"] == 0
     assert not sim.counters.writes
@@ -129,44 +129,46 @@ def test_a_write_of_several_happens_whole_or_not_at_all(sim: SimulatedDrive) -> 
         (3, 0x10, 11, b"", 3),
         (3, 0x10, 0, b"", 3),
         (4, 0x00, 1, b"", 2),
-        (4, 0x08, 2, b"", 2),  # one defined, one not
+        (4, 0x08, 2, b"", 2),  # the second of two input registers is undefined
         (3, 0xFFFF, 2, b"", 2),
         (3, 0x30, 1, b"", 2),  # write-only
-        (3, 0x8010, 1, b"", 2),  # the alias is for writing only
-        (6, 0x01, 0, b"\x00\x01", 2),  # an input register
-        (6, 0x11, 0, b"\x00\x01", 2),  # a gap
-        (6, 0x30, 0, b"\x13\x89", 3),  # 50.01 Hz
+        (3, 0x8010, 1, b"", 2),  # the RAM alias can only be written
+        (6, 0x01, 0, b"\x00\x01", 2),  # a read-only input register
+        (6, 0x11, 0, b"\x00\x01", 2),  # a reserved address
+        (6, 0x30, 0, b"\x13\x89", 3),  # 50.01 Hz, above the span
         (8, 0x01, 0, b"\x00\x00", 1),
         (0x2B, 0, 0, b"", 1),
     ],
 )
-def test_refusals(sim: SimulatedDrive, function: int, start: int, count: int, data: bytes, code: int) -> None:
+def test_invalid_request_gets_the_exception_code(
+    sim: SimulatedDrive, function: int, start: int, count: int, data: bytes, code: int
+) -> None:
     assert exception_of(ask(sim, function, start, count, data)) == code
     assert sim.counters.refusals == 1
 
 
-def test_a_span_knows_signs(sim: SimulatedDrive) -> None:
+def test_negative_value_below_its_span_is_refused(sim: SimulatedDrive) -> None:
     assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9c")) == 0  # -100
     assert sim["offset"] == -100
     assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9b")) == 3
 
 
-def test_a_dead_drive(sim: SimulatedDrive) -> None:
+def test_dead_drive_does_not_reply(sim: SimulatedDrive) -> None:
     sim.deaf_until = math.inf
     assert ask(sim, 4, 1, 1) is None
     assert sim.counters.requests == 0
 
 
-def test_diagnostics_echo(sim: SimulatedDrive) -> None:
+def test_diagnostics_request_is_echoed(sim: SimulatedDrive) -> None:
     assert ask(sim, 8, 0, data=b"\xa5\x37") == Message(7, 8, 0, data=b"\xa5\x37")
 
 
-def test_another_address_is_silence(sim: SimulatedDrive) -> None:
+def test_request_to_another_address_gets_no_reply(sim: SimulatedDrive) -> None:
     assert sim.answer(Message(8, 4, 1, 1), 0.0) is None
     assert sim.counters.requests == 0
 
 
-def test_a_broadcast_is_obeyed_and_never_answered(sim: SimulatedDrive) -> None:
+def test_broadcast_write_is_carried_out_without_a_reply(sim: SimulatedDrive) -> None:
     assert sim.answer(Message(0, 6, 0x30, data=b"\x13\x88"), 0.0) is None
     assert sim.memory.get(Own.frequency) == 50
     assert sim.answer(Message(0, 6, 0x99, data=b"\x13\x88"), 0.0) is None
@@ -174,7 +176,7 @@ def test_a_broadcast_is_obeyed_and_never_answered(sim: SimulatedDrive) -> None:
     assert (sim.counters.broadcasts, sim.counters.requests) == (3, 0)
 
 
-def test_a_class_without_broadcasts_ignores_them() -> None:
+def test_drive_class_without_broadcasts_ignores_a_broadcast() -> None:
     class Deaf(Own):
         broadcasts = False
 
@@ -183,7 +185,7 @@ def test_a_class_without_broadcasts_ignores_them() -> None:
     assert sim["frequency"] == 0
 
 
-def test_eeprom_wear_is_counted_and_the_ram_alias_spares_it(sim: SimulatedDrive) -> None:
+def test_eeprom_writes_are_counted_but_not_writes_to_the_ram_alias(sim: SimulatedDrive) -> None:
     ask(sim, 6, 0x10, data=b"\x00\xc8")
     ask(sim, 6, 0x10, data=b"\x00\xc8")
     ask(sim, 6, 0x8010, data=b"\x01\x90")
@@ -201,19 +203,19 @@ def test_requests_are_counted_by_function(sim: SimulatedDrive) -> None:
 
 
 @pytest.mark.long
-def test_writes_are_remembered_within_bounds(sim: SimulatedDrive) -> None:
+def test_record_of_writes_keeps_the_latest_10000(sim: SimulatedDrive) -> None:
     for _ in range(11_000):
         ask(sim, 6, 0x10, data=b"\x00\xc8")
     assert len(sim.counters.writes) == 10_000
     assert sim.counters.eeprom_writes["acceleration_time"] == 11_000
 
 
-def test_a_write_only_register_may_be_read_from_outside(sim: SimulatedDrive) -> None:
+def test_value_of_a_write_only_register_is_readable_by_name(sim: SimulatedDrive) -> None:
     ask(sim, 6, 0x30, data=b"\x13\x88")
     assert sim["frequency"] == 50
 
 
-def test_a_class_of_one_s_own_needs_no_family() -> None:
+def test_users_class_gets_a_general_simulated_drive() -> None:
     assert type(simulated(Own(3))) is SimulatedDrive
 
 
@@ -227,7 +229,7 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_an_encoded_drive_s_values_name_their_source(register: Register[float], at: int) -> None:
+def test_encoded_drive_reads_the_code_of_drive_table_and_register(register: Register[float], at: int) -> None:
     sim = EncodedDrive(Own(7))
     table, where = register.table, register.address + at
     numbers = {COIL: 1, DISCRETE: 2, HOLDING: 3, INPUT: 4}
@@ -239,7 +241,7 @@ def test_an_encoded_drive_s_values_name_their_source(register: Register[float], 
     assert int.from_bytes(reply.data) == expected & width
 
 
-def test_an_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
+def test_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
     sim = EncodedDrive(Own(7))
     before = ask(sim, 3, 0x10, 1)
     request = Message(7, 6, 0x10, data=b"\x00\xc8")
@@ -247,13 +249,13 @@ def test_an_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
     assert ask(sim, 3, 0x10, 1) == before
 
 
-def test_neighbouring_drives_and_registers_have_different_codes() -> None:
+def test_adjacent_drives_and_registers_have_different_codes() -> None:
     tables = (HOLDING, INPUT, Table("another", 7, None))
     codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
     assert len(codes) == 8 * 3 * 8
 
 
-def test_a_simulated_value_may_be_a_name_or_text() -> None:
+def test_simulated_value_can_be_set_by_name_or_as_text() -> None:
     sim = simulated(Toy(1))
     sim["fault"] = "overcurrent"
     sim["output_current"] = "2.5"

@@ -1,6 +1,6 @@
-"""Every family answers as its document says: whole frames in, whole frames out, at chosen times.
+"""Every family's simulation replies as its document says: whole frames in, whole frames out.
 
-Frames with a written checksum are printed in the family's document, unless they are marked as built from its
+Frames with a literal checksum are printed in the family's document, unless marked "built": composed from its
 tables. checksums.py computes the checksums of all other frames.
 """
 
@@ -26,7 +26,7 @@ from multidrop.sim.yd1000 import SimulatedYD1000
 
 
 class Bench:
-    """One simulated drive on an unpaced wire, and the time."""
+    """One simulated drive on an unpaced wire, and its simulated time."""
 
     def __init__(self, drive: Drive) -> None:
         sim = simulated(drive)
@@ -37,26 +37,26 @@ class Bench:
         self.now = 100.0
 
     def hear(self, frame: bytes) -> bytes:
-        """Return the reply; empty if the drive is silent."""
+        """Send a frame; return the reply, empty if the drive does not reply."""
         self.wire.receive(frame, self.now)
         self.now += 0.1
         return self.wire.advance(self.now)
 
     def say(self, frame: str) -> str:
-        """The same as the documents print it: RTU as hex digits, text without its end."""
+        """Do the same with frames as the documents print them: RTU in hex, text without its line end."""
         if frame.startswith(":"):
             return self.hear(f"{frame}\r\n".encode()).decode().removesuffix("\r\n")
         return self.hear(bytes.fromhex(frame)).hex(" ").upper()
 
     def ask(self, function: int, start: int, count: int = 1) -> list[int]:
-        """The words that are read there."""
+        """Read `count` registers; return their raw counts."""
         reply = self.sim.answer(Message(self.sim.drive.address, function, start, count), self.now)
         assert reply is not None
         assert not reply.exception
         return [int.from_bytes(reply.data[at : at + 2]) for at in range(0, len(reply.data), 2)]
 
     def write(self, start: int, value: int, function: int = 6) -> int | None:
-        """The exception code, 0 for a confirmation, None for silence."""
+        """Write a register; return the exception code, 0 if confirmed, None without a reply."""
         data = value.to_bytes(4 if function == 4 else 2)
         reply = self.sim.answer(Message(self.sim.drive.address, function, start, data=data), self.now)
         return None if reply is None else reply.exception
@@ -74,7 +74,7 @@ def erman() -> Bench:
     return Bench(ErmanERG220(1))
 
 
-def test_erman_reads_control_registers(erman: Bench) -> None:
+def test_erman_control_registers_are_read_as_printed(erman: Bench) -> None:
     erman.sim["control_register"] = 0x0100
     erman.sim["frequency"] = 50.0
     erman.sim["maximum_frequency"] = 50.0
@@ -82,7 +82,7 @@ def test_erman_reads_control_registers(erman: Bench) -> None:
     assert erman.say("01 03 00 01 00 04 15 C9") == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4"
 
 
-def test_erman_reads_state_registers_with_the_checksum_corrected(erman: Bench) -> None:
+def test_erman_state_registers_are_read_as_printed_with_a_corrected_checksum(erman: Bench) -> None:
     erman.sim["output_frequency"] = 50.0
     erman.sim["output_current"] = 21.4
     erman.sim["dc_bus_voltage"] = 562
@@ -93,23 +93,23 @@ def test_erman_reads_state_registers_with_the_checksum_corrected(erman: Bench) -
     "frame",
     [
         "01 05 00 00 FF 00 8C 3A",  # start
-        "01 06 00 02 01 1D E9 93",  # 28.5 Hz, the address corrected
-        "01 06 00 01 01 1D 19 93",  # as printed: the drive takes it, the library never sends it
+        "01 06 00 02 01 1D E9 93",  # setpoint 28.5 Hz, with the address corrected
+        "01 06 00 01 01 1D 19 93",  # as printed, to 0001H; the library never sends it
         "01 08 00 00 A5 37 DA 8D",
     ],
 )
-def test_erman_confirms_with_a_copy(erman: Bench, frame: str) -> None:
+def test_erman_confirms_a_write_with_a_copy_of_the_request(erman: Bench, frame: str) -> None:
     assert erman.say(frame) == frame
 
 
-def test_erman_writes_several(erman: Bench) -> None:
+def test_erman_writes_several_registers_with_function_10(erman: Bench) -> None:
     assert erman.say("01 10 00 0C 00 02 04 00 C8 01 90 73 F8") == "01 10 00 0C 00 02 81 CB"
     assert (erman.sim["acceleration_time"], erman.sim["deceleration_time"]) == (20, 40)
     assert (erman.motor.acceleration_time, erman.motor.deceleration_time) == (20, 40)
     assert erman.say("01 0F 00 00 00 09 02 01 01 25 2C") == "01 0F 00 00 00 09 95 CD"
 
 
-def test_erman_reads_coils(erman: Bench) -> None:
+def test_erman_coils_are_read_as_printed(erman: Bench) -> None:
     assert erman.say("01 01 00 00 00 0C 3C 0F")[:11] == "01 01 02 00"
     erman.say("01 05 00 00 FF 00 8C 3A")
     assert erman.say("01 01 00 00 00 0C 3C 0F")[:14] == "01 01 02 01 00"
@@ -128,11 +128,13 @@ def test_erman_reads_coils(erman: Bench) -> None:
         (Message(1, 0x10, 0x58, 2, b"\x00\x00\x00\x00"), "01 90 03 0C 01"),
     ],
 )
-def test_erman_refuses_wrong_addresses_as_printed(erman: Bench, request_: Message, reply: str) -> None:
+def test_erman_refuses_wrong_addresses_with_the_printed_reply(
+    erman: Bench, request_: Message, reply: str
+) -> None:
     assert erman.hear(build_request(Framing.RTU, request_)) == bytes.fromhex(reply)
 
 
-def test_erman_has_an_exception_for_an_unknown_function(erman: Bench) -> None:
+def test_erman_refuses_an_unknown_function_with_exception_01(erman: Bench) -> None:
     assert erman.hear(checksums.rtu("01 2B")) == checksums.rtu("01 AB 01")
 
 
@@ -140,19 +142,19 @@ def test_erman_has_an_exception_for_an_unknown_function(erman: Bench) -> None:
     "frame",
     [
         bytes.fromhex("01 04 00 01 00 05 15 C9"),  # the printed checksum, which is wrong
-        checksums.rtu("02 04 00 01 00 05"),  # another drive's
+        checksums.rtu("02 04 00 01 00 05"),  # request to another drive
         checksums.rtu("00 05 00 01 FF 00"),  # a broadcast
         checksums.rtu("01 03 00 01 00"),  # of a wrong length
         checksums.rtu("01 10 00 0C 00 02 03 00 C8 01"),
     ],
 )
-def test_erman_is_silent(erman: Bench, frame: bytes) -> None:
+def test_erman_does_not_reply_to_damaged_foreign_or_broadcast_frames(erman: Bench, frame: bytes) -> None:
     assert erman.hear(frame) == b""
     assert erman.sim.counters.replies == 0
 
 
-def test_erman_runs_a_motor(erman: Bench) -> None:
-    erman.say("01 06 00 02 01 1D E9 93")  # 28.5 Hz
+def test_erman_start_and_stop_ramp_the_motor(erman: Bench) -> None:
+    erman.say("01 06 00 02 01 1D E9 93")  # setpoint 28.5 Hz
     assert erman.ask(4, 0x400, 2) == [0, 0]
     erman.say("01 05 00 00 FF 00 8C 3A")
     erman.wait(1)
@@ -167,7 +169,7 @@ def test_erman_runs_a_motor(erman: Bench) -> None:
     assert (erman.ask(4, 0x400, 2), erman.ask(4, 0x01)) == ([0, 0], [0])
 
 
-def test_erman_starts_only_while_stop_is_off_and_not_by_clearing_it(erman: Bench) -> None:
+def test_erman_start_is_ignored_while_stop_is_on_and_clearing_stop_starts_nothing(erman: Bench) -> None:
     erman.say("01 06 00 02 01 1D E9 93")
     erman.say("01 05 00 01 FF 00 DD FA")  # stop on
     erman.say("01 05 00 00 FF 00 8C 3A")  # start on
@@ -178,7 +180,7 @@ def test_erman_starts_only_while_stop_is_off_and_not_by_clearing_it(erman: Bench
     assert erman.motor.energised
 
 
-def test_erman_emergency_stop_is_a_fault_that_a_reset_clears_and_the_record_keeps(erman: Bench) -> None:
+def test_erman_emergency_stop_prevents_a_start_until_a_reset_and_stays_the_last_fault(erman: Bench) -> None:
     erman.say("01 05 00 00 FF 00 8C 3A")
     erman.say("01 05 00 02 FF 00 2D FA")  # emergency stop (built)
     assert not erman.motor.energised
@@ -208,7 +210,7 @@ def che() -> Bench:
 
 
 @pytest.mark.parametrize(
-    "frame",  # built; those of the control word and setpoint
+    "frame",  # built: writes of the control word and the setpoint
     [
         "01 06 10 00 00 01 4C CA",
         "01 06 10 00 00 05 4D 09",
@@ -218,17 +220,17 @@ def che() -> Bench:
         "01 06 20 00 00 00 82 0A",
     ],
 )
-def test_che_confirms_with_a_copy(che: Bench, frame: str) -> None:
+def test_che_confirms_a_write_with_a_copy_of_the_request(che: Bench, frame: str) -> None:
     assert che.say(frame) == frame
 
 
-def test_che_says_that_it_is_one(che: Bench) -> None:
+def test_che_device_code_register_reads_0101(che: Bench) -> None:
     assert che.say("01 03 30 16 00 01 6A CE")[:14] == "01 03 02 01 01"
 
 
-def test_che_writes_a_parameter() -> None:
+def test_che_stores_a_written_parameter() -> None:
     che = Bench(MyCHE(2))
-    frame = "02 06 00 08 13 88 05 6D"  # 11.6.2
+    frame = "02 06 00 08 13 88 05 6D"  # example of section 11.6.2
     assert che.say(frame) == frame
     assert che.sim["jump"] == 0x1388
 
@@ -242,7 +244,7 @@ def test_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> No
     assert che.ask(3, 0x1001) == [1]
 
 
-def test_che_a_negative_setpoint_turns_the_motor_the_other_way(che: Bench) -> None:
+def test_che_negative_setpoint_reverses_the_motor(che: Bench) -> None:
     assert che.write(0x2000, 0x10000 - 5000) == 0
     che.write(0x1000, 1)
     che.wait(60)
@@ -252,7 +254,9 @@ def test_che_a_negative_setpoint_turns_the_motor_the_other_way(che: Bench) -> No
 
 
 @pytest.mark.parametrize(("word", "stopped_after"), [(5, False), (6, True), (8, False)])
-def test_che_stops_along_the_ramp_or_coasts(che: Bench, word: int, stopped_after: bool) -> None:
+def test_che_stop_words_ramp_down_and_coast_word_stops_immediately(
+    che: Bench, word: int, stopped_after: bool
+) -> None:
     che.write(0x2000, 10_000)
     che.write(0x1000, 2)
     che.wait(60)
@@ -264,10 +268,10 @@ def test_che_stops_along_the_ramp_or_coasts(che: Bench, word: int, stopped_after
     assert che.ask(3, 0x1001) == [3]
 
 
-def test_che_in_a_fault(che: Bench) -> None:
+def test_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
     che.sim.trip(10)
     assert (che.ask(3, 0x1001), che.ask(3, 0x5000)) == ([4], [10])
-    assert che.write(0x1000, 1) == 0x01  # "or the drive has a fault"
+    assert che.write(0x1000, 1) == 0x01  # by the manual also for a drive in fault
     assert che.write(0x1000, 7) == 0
     assert (che.ask(3, 0x1001), che.ask(3, 0x5000)) == ([3], [0])
 
@@ -275,18 +279,20 @@ def test_che_in_a_fault(che: Bench) -> None:
 @pytest.mark.parametrize(
     ("body", "reply"),
     [
-        ("01 03 40 00 00 01", "01 83 02"),  # nothing there
+        ("01 03 40 00 00 01", "01 83 02"),  # undefined address
         ("01 03 80 0B 00 01", "01 83 02"),  # the alias in RAM cannot be read
-        ("01 03 30 00 00 11", "01 83 03"),  # 17 words
+        ("01 03 30 00 00 11", "01 83 03"),  # 17 registers, one too many
         ("01 06 10 00 00 09", "01 86 12"),
         ("01 04 30 00 00 01", "01 84 01"),
     ],
 )
-def test_che_refuses(che: Bench, body: str, reply: str) -> None:
+def test_che_refuses_invalid_requests_with_the_documented_exception(
+    che: Bench, body: str, reply: str
+) -> None:
     assert che.hear(checksums.rtu(body)) == checksums.rtu(reply)
 
 
-def test_che_parameters_wear_the_eeprom_and_their_aliases_do_not(che: Bench) -> None:
+def test_che_parameter_writes_wear_the_eeprom_but_alias_writes_do_not(che: Bench) -> None:
     for _ in range(3):
         che.write(11, 50)
     che.write(0x800B, 70)
@@ -294,7 +300,7 @@ def test_che_parameters_wear_the_eeprom_and_their_aliases_do_not(che: Bench) -> 
     assert che.sim.counters.eeprom_writes == {"acceleration_time": 3}
 
 
-def test_che_is_busy_while_it_stores(che: Bench) -> None:
+def test_che_refuses_a_write_while_it_stores_the_previous_one(che: Bench) -> None:
     assert isinstance(che.sim, SimulatedCHE)
     che.sim.storing = 0.5
     assert che.write(11, 50) == 0
@@ -304,7 +310,7 @@ def test_che_is_busy_while_it_stores(che: Bench) -> None:
     assert che.write(11, 60) == 0
 
 
-def test_che_some_parameters_cannot_be_changed_while_it_runs(che: Bench) -> None:
+def test_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> None:
     che.write(0x2000, 5000)
     assert che.write(12, 1) == 0
     che.write(0x1000, 1)
@@ -312,7 +318,7 @@ def test_che_some_parameters_cannot_be_changed_while_it_runs(che: Bench) -> None
     assert che.sim["locked"] == 1
 
 
-def test_che_answers_a_damaged_frame_with_a_fault_frame(che: Bench) -> None:
+def test_che_replies_to_a_damaged_frame_with_exception_11(che: Bench) -> None:
     assert che.hear(bytes.fromhex("01 03 10 01 00 01 D1 0B")) == checksums.rtu("01 83 11")
     assert che.hear(bytes.fromhex("02 03 10 01 00 01 D1 0B")) == b""
     assert che.sim.counters.damaged == 1
@@ -340,7 +346,7 @@ def ibd_ascii() -> Bench:
         "01 06 00 6B 00 C8 F9 80",
     ],
 )
-def test_ibd_confirms_with_a_copy(ibd: Bench, frame: str) -> None:
+def test_ibd_confirms_a_write_with_a_copy_of_the_request(ibd: Bench, frame: str) -> None:
     assert ibd.say(frame) == frame
 
 
@@ -354,7 +360,7 @@ def test_ibd_confirms_with_a_copy(ibd: Bench, frame: str) -> None:
         ":0106006500058F",
     ],
 )
-def test_ibd_confirms_with_a_copy_in_ascii(ibd_ascii: Bench, frame: str) -> None:
+def test_ibd_confirms_a_write_in_ascii_with_a_copy_of_the_request(ibd_ascii: Bench, frame: str) -> None:
     assert ibd_ascii.say(frame) == frame
 
 
@@ -378,19 +384,19 @@ def test_ibd_programmed_outputs_show_the_motor_s_state(ibd: Bench) -> None:
     assert ibd.ask(3, 22) == [0x1800]
 
 
-def test_ibd_reverses_without_a_run_command(ibd: Bench) -> None:
+def test_ibd_direction_bits_alone_reverse_a_running_motor(ibd: Bench) -> None:
     assert ibd.write(0x2001, 2000) == 0
-    for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):  # run reverse; forward; the other way
+    for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):  # run in reverse; forward; both bits: reverse
         assert ibd.write(0x2000, bits) == 0
         assert ibd.motor.direction == direction
         assert ibd.motor.energised
 
 
-def test_ibd_a_jog_is_left_by_a_stop_and_a_new_run_alone(ibd: Bench) -> None:
+def test_ibd_run_command_does_not_end_a_jog_but_stop_then_run_does(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(0x2000, 3)
     ibd.wait(60)
-    assert ibd.write(0x2000, 2) == 0  # confirmed, and of no effect
+    assert ibd.write(0x2000, 2) == 0  # confirmed without effect
     ibd.wait(60)
     assert ibd.motor.frequency == ibd.motor.jog_frequency
     ibd.write(0x2000, 0)
@@ -413,7 +419,7 @@ def test_ibd_a_trip_ends_a_jog(ibd: Bench) -> None:
     assert ibd.motor.frequency == 50
 
 
-def test_ibd_runs_by_the_line_only_if_it_is_set_up_for_it(ibd: Bench) -> None:
+def test_ibd_obeys_the_line_only_if_its_source_parameters_select_it(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(102, 0)  # Prb.02
     assert ibd.write(0x2000, 2) == 0
@@ -429,7 +435,7 @@ def test_ibd_runs_by_the_line_only_if_it_is_set_up_for_it(ibd: Bench) -> None:
     assert ibd.motor.frequency == 50
 
 
-def test_ibd_clamps_silently(ibd: Bench) -> None:
+def test_ibd_stores_the_maximum_for_a_larger_value(ibd: Bench) -> None:
     assert ibd.write(107, 60_000) == 0
     assert ibd.ask(3, 107) == [36_000]
     assert ibd.write(0x2001, 50_000) == 0
@@ -439,7 +445,7 @@ def test_ibd_clamps_silently(ibd: Bench) -> None:
 @pytest.mark.parametrize(
     ("function", "start", "count"), [(3, 107, 5), (3, 0x2000, 1), (3, 50, 1), (4, 3, 1), (0x10, 107, 1)]
 )
-def test_ibd_does_not_answer_impossible_requests(ibd: Bench, function: int, start: int, count: int) -> None:
+def test_ibd_does_not_reply_to_invalid_requests(ibd: Bench, function: int, start: int, count: int) -> None:
     data = b"\0\1" if function == 0x10 else b""
     assert ibd.sim.answer(Message(1, function, start, count, data), 0.0) is None
 
@@ -450,7 +456,7 @@ def test_ibd_reads_at_most_four_registers(ibd: Bench) -> None:
     assert len(reply.data) == 4
 
 
-def test_ibd_obeys_a_broadcast_in_silence(ibd: Bench) -> None:
+def test_ibd_carries_out_a_broadcast_without_a_reply(ibd: Bench) -> None:
     ibd.say("01 06 20 01 13 88 DE 9C")
     ibd.say("01 06 20 00 00 02 03 CB")
     ibd.wait(60)
@@ -459,7 +465,7 @@ def test_ibd_obeys_a_broadcast_in_silence(ibd: Bench) -> None:
     assert not ibd.motor.energised
 
 
-def test_ibd_the_bit_that_is_delixi_s_forward_resets_the_fault(ibd: Bench) -> None:
+def test_ibd_0010h_which_is_delixis_forward_bit_resets_the_fault(ibd: Bench) -> None:
     ibd.sim.trip(1)
     ibd.say("01 06 20 00 00 10 83 C6")  # built
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
@@ -474,16 +480,16 @@ def delixi() -> Bench:
 
 
 @pytest.mark.parametrize("frame", ["01 06 20 00 00 12 02 07", "01 06 00 02 13 88 25 5C"])
-def test_delixi_confirms_with_a_copy(delixi: Bench, frame: str) -> None:
+def test_delixi_confirms_a_write_with_a_copy_of_the_request(delixi: Bench, frame: str) -> None:
     assert delixi.say(frame) == frame
 
 
 @pytest.mark.parametrize("frame", [":010620000012C7", ":0106000213885C"])
-def test_delixi_confirms_with_a_copy_in_ascii(frame: str) -> None:
+def test_delixi_confirms_a_write_in_ascii_with_a_copy_of_the_request(frame: str) -> None:
     assert Bench(DelixiModbus(1, framing=Framing.ASCII)).say(frame) == frame
 
 
-def test_delixi_shows_its_frequency(delixi: Bench) -> None:
+def test_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> None:
     delixi.say("01 06 00 02 13 88 25 5C")
     delixi.say("01 06 20 00 00 12 02 07")
     delixi.wait(60)
@@ -493,13 +499,13 @@ def test_delixi_shows_its_frequency(delixi: Bench) -> None:
     assert delixi.ask(3, 0x020D) == [9]
 
 
-def test_delixi_shows_its_frequency_in_ascii() -> None:
+def test_delixi_output_frequency_is_read_in_ascii_as_printed() -> None:
     delixi = Bench(DelixiModbus(1, framing=Framing.ASCII))
     delixi.sim["output_frequency"] = 50
     assert delixi.say(":010301F4000106") == ":01030213885F"
 
 
-def test_delixi_runs_by_the_line_only_if_it_is_set_up_for_it(delixi: Bench) -> None:
+def test_delixi_obeys_the_line_only_if_its_source_parameters_select_it(delixi: Bench) -> None:
     delixi.say("01 06 00 02 13 88 25 5C")
     delixi.sim["run_source"] = 0  # P00.00
     assert delixi.say("01 06 20 00 00 12 02 07") == "01 06 20 00 00 12 02 07"
@@ -511,7 +517,7 @@ def test_delixi_runs_by_the_line_only_if_it_is_set_up_for_it(delixi: Bench) -> N
     assert (delixi.motor.energised, delixi.motor.frequency) == (True, 0)
 
 
-def test_delixi_turns_backwards(delixi: Bench) -> None:
+def test_delixi_reverse_word_turns_the_motor_in_reverse(delixi: Bench) -> None:
     delixi.say("01 06 00 02 13 88 25 5C")
     delixi.say("01 06 20 00 00 22 02 13")  # built
     delixi.wait(60)
@@ -519,13 +525,13 @@ def test_delixi_turns_backwards(delixi: Bench) -> None:
 
 
 @pytest.mark.parametrize(("function", "start", "count"), [(3, 0x01F4, 2), (3, 0x9999, 1), (4, 0x01F4, 1)])
-def test_delixi_does_not_answer_impossible_requests(
+def test_delixi_does_not_reply_to_invalid_requests(
     delixi: Bench, function: int, start: int, count: int
 ) -> None:
     assert delixi.sim.answer(Message(1, function, start, count), 0.0) is None
 
 
-def test_delixi_obeys_only_run_commands_as_broadcasts(delixi: Bench) -> None:
+def test_delixi_obeys_only_run_commands_among_broadcasts(delixi: Bench) -> None:
     delixi.sim.answer(Message(0, 6, 2, data=b"\x13\x88"), 0.0)
     assert delixi.sim["frequency"] == 0
     delixi.sim.answer(Message(0, 6, 0x2000, data=b"\x00\x12"), 0.0)
@@ -541,11 +547,11 @@ def native() -> Bench:
 
 
 @pytest.mark.parametrize("frame", [":010200020000000005", ":0104000100001388A1", ":0106000200001388A4"])
-def test_native_confirms_with_a_copy(native: Bench, frame: str) -> None:
+def test_native_confirms_a_write_with_a_copy_of_the_request(native: Bench, frame: str) -> None:
     assert native.say(frame) == frame
 
 
-def test_native_shows_its_frequency_and_state(native: Bench) -> None:
+def test_native_frequency_and_run_state_are_read(native: Bench) -> None:
     assert native.say(":010300000000000004")[:9] == ":01030001"  # built; stopped
     native.say(":0104000100001388A1")
     native.say(":010200020000000005")
@@ -561,7 +567,9 @@ def test_native_shows_its_frequency_and_state(native: Bench) -> None:
     ("fault", "shown", "state"),
     [(9, "00000009", 4), (10, "00000010", 4), (14, "00000014", 4), (7, "00000007", 5)],
 )
-def test_native_faults_are_shown_as_printed(native: Bench, fault: int, shown: str, state: int) -> None:
+def test_native_fault_code_is_shown_in_the_printed_digits(
+    native: Bench, fault: int, shown: str, state: int
+) -> None:
     native.sim.trip(fault)
     assert native.say(":01070213000000001D")[9:17] == shown
     assert native.say(":010300000000000004")[5:9] == f"{state:04X}"
@@ -574,11 +582,13 @@ def test_native_faults_are_shown_as_printed(native: Bench, fault: int, shown: st
     [
         (checksums.delixi("0102000900000000"), b":01F0000000000000F1\r\n"),  # no such command
         (checksums.delixi("0107270F00000000"), checksums.delixi("01FC000000000000")),  # no such parameter
-        (b":010200020000000006\r\n", b":01FF00000000000000\r\n"),  # the sum is 05
+        (b":010200020000000006\r\n", b":01FF00000000000000\r\n"),  # wrong checksum instead of 05
         (b":0102000205\r\n", b""),  # of a wrong length
     ],
 )
-def test_native_error_replies(native: Bench, frame: bytes, reply: bytes) -> None:
+def test_native_invalid_requests_get_the_documented_error_replies(
+    native: Bench, frame: bytes, reply: bytes
+) -> None:
     assert native.hear(frame) == reply
 
 
@@ -586,7 +596,7 @@ class MyNative(DelixiNative):
     ramp = setting(17, "s", step=0.1, span=(0.1, 600), table=PARAMETER, while_running=False)
 
 
-def test_native_limits_and_locks() -> None:
+def test_native_refuses_values_beyond_limits_and_locked_parameters() -> None:
     native = Bench(MyNative(1))
     assert native.hear(checksums.delixi("0106001100000064")) == checksums.delixi("0106001100000064")
     assert native.hear(checksums.delixi("0106001100001771")) == checksums.delixi(
@@ -597,14 +607,14 @@ def test_native_limits_and_locks() -> None:
     assert native.sim["ramp"] == 10
 
 
-def test_native_start_in_a_fault_cannot_be_executed(native: Bench) -> None:
+def test_native_start_during_a_fault_is_refused(native: Bench) -> None:
     native.sim.trip(1)
     assert native.say(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 
 
 @pytest.mark.parametrize("fault", [9, 10, 14])
-def test_native_a_fault_and_its_record_agree(native: Bench, fault: int) -> None:
+def test_native_fault_and_fault_record_show_the_same_code(native: Bench, fault: int) -> None:
     native.sim.trip(fault)
     assert native.sim["fault"] == fault
     shown = native.say(":01070213000000001D")[9:17]
@@ -613,13 +623,13 @@ def test_native_a_fault_and_its_record_agree(native: Bench, fault: int) -> None:
         assert native.hear(asked)[9:17].decode() == record
 
 
-def test_native_a_locked_parameter(native: Bench) -> None:
+def test_native_refuses_parameter_writes_while_locked(native: Bench) -> None:
     assert isinstance(native.sim, SimulatedDelixiNative)
     native.sim.locked = True
     locked = checksums.delixi("01FE000000000000")
     assert native.say(":0106000200001388A4").encode() + b"\r\n" == locked
     assert native.hear(checksums.delixi("0105000200001388")) == locked
-    assert native.say(":0104000100001388A1") == ":0104000100001388A1"  # no parameter
+    assert native.say(":0104000100001388A1") == ":0104000100001388A1"  # run setpoint, not a parameter
     assert native.say(":010200020000000005") == ":010200020000000005"
     native.sim.locked = False
     assert native.say(":0106000200001388A4") == ":0106000200001388A4"
@@ -631,14 +641,14 @@ def test_native_refuses_commands_without_line_control(native: Bench) -> None:
     assert not native.motor.energised
 
 
-def test_native_stores_with_06_only(native: Bench) -> None:
+def test_native_only_function_06_wears_the_eeprom(native: Bench) -> None:
     native.say(":0104000100001388A1")
     assert not native.sim.counters.eeprom_writes
     native.say(":0106000200001388A4")
     assert native.sim.counters.eeprom_writes == {"stored_frequency": 1}
 
 
-def test_native_broadcast(native: Bench) -> None:
+def test_native_carries_out_a_broadcast_run_command_without_a_reply(native: Bench) -> None:
     native.say(":0104000100001388A1")
     native.say(":010200020000000005")
     native.wait(60)
@@ -647,7 +657,7 @@ def test_native_broadcast(native: Bench) -> None:
     assert not native.motor.energised
 
 
-def test_native_does_not_answer_modbus_and_modbus_does_not_answer_native(native: Bench) -> None:
+def test_native_and_modbus_drives_ignore_frames_of_the_other_protocol(native: Bench) -> None:
     assert native.say(":010301F4000106") == ""
     assert Bench(DelixiModbus(1, framing=Framing.ASCII)).say(":010701F400000000FD") == ""
 
@@ -673,20 +683,20 @@ FORWARD, STOP, RESET = 0xC400, 0xC000, 0xE000
         "01 06 10 01 1F 40 D5 0A",
     ],
 )
-def test_yd_confirms_with_a_copy(yd: Bench, frame: str) -> None:
+def test_yd_confirms_a_write_with_a_copy_of_the_request(yd: Bench, frame: str) -> None:
     assert yd.say(frame) == frame
 
 
-def test_yd_says_who_it_is(yd: Bench) -> None:
+def test_yd_address_and_maximum_frequency_are_readable(yd: Bench) -> None:
     assert yd.say("01 03 08 02 00 01 27 AA")[:14] == "01 03 02 00 01"
-    assert yd.say("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"  # FH = 80 Hz
+    assert yd.say("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"  # FH, the maximum frequency: 80 Hz
 
 
-def test_yd_reads_one_register_at_a_time(yd: Bench) -> None:
+def test_yd_refuses_to_read_two_registers_at_once(yd: Bench) -> None:
     assert yd.sim.answer(Message(1, 3, 0x1100, 2), 0.0) == Message(1, 3, exception=3)
 
 
-def test_yd_runs_at_the_line_s_frequency(yd: Bench) -> None:
+def test_yd_runs_at_the_setpoint_written_over_the_line(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     yd.wait(60)
@@ -699,7 +709,7 @@ def test_yd_runs_at_the_line_s_frequency(yd: Bench) -> None:
     assert yd.ask(3, 0x1100) == [0]
 
 
-def test_yd_shows_amperes_and_volts_as_percentages(yd: Bench) -> None:
+def test_yd_shows_current_and_voltage_in_percent(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     yd.wait(60)
@@ -707,7 +717,7 @@ def test_yd_shows_amperes_and_volts_as_percentages(yd: Bench) -> None:
     assert yd.ask(3, 0x1205) == [10_000]  # 50 Hz are the rated frequency
 
 
-def test_yd_without_bit_15_the_panel_is_in_command(yd: Bench) -> None:
+def test_yd_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None:
     assert isinstance(yd.sim, SimulatedYD1000)
     yd.sim.panel_runs = True
     yd.write(0x1002, 3000)
@@ -716,7 +726,7 @@ def test_yd_without_bit_15_the_panel_is_in_command(yd: Bench) -> None:
     assert yd.motor.frequency == 30
 
 
-def test_yd_freezes_its_monitors_in_a_trip(yd: Bench) -> None:
+def test_yd_trip_freezes_only_1200h_and_1201h(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     yd.wait(60)
@@ -727,11 +737,11 @@ def test_yd_freezes_its_monitors_in_a_trip(yd: Bench) -> None:
     assert yd.ask(3, 0x1200) == [5000]
     assert yd.ask(3, 0x1201) == [1 << 10]
     assert yd.ask(3, 0x1202) == [5000]
-    assert (yd.ask(3, 0x1203), yd.ask(3, 0x1205)) == ([0], [0])  # only 1200H and 1201H are held
+    assert (yd.ask(3, 0x1203), yd.ask(3, 0x1205)) == ([0], [0])  # only 1200H and 1201H are frozen
     assert yd.ask(3, 0x1210) != [0]
 
 
-def test_yd_restarts_on_a_reset_and_is_deaf_meanwhile(yd: Bench) -> None:
+def test_yd_reset_restarts_the_drive_which_ignores_requests_meanwhile(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.sim.trip(3)
     assert yd.write(0x1000, RESET) == 0
@@ -743,8 +753,8 @@ def test_yd_restarts_on_a_reset_and_is_deaf_meanwhile(yd: Bench) -> None:
 
 
 @pytest.mark.parametrize("bit", [13, 12, 11, 10, 8, 7], ids=lambda bit: f"bit {bit}")
-def test_yd_no_command_works_without_bit_15(yd: Bench, bit: int) -> None:
-    """The panel that is in command then lets the motor run (8.1)."""
+def test_yd_command_bit_without_bit_15_has_no_effect(yd: Bench, bit: int) -> None:
+    """Without bit 15 the panel is in control, and here lets the motor run (8.1)."""
     assert isinstance(yd.sim, SimulatedYD1000)
     yd.sim.panel_runs = True
     yd.write(0x1001, 3000)
@@ -763,11 +773,11 @@ def test_yd_no_command_works_without_bit_15(yd: Bench, bit: int) -> None:
         (0xC600, 1 << 10 | 1 << 9),
         (0xC440, 1 << 10 | 1 << 6),
         (0xC100, 1 << 10 | 1 << 8),
-        (0xC080, 1 << 10 | 1 << 7),  # "in DC braking this bit is run" (8.2, table 2)
+        (0xC080, 1 << 10 | 1 << 7),  # bit "run" while braking with direct current (8.2, table 2)
         (0xC000, 0),
     ],
 )
-def test_yd_shows_the_motor_s_state(yd: Bench, word: int, state: int) -> None:
+def test_yd_status_bits_show_the_motors_state(yd: Bench, word: int, state: int) -> None:
     yd.write(0x1001, 3000)
     yd.write(0x1000, word)
     yd.wait(60)
@@ -777,7 +787,7 @@ def test_yd_shows_the_motor_s_state(yd: Bench, word: int, state: int) -> None:
     assert not yd.motor.energised
 
 
-def test_yd_brakes_by_direct_current_until_a_stop(yd: Bench) -> None:
+def test_yd_direct_current_brake_keeps_the_motor_energised_at_0_hz(yd: Bench) -> None:
     yd.write(0x1001, 3000)
     yd.write(0x1000, FORWARD)
     yd.wait(60)
@@ -789,7 +799,7 @@ def test_yd_brakes_by_direct_current_until_a_stop(yd: Bench) -> None:
 @pytest.mark.parametrize(
     ("bits", "speed"), [(0x8, 1), (0x4, 2), (0xC, 3), (0x2, 4), (0xA, 5), (0x6, 6), (0xE, 7)]
 )
-def test_yd_preset_speeds(yd: Bench, bits: int, speed: int) -> None:
+def test_yd_preset_speed_bits_select_the_speed(yd: Bench, bits: int, speed: int) -> None:
     yd.write(0x1001, 5000)
     for number, address in enumerate((0x18, 0x19, 0x20, 0x21, 0x22, 0x23, 0x24), start=1):
         assert yd.write(address, 1000 + number * 100) == 0
@@ -813,17 +823,17 @@ def test_yd_preset_speeds(yd: Bench, bits: int, speed: int) -> None:
     ],
     ids=lambda each: f"{each:04X}",
 )
-def test_yd_refuses_values_beyond_its_limits(yd: Bench, address: int, value: int) -> None:
+def test_yd_refuses_values_beyond_the_documented_limits(yd: Bench, address: int, value: int) -> None:
     before = yd.ask(3, address)
     assert yd.write(address, value) == 3
     assert yd.ask(3, address) == before
 
 
-def test_yd_its_limits_are_those_that_it_holds(yd: Bench) -> None:
+def test_yd_limits_follow_the_present_values_of_other_parameters(yd: Bench) -> None:
     assert yd.write(0x0012, 6000) == 0  # UL
     assert (yd.write(0x0013, 6001), yd.write(0x0013, 2000)) == (3, 0)  # LL
     assert (yd.write(0x0018, 1999), yd.write(0x0018, 2000)) == (3, 0)  # Sr1
-    assert (yd.write(0x0012, 1999), yd.write(0x0011, 5999)) == (3, 3)  # neither UL below LL nor FH below UL
+    assert (yd.write(0x0012, 1999), yd.write(0x0011, 5999)) == (3, 3)  # UL below LL, FH below UL
 
 
 @pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
@@ -833,7 +843,7 @@ def test_yd_does_not_store_the_panel_s_setpoint(yd: Bench, address: int) -> None
     assert not yd.sim.counters.eeprom_writes
 
 
-def test_yd_its_watchdog_restarts_after_a_reset(yd: Bench) -> None:
+def test_yd_watchdog_is_inactive_after_a_reset_until_the_first_message(yd: Bench) -> None:
     yd.write(0x0803, 1)
     yd.write(0x1000, RESET)
     yd.now += 5
@@ -848,21 +858,21 @@ def test_yd_obeys_broadcasts_of_command_and_frequency_only(yd: Bench) -> None:
     assert (yd.sim["frequency"], yd.sim["acceleration_time"]) == (50, 10)
 
 
-def test_yd_all_but_commands_wears_the_eeprom(yd: Bench) -> None:
+def test_yd_every_write_except_commands_wears_the_eeprom(yd: Bench) -> None:
     yd.write(0x0009, 50)
     yd.write(0x1001, 5000)
     assert yd.sim.counters.eeprom_writes == {"acceleration_time": 1}
 
 
-def test_yd_locks_some_parameters_while_it_runs(yd: Bench) -> None:
-    assert yd.write(0x0012, 6000) == 0  # UL, which FH is not below
+def test_yd_refuses_to_change_some_parameters_while_running(yd: Bench) -> None:
+    assert yd.write(0x0012, 6000) == 0  # UL, because FH may not be lower
     assert yd.write(0x0011, 6000) == 0
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     assert yd.write(0x0011, 8000) == 4
 
 
-def test_yd_watches_the_line_if_set_to(yd: Bench) -> None:
+def test_yd_watchdog_trips_when_the_line_is_silent_too_long(yd: Bench) -> None:
     yd.write(0x0803, 5)
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
@@ -873,11 +883,11 @@ def test_yd_watches_the_line_if_set_to(yd: Bench) -> None:
     assert yd.motor.fault
 
 
-# ---- all ----
+# ---- all families ----
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
-def test_every_declared_register_can_be_read_or_written_as_declared(family: type[Drive]) -> None:
+def test_every_declared_register_is_readable_and_writable_as_declared(family: type[Drive]) -> None:
     bench = Bench(family(1))
     for register in family.registers.values():
         if register.readable:
@@ -891,8 +901,8 @@ def test_every_declared_register_can_be_read_or_written_as_declared(family: type
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
-def test_every_family_can_be_encoded(family: type[Drive]) -> None:
-    """A register reads as `encoded` says, or its document, through whole frames."""
+def test_encoded_drive_of_every_family_reads_its_codes(family: type[Drive]) -> None:
+    """Each register reads as `encoded` or `known_counts` state, through whole frames."""
     drive = family(5)
     known = drive.known_counts()
     wire = Wire([EncodedDrive(drive)], unpaced=True)

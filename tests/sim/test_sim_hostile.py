@@ -1,4 +1,4 @@
-"""The effect of each fault on the bytes of a hostile line, and how a faults' file is read."""
+"""The effect of each simulated fault on a line's bytes, and how a faults file is loaded."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from multidrop.transport.prepared import make_exchange
 
 READ = checksums.rtu("01 03 00 02 00 01")
 REPLY = checksums.rtu("01 03 02 00 00")
-START = checksums.rtu("01 06 10 00 C4 00")  # of a YD1000
-WHOLE = 5.0  # s, in which all that is on its way comes
+START = checksums.rtu("01 06 10 00 C4 00")  # start command of a YD1000
+WHOLE = 5.0  # s, enough for every delayed byte to arrive
 
 
 class LineClient:
-    """A client's view of a hostile line, on a clock that moves with its requests."""
+    """The client of a line with faults, on simulated time that advances with its requests."""
 
     def __init__(self, *drives: SimulatedDrive, **faults: Any) -> None:
         self.wire = FaultyWire(drives or [SimulatedDrive(Toy(1))], Faults(**faults))
@@ -53,11 +53,11 @@ def bits(one: bytes, other: bytes) -> int:
     return (int.from_bytes(one) ^ int.from_bytes(other)).bit_count()
 
 
-def test_without_faults_it_is_a_wire() -> None:
+def test_wire_without_faults_delivers_the_plain_reply() -> None:
     assert LineClient().bytes_after() == REPLY
 
 
-def test_the_same_seed_brings_the_same_faults() -> None:
+def test_same_seed_gives_the_same_faults() -> None:
     def story(seed: int) -> list[Any]:
         line = LineClient(seed=seed, drop=0.2, delay=0.3, noise=0.2, merge=0.2, split=0.3)
         return [line.after() for _ in range(50)]
@@ -66,28 +66,28 @@ def test_the_same_seed_brings_the_same_faults() -> None:
 
 
 @pytest.mark.parametrize(("fault", "length"), [("drop", -1), ("flip", 0), ("repeat", 1)])
-def test_a_frame_is_damaged_once(fault: str, length: int) -> None:
+def test_damaged_frame_has_exactly_one_fault(fault: str, length: int) -> None:
     line = LineClient(**{fault: 0.5})
     found = [line.bytes_after() for _ in range(200)]
     damaged = [each for each in found if each not in (REPLY, b"")]
-    assert 20 < len(damaged) < 80  # half of them, where the request was spared
+    assert 20 < len(damaged) < 80  # about a quarter: reply damaged, request not
     assert {len(each) - len(REPLY) for each in damaged} == {length}
     if fault == "flip":
         assert {bits(each, REPLY) for each in damaged} == {1}
     assert line.wire.struck[fault] >= len(damaged) + found.count(b"")
 
 
-def test_a_reply_comes_twice() -> None:
+def test_twice_fault_delivers_the_reply_twice() -> None:
     assert LineClient(twice=1).bytes_after() == 2 * REPLY
 
 
-def test_a_reply_comes_late() -> None:
+def test_delay_fault_delays_the_reply_by_up_to_late() -> None:
     usual = LineClient().after()[0][0]
     delays = [LineClient(delay=1, late=0.5, seed=seed).after()[0][0] - usual for seed in range(50)]
     assert 0 <= min(delays) < 0.1 < 0.4 < max(delays) <= 0.5
 
 
-def test_a_reply_waits_for_the_next_one() -> None:
+def test_merge_fault_holds_a_reply_until_the_next_one() -> None:
     line = LineClient(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
     line.wire.receive(READ, 0.0)
     assert timeline(line.wire, 0.3) == []
@@ -97,14 +97,14 @@ def test_a_reply_waits_for_the_next_one() -> None:
     assert received[-1][0] < 0.5
 
 
-def test_a_reply_waits_only_so_long_for_the_next_one() -> None:
+def test_merge_fault_releases_a_reply_after_late_seconds() -> None:
     line = LineClient(merge=1, late=0.2)
     received = line.after()
     assert b"".join(piece for _, piece in received) == REPLY
     assert received[-1][0] < 0.4
 
 
-def test_a_reply_has_a_pause_inside() -> None:
+def test_split_fault_puts_a_pause_inside_the_reply() -> None:
     pauses = []
     for seed in range(50):
         times, pieces = zip(*LineClient(split=1, pause=0.5, seed=seed).after(), strict=True)
@@ -113,11 +113,11 @@ def test_a_reply_has_a_pause_inside() -> None:
     assert max(pauses) > 0.4
 
 
-def test_a_request_comes_back() -> None:
+def test_echo_fault_returns_the_request_before_the_reply() -> None:
     assert LineClient(echo=1).bytes_after() == READ + REPLY
 
 
-def test_noise_is_heard_before_a_reply_and_by_the_drives() -> None:
+def test_noise_fault_adds_bytes_before_the_reply() -> None:
     lengths = set()
     line = LineClient(noise=1, burst=9)
     for _ in range(100):
@@ -127,20 +127,20 @@ def test_noise_is_heard_before_a_reply_and_by_the_drives() -> None:
     assert lengths == set(range(1, 10))
 
 
-def test_noise_comes_with_a_motor_s_start() -> None:
+def test_start_noise_occurs_only_when_a_motor_starts() -> None:
     line = LineClient(simulated(YD1000(1)), start_noise=1)
     stop = checksums.rtu("01 06 10 00 C0 00")
     assert line.bytes_after(stop) == stop
     assert len(line.bytes_after(START)) > len(START)
-    assert line.bytes_after(START) == START  # it runs already
+    assert line.bytes_after(START) == START  # the motor runs already
     assert line.wire.struck["start_noise"] == 1
 
 
-# ---- one drive ----
+# ---- faults of one drive ----
 
 
 def two_drives(**faults: Any) -> LineClient:
-    """A line whose second drive has these faults."""
+    """Return the client of a line whose second drive has these faults."""
     drives = [SimulatedDrive(Toy(1, name="sound")), SimulatedDrive(Toy(2, name="flaky"))]
     return LineClient(*drives, drives={"flaky": DriveFaults(**faults)})
 
@@ -165,20 +165,20 @@ def test_a_fault_of_one_drive_affects_only_its_replies(fault: str) -> None:
     assert line.wire.struck == {fault: 1}
 
 
-def test_a_drive_falls_silent_and_comes_back() -> None:
+def test_silence_fault_stops_a_drives_replies_for_its_duration() -> None:
     line = two_drives(silence=30.0, silent_for=9.0, first=10.0)
-    replies = [line.bytes_after(FLAKY_READ) == FLAKY_REPLY for _ in range(10)]  # every 5 s
+    replies = [line.bytes_after(FLAKY_READ) == FLAKY_REPLY for _ in range(10)]  # one request every 5 s
     assert replies == [True, True, False, False, True, True, True, True, False, False]
     assert line.bytes_after() == REPLY
 
 
-def test_a_running_motor_trips_and_its_load_drifts() -> None:
+def test_trip_fault_trips_a_running_motor_and_drift_changes_its_load() -> None:
     sim = simulated(YD1000(1, name="flaky"))
     assert isinstance(sim, MotorDrive)
     line = LineClient(sim, drives={"flaky": DriveFaults(trip=20.0, first=10.0, drift=0.2)})
     loads = set()
     for _ in range(3):
-        line.after()  # not running: it does not trip
+        line.after()  # a motor at rest does not trip
         loads.add(sim.motor.load)
     assert sim.motor.fault == 0
     assert len(loads) == 3
@@ -189,27 +189,29 @@ def test_a_running_motor_trips_and_its_load_drifts() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS.values())
-def test_a_trip_has_a_code_of_its_family(model: type[Drive]) -> None:
+def test_overload_code_of_every_family_is_valid(model: type[Drive]) -> None:
     drive = model(1)
     assert 0 < overload_code(drive) < 0x10000
 
 
-def test_a_drive_without_a_motor_cannot_trip() -> None:
+def test_trip_fault_for_a_drive_without_a_motor_is_refused() -> None:
     with pytest.raises(ValueError, match="flaky has no simulated motor: remove its trip and drift"):
         two_drives(trip=1.0)
 
 
-# ---- the port ----
+# ---- a port that hangs up ----
 
 
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
-def test_a_port_hangs_up_and_returns_at_its_path(port: str, tmp_path: Path) -> None:
+def test_port_that_hung_up_is_reopened_at_its_path(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
     wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.1, rename=1), port=where, unpaced=True)
     with Simulator([wire]) as sim:
         path = sim.wires[0].path
         names = set()
-        while wire.struck["hang_up"] < 5:  # a connection to the port that is just closing is reset instead
+        while (
+            wire.struck["hang_up"] < 5
+        ):  # a client that connects while the port closes is reset and not counted
             line = opened(path)
             names.add(Path(path).resolve())
             with pytest.raises(LineError):
@@ -219,7 +221,7 @@ def test_a_port_hangs_up_and_returns_at_its_path(port: str, tmp_path: Path) -> N
         found = b""
         while not found:
             line = opened(path)
-            with suppress(PortLost):  # it was the one that is just closing
+            with suppress(PortLost):  # connected while the port was closing
                 found = read(line)
             line.close()
         assert found == REPLY
@@ -249,21 +251,21 @@ def read(line: Line) -> bytes:
     return found.raw
 
 
-def test_a_bare_pty_cannot_hang_up() -> None:
+def test_hang_up_fault_for_a_bare_pty_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
         FaultyWire([simulated(Toy(1))], Faults(hang_up=0.1))
 
 
-# ---- the file ----
+# ---- the faults file ----
 
 
-def test_all_that_a_file_says(tmp_path: Path) -> None:
+def test_every_key_of_a_faults_file_is_loaded(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text("\n".join([*(f"{name} = 0.25" for name in rates_of(Faults)), 'late = "2 s"', "seed = 3"]))
     assert load_faults(path) == Faults(**dict.fromkeys(rates_of(Faults), 0.25), late=2.0, seed=3)
 
 
-def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_faults_file_are_reported_together(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text('drop = 1.5\nflips = 0.1\nlate = "soon"\nburst = 0\nseed = "x"\naway = 3\ndelay = true\n')
     with pytest.raises(ValueError, match=re.escape(str(path))) as mistake:
@@ -284,7 +286,7 @@ def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
     ]
 
 
-def test_faults_of_drives_are_in_their_tables(tmp_path: Path) -> None:
+def test_drive_tables_of_a_faults_file_set_the_drives_faults(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text('drop = 0.1\n[drive.pump-1]\nloss = 0.2\nsilence = "1 min"\n')
     pump = DriveFaults(loss=0.2, silence=60.0)
@@ -321,7 +323,7 @@ def test_the_help_lists_the_keys_of_a_faults_file(capsys: pytest.CaptureFixture[
     assert {name for name in keys if not re.search(rf"^  {name} = ", told, re.MULTILINE)} == set()
 
 
-def test_the_command_reports_a_mistake_in_the_file(
+def test_simulate_command_reports_a_mistake_in_the_faults_file(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     plant, faults = tmp_path / "plant.toml", tmp_path / "faults.toml"

@@ -25,7 +25,7 @@ from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire, encoded, serve, simulated
 
-READ = Message(1, 0x03, 0x3000, 2)  # of a CHE
+READ = Message(1, 0x03, 0x3000, 2)  # a read of a CHE
 
 
 def wire(*, unpaced: bool = True, port: str = "pty") -> Wire:
@@ -48,15 +48,15 @@ def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Messa
 
 @table("port", ["pty", "socket://127.0.0.1:0"])
 @table("unpaced", [True, False], ids=["unpaced", "paced"])
-def test_a_line_is_read_and_opened_again(port: str, unpaced: bool) -> None:
+def test_simulated_port_can_be_opened_and_read_repeatedly(port: str, unpaced: bool) -> None:
     with Simulator([wire(port=port, unpaced=unpaced)]) as sim:
         for _ in range(3):
             with opened(sim.wires[0].path) as fd:
                 assert exchange(fd, READ).data == expected()
-            time.sleep(0.005)  # the silence that a client owes a paced line
+            time.sleep(0.005)  # silence before the next request on a paced line
 
 
-def test_nothing_is_left_behind() -> None:
+def test_ended_simulator_leaves_no_thread_or_descriptor() -> None:
     before = descriptors(), threads()
     for port in ("pty", "socket://127.0.0.1:0"):
         with Simulator([wire(port=port), wire()]) as sim:
@@ -66,7 +66,7 @@ def test_nothing_is_left_behind() -> None:
     assert (descriptors(), threads()) == before
 
 
-def test_many_lines_are_one_thread() -> None:
+def test_one_thread_simulates_many_lines() -> None:
     wires = [Wire([EncodedDrive(InvtCHE(at))], unpaced=True) for at in range(1, 65)]
     before = threads()
     with Simulator(wires) as sim:
@@ -76,16 +76,16 @@ def test_many_lines_are_one_thread() -> None:
                 assert exchange(fd, Message(at, 3, 0x3000, 2)).data == expected(at)
 
 
-def test_a_paced_reply_takes_at_least_its_time_on_the_wire() -> None:
+def test_paced_reply_is_never_faster_than_the_wire() -> None:
     with Simulator([wire(unpaced=False)]) as sim, opened(sim.wires[0].path) as fd:
         begin = time.monotonic()
         exchange(fd, READ)
         taken = time.monotonic() - begin
     delay = sim.wires[0].drives[0].delay
-    assert taken >= (8 + 9) * 10 / 9600 + delay  # never early; how late is the machine's business
+    assert taken >= (8 + 9) * 10 / 9600 + delay  # no upper limit: the test machine may be busy
 
 
-def test_the_next_tcp_client_is_served_when_the_first_has_gone() -> None:
+def test_second_tcp_client_is_served_after_the_first_disconnects() -> None:
     with Simulator([wire(port="socket://127.0.0.1:0")]) as sim, ExitStack() as clients:
         path = sim.wires[0].path
         with opened(path) as first:
@@ -96,8 +96,8 @@ def test_the_next_tcp_client_is_served_when_the_first_has_gone() -> None:
         assert parse_reply(Framing.RTU, receive(second, 9), READ)[0] == 9
 
 
-def test_the_next_tcp_client_is_served_when_the_first_has_broken_off() -> None:
-    """A client whose process dies leaves so: what it was sent is thrown away, and the connection reset."""
+def test_second_tcp_client_is_served_after_the_first_resets_its_connection() -> None:
+    """A killed client's connection ends like this: unread bytes are discarded and the connection is reset."""
     with Simulator([wire(port="socket://127.0.0.1:0")]) as sim:
         path = sim.wires[0].path
         host, _, port = path.removeprefix("socket://").partition(":")
@@ -109,7 +109,7 @@ def test_the_next_tcp_client_is_served_when_the_first_has_broken_off() -> None:
 
 
 class Broken(Wire):
-    """Its test made a mistake."""
+    """A wire with a mistake in the test's own code."""
 
     def distort(self, reply: bytes) -> bytes:
         raise ZeroDivisionError("a mistake of the test's own")
@@ -121,12 +121,12 @@ def ask_in_vain(broken: Wire) -> None:
         until(lambda: sim.failure)
 
 
-def test_a_failure_in_the_simulator_s_thread_is_raised_on_exit() -> None:
+def test_exception_in_the_simulator_thread_is_raised_on_exit() -> None:
     with pytest.raises(ZeroDivisionError, match="a mistake of the test's own"):
         ask_in_vain(Broken([EncodedDrive(InvtCHE(1))], unpaced=True))
 
 
-def test_two_framings_answer_on_one_line() -> None:
+def test_drives_of_three_framings_reply_on_one_line() -> None:
     drives = [
         EncodedDrive(InvtCHE(1)),
         simulated(InnovertIBD(2, framing="ascii")),
@@ -139,8 +139,8 @@ def test_two_framings_answer_on_one_line() -> None:
         assert exchange(fd, READ).data == expected()
 
 
-def test_a_client_at_another_baud_rate_is_not_heard() -> None:
-    drives = [EncodedDrive(InvtCHE(1)), simulated(ErmanERG220(2))]  # 9600 and 38400
+def test_drives_ignore_a_client_at_another_baud_rate() -> None:
+    drives = [EncodedDrive(InvtCHE(1)), simulated(ErmanERG220(2))]  # baud rates 9600 and 38400
     state = Message(2, 4, 0x0400, 4)
     with Simulator([Wire(drives, unpaced=True)]) as sim:
         path = sim.wires[0].path
@@ -154,7 +154,7 @@ def test_a_client_at_another_baud_rate_is_not_heard() -> None:
             assert receive(fd, 1, patience=0.05) == b""
 
 
-def test_garbage_then_a_good_frame() -> None:
+def test_valid_frame_after_garbage_is_answered() -> None:
     with Simulator([wire()]) as sim, opened(sim.wires[0].path) as fd:
         for garbage in (b"\x00", bytes(range(256)), b":::" * 2000, b"\xff" * 5000):
             os.write(fd, garbage)
@@ -162,13 +162,13 @@ def test_garbage_then_a_good_frame() -> None:
             assert exchange(fd, READ).data == expected()
 
 
-def test_an_unknown_function_is_answered_when_silence_has_ended_it() -> None:
+def test_unknown_function_gets_an_exception_reply_after_silence() -> None:
     with Simulator([Wire([simulated(ErmanERG220(1))])]) as sim, opened(sim.wires[0].path, 38400) as fd:
         os.write(fd, checksums.rtu("01 2B"))
         assert receive(fd, 5) == checksums.rtu("01 AB 01")
 
 
-def test_a_pty_can_have_a_name(tmp_path: Path) -> None:
+def test_named_pty_is_opened_through_its_link(tmp_path: Path) -> None:
     link = tmp_path / "hall-1"
     with Simulator([wire(port=str(link))]) as sim:
         assert sim.wires[0].path == str(link)
@@ -180,7 +180,7 @@ def test_a_pty_can_have_a_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("url", ["socket://127.0.0.1", "socket://:5020"])
-def test_a_tcp_port_needs_host_and_port(url: str) -> None:
+def test_tcp_port_without_host_or_port_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match=r"socket://host:port, such as"), Simulator([wire(port=url)]):
         pass
 
@@ -190,7 +190,7 @@ def _serve(link: str, connection: Connection) -> None:
 
 
 @pytest.mark.long
-def test_a_line_in_another_process_that_is_terminated(tmp_path: Path) -> None:
+def test_terminated_simulator_process_removes_its_link(tmp_path: Path) -> None:
     link = tmp_path / "hall-1"
     ours, theirs = multiprocessing.Pipe()
     arguments = (str(link), theirs)

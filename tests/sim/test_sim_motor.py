@@ -1,4 +1,4 @@
-"""The simulated motor's physics, at times that the test chooses."""
+"""The simulated motor's physics on simulated time."""
 
 import math
 
@@ -13,12 +13,12 @@ RATING = Rating(frequency=50, voltage=400, current=10, power=4, torque=26, pole_
 def motor() -> Motor:
     motor = Motor(RATING)
     motor.acceleration_time = 10  # s from 0 to 50 Hz: 5 Hz/s
-    motor.deceleration_time = 5  # 10 Hz/s
+    motor.deceleration_time = 5  # s from 50 Hz to 0: 10 Hz/s
     motor.target = 40
     return motor
 
 
-def test_the_motor_is_off_until_a_run(motor: Motor) -> None:
+def test_motor_has_no_voltage_until_run_is_called(motor: Motor) -> None:
     motor.run_to(1000)
     assert (motor.frequency, motor.current, motor.voltage, motor.phase) == (0, 0, 0, Phase.STOPPED)
 
@@ -32,21 +32,21 @@ def test_the_motor_is_off_until_a_run(motor: Motor) -> None:
         (100, 40, Phase.CONSTANT),
     ],
 )
-def test_it_accelerates_along_its_ramp(motor: Motor, now: float, frequency: float, phase: Phase) -> None:
+def test_motor_accelerates_along_its_ramp(motor: Motor, now: float, frequency: float, phase: Phase) -> None:
     motor.run()
     motor.run_to(now)
     assert motor.frequency == pytest.approx(frequency)
     assert motor.phase is phase
 
 
-def test_the_ramp_does_not_depend_on_how_often_it_is_looked_at(motor: Motor) -> None:
+def test_ramp_is_the_same_in_one_step_or_many(motor: Motor) -> None:
     motor.run()
     for step in range(1, 401):
         motor.run_to(step / 100)
     assert motor.frequency == pytest.approx(20)
 
 
-def test_a_stop_goes_down_the_ramp_and_then_takes_the_voltage_off(motor: Motor) -> None:
+def test_stop_ramps_down_and_then_removes_the_voltage(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     motor.stop()
@@ -57,7 +57,7 @@ def test_a_stop_goes_down_the_ramp_and_then_takes_the_voltage_off(motor: Motor) 
     assert (motor.frequency, motor.phase, motor.energised) == (0, Phase.STOPPED, False)
 
 
-def test_a_lower_target_is_reached_along_the_deceleration_ramp(motor: Motor) -> None:
+def test_lower_target_is_reached_along_the_deceleration_ramp(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     motor.target = 30
@@ -67,19 +67,19 @@ def test_a_lower_target_is_reached_along_the_deceleration_ramp(motor: Motor) -> 
     assert motor.frequency == 30
 
 
-def test_a_reversal_brakes_to_zero_first(motor: Motor) -> None:
+def test_reversal_decelerates_to_zero_first(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     motor.run(-1)
-    motor.run_to(104)  # 40 Hz at 10 Hz/s
+    motor.run_to(104)  # 4 s from 40 Hz to 0, at 10 Hz/s
     assert motor.frequency == pytest.approx(0)
-    motor.run_to(106)  # then at 5 Hz/s
+    motor.run_to(106)  # 2 s in reverse, at 5 Hz/s
     assert motor.frequency == pytest.approx(-10)
     motor.run_to(104 + 8)
     assert motor.frequency == pytest.approx(-40)
 
 
-def test_coasting_takes_the_voltage_off_while_the_shaft_runs_out(motor: Motor) -> None:
+def test_coast_removes_the_voltage_while_the_shaft_runs_down(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     turning = motor.speed
@@ -91,14 +91,14 @@ def test_coasting_takes_the_voltage_off_while_the_shaft_runs_out(motor: Motor) -
     assert motor.speed == 0
 
 
-def test_the_target_is_limited_by_the_maximum_frequency(motor: Motor) -> None:
+def test_target_is_limited_to_the_maximum_frequency(motor: Motor) -> None:
     motor.target = 400
     motor.run()
     motor.run_to(1000)
     assert motor.frequency == 50
 
 
-def test_volts_follow_hertz_and_amperes_follow_the_load(motor: Motor) -> None:
+def test_voltage_follows_frequency_and_current_follows_load(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     assert motor.voltage == pytest.approx(400 * 40 / 50)
@@ -109,7 +109,7 @@ def test_volts_follow_hertz_and_amperes_follow_the_load(motor: Motor) -> None:
     assert motor.power == pytest.approx(4 * 40 / 50)
 
 
-def test_the_bus_sags_under_load_and_rises_while_braking(motor: Motor) -> None:
+def test_dc_bus_voltage_falls_under_load_and_rises_while_braking(motor: Motor) -> None:
     idle = motor.dc_bus_voltage
     assert idle == pytest.approx(400 * math.sqrt(2))
     motor.run()
@@ -120,7 +120,7 @@ def test_the_bus_sags_under_load_and_rises_while_braking(motor: Motor) -> None:
     assert motor.dc_bus_voltage > idle
 
 
-def test_the_heatsink_warms_slowly_and_cools_again(motor: Motor) -> None:
+def test_heatsink_warms_under_load_and_cools_at_rest(motor: Motor) -> None:
     motor.load = 0.95
     motor.run()
     motor.run_to(10)
@@ -132,7 +132,7 @@ def test_the_heatsink_warms_slowly_and_cools_again(motor: Motor) -> None:
     assert motor.heatsink == pytest.approx(25, abs=0.01)
 
 
-def test_a_fault_keeps_the_motor_off_and_a_reset_does_not_start_it(motor: Motor) -> None:
+def test_fault_prevents_a_run_until_reset_which_starts_nothing(motor: Motor) -> None:
     motor.run()
     motor.run_to(100)
     motor.trip(7)
@@ -148,20 +148,20 @@ def test_a_fault_keeps_the_motor_off_and_a_reset_does_not_start_it(motor: Motor)
     assert motor.frequency == 40
 
 
-def test_it_remembers_four_faults_the_latest_first(motor: Motor) -> None:
+def test_fault_record_keeps_the_four_latest_faults(motor: Motor) -> None:
     for code in range(1, 6):
         motor.trip(code)
     assert [motor.fault_record(number) for number in range(1, 6)] == [5, 4, 3, 2, 0]
 
 
-def test_it_counts_the_hours_that_it_ran(motor: Motor) -> None:
+def test_run_time_counts_only_while_the_motor_runs(motor: Motor) -> None:
     motor.run_to(10_000)
     motor.run()
     motor.run_to(17_200)
     assert motor.run_seconds == 7200
 
 
-def test_time_does_not_run_backwards(motor: Motor) -> None:
+def test_run_to_an_earlier_time_changes_nothing(motor: Motor) -> None:
     motor.run()
     motor.run_to(4)
     motor.run_to(3)

@@ -19,7 +19,7 @@ class MyCHE(InvtCHE):
 
 
 def mbpoll(sim: SimulatedDrive, options: str, *values: int) -> subprocess.CompletedProcess[str]:
-    """mbpoll run once against this drive: it reads, or writes the values. A pty knows no parity."""
+    """Run mbpoll once against this drive to read, or to write the values; a pty has no parity."""
     program = require_program("mbpoll")
     baudrate, address = str(sim.drive.settings.baudrate), str(sim.drive.address)
     with Simulator([Wire([sim])]) as simulator:
@@ -43,7 +43,9 @@ def values(done: subprocess.CompletedProcess[str]) -> list[str]:
         (InnovertIBD(1), "output_current", 2.5, "-r 3 -c 1 -t 4 -1", ["25"]),
     ],
 )
-def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown: list[str]) -> None:
+def test_mbpoll_reads_registers_of_a_simulated_drive(
+    drive: Drive, name: str, value: float, options: str, shown: list[str]
+) -> None:
     sim = simulated(drive)
     sim[name] = value
     assert values(mbpoll(sim, options)) == shown
@@ -59,20 +61,22 @@ def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown
         (InnovertIBD(1), "-r 107 -t 4", [200], "acceleration_time", 20),
     ],
 )
-def test_mbpoll_writes(drive: Drive, options: str, raw: list[int], name: str, value: float) -> None:
+def test_mbpoll_writes_a_register_of_a_simulated_drive(
+    drive: Drive, options: str, raw: list[int], name: str, value: float
+) -> None:
     sim = simulated(drive)
     done = mbpoll(sim, options, *raw)
     assert done.returncode == 0, done.stderr
     assert sim[name] == value
 
 
-def test_mbpoll_understands_refusals() -> None:
+def test_mbpoll_reports_the_drives_exception() -> None:
     done = mbpoll(simulated(InvtCHE(1)), "-r 32779 -c 1 -t 4 -1")
     assert done.returncode == 1
     assert "Illegal data address" in done.stderr
 
 
-def test_mbpoll_sees_silence() -> None:
+def test_mbpoll_times_out_if_the_drive_does_not_reply() -> None:
     done = mbpoll(simulated(InnovertIBD(1)), "-r 50 -c 1 -t 4 -1")
     assert done.returncode == 1
     assert "timed out" in done.stderr

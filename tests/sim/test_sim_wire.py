@@ -1,4 +1,4 @@
-"""One line of simulated drives: which drives receive a byte, and when it has passed, on the test's clock."""
+"""One line of simulated drives on simulated time: which drives receive a byte, and when."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def exchange(wire: Wire, frame: bytes, now: float, baudrate: int | None = None) 
     return b"".join(piece for _, piece in timeline(wire, now + 5))
 
 
-def test_the_reply_waits_for_the_request_s_last_bit_and_the_drive() -> None:
+def test_reply_starts_after_the_requests_last_bit_and_the_response_delay() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.02)])
     wire.receive(READ, 10.0)
     received = timeline(wire, 11.0)
@@ -36,7 +36,7 @@ def test_the_reply_waits_for_the_request_s_last_bit_and_the_drive() -> None:
 
 
 @table("baudrate", [1200, 9600, 19200, 38400, 115200])
-def test_no_byte_comes_before_its_last_bit_and_none_much_later(baudrate: int) -> None:
+def test_each_byte_is_delivered_at_its_last_bit_or_slightly_later(baudrate: int) -> None:
     drive = Own(1, baudrate=baudrate)
     wire = Wire([SimulatedDrive(drive, response_delay=0.05)])
     wire.receive(checksums.rtu("01 03 00 01 00 02"), 0.0)
@@ -46,16 +46,14 @@ def test_no_byte_comes_before_its_last_bit_and_none_much_later(baudrate: int) ->
     for at, piece in timeline(wire, 1.0):
         passed += len(piece)
         ends = begin + passed * character
-        assert at == pytest.approx(ends)  # its last byte: on time
-        assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9  # its first
+        assert at == pytest.approx(ends)  # the last byte of the piece is on time
+        assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9  # the first byte
     assert passed == 9
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000])
 @table("extra", [b"\0", b"\x01\x03", b"\xff\xff\xff"])
-def test_a_drive_is_silent_to_a_good_frame_with_more_bytes_behind_it(
-    family: type[Drive], extra: bytes
-) -> None:
+def test_valid_frame_followed_by_more_bytes_gets_no_reply(family: type[Drive], extra: bytes) -> None:
     """ERMAN, section 5: wrong length; CHE, 11.5; YD1000, section 5: nothing may follow the checksum."""
     wire = Wire([simulated(family(1))])
     register = next(each for each in wire.drives[0].drive.readings() if each.step is not None)
@@ -64,7 +62,7 @@ def test_a_drive_is_silent_to_a_good_frame_with_more_bytes_behind_it(
     assert exchange(wire, good, 20.0) != b""
 
 
-def test_an_rtu_drive_keeps_t3_5_even_if_it_is_quicker() -> None:
+def test_rtu_reply_waits_t3_5_even_for_a_shorter_response_delay() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.0)])
     wire.receive(READ, 0.0)
     assert timeline(wire, 1.0)[0][0] == pytest.approx((8 + 3.5 + 1) * CHARACTER_8N1)
@@ -79,14 +77,14 @@ def test_an_rtu_drive_keeps_t3_5_even_if_it_is_quicker() -> None:
     ],
     ids=lambda each: getattr(each, "model", None),
 )
-def test_each_family_s_silence_before_its_reply(drive: Drive, request_: str, silence: float) -> None:
+def test_silence_before_a_reply_is_that_of_the_family(drive: Drive, request_: str, silence: float) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
     wire.receive(checksums.rtu(request_), 0.0)
     character = drive.settings.character
     assert timeline(wire, 1.0)[-1][0] == pytest.approx((8 + 7) * character + silence)
 
 
-def test_an_unpaced_wire_has_no_waits() -> None:
+def test_unpaced_wire_replies_without_delay() -> None:
     wire = Wire([SimulatedDrive(Own(1), response_delay=0.5)], unpaced=True)
     wire.receive(READ, 10.0)
     assert wire.advance(10.0) == checksums.rtu("01 03 02 00 00")
@@ -94,7 +92,7 @@ def test_an_unpaced_wire_has_no_waits() -> None:
     assert wire.advance(10.0) == checksums.rtu("01 03 02 00 00")
 
 
-def test_a_request_within_the_silence_after_a_reply_is_not_understood() -> None:
+def test_request_too_soon_after_a_reply_gets_no_reply() -> None:
     sim = simulated(InnovertIBD(1))
     wire = Wire([sim])
     request = checksums.rtu("01 03 00 03 00 01")
@@ -110,7 +108,7 @@ def test_a_request_within_the_silence_after_a_reply_is_not_understood() -> None:
     assert sim.counters.early == 1
 
 
-def test_a_request_that_begins_while_a_reply_is_under_way_is_not_understood() -> None:
+def test_request_during_a_reply_gets_no_reply() -> None:
     sim = SimulatedDrive(Own(1), response_delay=0.02)
     wire = Wire([sim])
     wire.receive(READ, 0.0)
@@ -121,7 +119,7 @@ def test_a_request_that_begins_while_a_reply_is_under_way_is_not_understood() ->
     assert sim.counters.requests == 1
 
 
-def test_a_missing_silence_is_only_counted_unless_the_manual_demands_it() -> None:
+def test_early_request_is_counted_but_answered_unless_the_manual_forbids() -> None:
     sim = SimulatedDrive(Own(1), response_delay=0.02)
     wire = Wire([sim])
     wire.receive(READ, 0.0)
@@ -130,7 +128,7 @@ def test_a_missing_silence_is_only_counted_unless_the_manual_demands_it() -> Non
     assert sim.counters.early == 1
 
 
-def test_a_quick_drive_does_not_wait_for_a_slow_one_s_late_reply() -> None:
+def test_fast_drives_reply_precedes_a_slow_drives_late_reply() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     slow["value"], quick["value"] = 1, 2
     wire = Wire([slow, quick])
@@ -143,7 +141,7 @@ def test_a_quick_drive_does_not_wait_for_a_slow_one_s_late_reply() -> None:
     assert received[-1][0] == pytest.approx(0.5 + (8 + 7) * CHARACTER_8N1)
 
 
-def test_replies_that_meet_follow_one_another() -> None:
+def test_overlapping_replies_are_sent_one_after_another() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     wire = Wire([slow, quick])
     wire.receive(READ, 0.0)
@@ -154,7 +152,7 @@ def test_replies_that_meet_follow_one_another() -> None:
     assert received[-1][0] - received[0][0] == pytest.approx(13 * CHARACTER_8N1)
 
 
-def test_a_late_reply_is_sent_all_the_same() -> None:
+def test_late_reply_is_sent_before_the_reply_to_the_next_request() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     slow["value"], quick["value"] = 1, 2
     wire = Wire([slow, quick])
@@ -164,7 +162,7 @@ def test_a_late_reply_is_sent_all_the_same() -> None:
     assert received == checksums.rtu("01 03 02 00 01") + checksums.rtu("02 03 02 00 02")
 
 
-def test_two_framings_share_a_line() -> None:
+def test_drives_of_two_framings_share_a_line() -> None:
     rtu, text = Own(1, framing="rtu"), Own(2, framing="ascii")
     native = DelixiNative(3)
     wire = Wire([simulated(rtu), simulated(text), simulated(native)], unpaced=True)
@@ -173,14 +171,14 @@ def test_two_framings_share_a_line() -> None:
         (checksums.ascii("020300010001"), checksums.ascii("0203020000")),
         (checksums.delixi("0303000000000000"), checksums.delixi("0303000100000000")),
         (READ, checksums.rtu("01 03 02 00 00")),
-        (checksums.ascii("010300010001"), b""),  # its address is RTU's
+        (checksums.ascii("010300010001"), b""),  # this address belongs to the RTU drive
         (checksums.rtu("02 03 00 01 00 01"), b""),
     ]:
         wire.receive(frame, 0.0)
         assert wire.advance(10.0) == reply
 
 
-def test_a_drive_hears_its_own_baud_rate_only() -> None:
+def test_drive_receives_only_its_own_baud_rate() -> None:
     slow, fast = Own(1, baudrate=9600), Own(2, baudrate=19200)
     wire = Wire([simulated(slow), simulated(fast)])
     other = checksums.rtu("02 03 00 01 00 01")
@@ -188,17 +186,17 @@ def test_a_drive_hears_its_own_baud_rate_only() -> None:
     assert exchange(wire, READ, 10.0, 9600) != b""
     assert exchange(wire, other, 20.0, 9600) == b""
     assert exchange(wire, other, 30.0, 19200) != b""
-    assert exchange(wire, READ, 40.0, None) != b""  # where it cannot be seen, everything is heard
+    assert exchange(wire, READ, 40.0, None) != b""  # unknown baud rate: every drive receives
 
 
-def test_a_frame_started_at_another_baud_rate_is_dropped() -> None:
+def test_frame_is_dropped_if_the_baud_rate_changes_within_it() -> None:
     wire = Wire([simulated(Own(1, baudrate=9600))])
     wire.receive(READ[:4], 0.0, 9600)
     wire.receive(b"", 0.001, 19200)
     assert exchange(wire, READ, 0.002, 9600) != b""
 
 
-def test_all_drives_obey_a_broadcast_and_none_answers() -> None:
+def test_all_drives_carry_out_a_broadcast_and_none_replies() -> None:
     sims = [
         simulated(Own(address, framing=framing))
         for address, framing in ((1, "rtu"), (2, "rtu"), (3, "ascii"))
@@ -208,11 +206,11 @@ def test_all_drives_obey_a_broadcast_and_none_answers() -> None:
     assert [sim["value"] for sim in sims] == [42, 42, 0]
 
 
-def test_an_absent_address_is_silence() -> None:
+def test_request_to_an_absent_address_gets_no_reply() -> None:
     assert exchange(Wire([simulated(Own(1))]), checksums.rtu("09 03 00 01 00 01"), 0.0) == b""
 
 
-def test_the_same_address_twice_is_a_mistake() -> None:
+def test_two_drives_with_the_same_address_are_refused() -> None:
     with pytest.raises(ValueError, match="the same address"):
         Wire([simulated(Own(1)), simulated(Own(1))])
     Wire([simulated(Own(1)), simulated(Own(1, framing="ascii")), simulated(Own(1, baudrate=19200))])
@@ -220,7 +218,7 @@ def test_the_same_address_twice_is_a_mistake() -> None:
         Wire([])
 
 
-def test_noise_can_be_put_on_replies() -> None:
+def test_distort_can_change_replies() -> None:
     class Noisy(Wire):
         def distort(self, reply: bytes) -> bytes:
             return b"\x00" + reply
@@ -228,7 +226,7 @@ def test_noise_can_be_put_on_replies() -> None:
     assert exchange(Noisy([simulated(Own(1))]), READ, 0.0) == b"\x00" + checksums.rtu("01 03 02 00 00")
 
 
-def test_an_idle_wire_needs_no_wake_up() -> None:
+def test_idle_wire_has_no_wake_up_time() -> None:
     wire = Wire([simulated(each) for each in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
     assert wire.wake is None
     wire.receive(b"\x01", 0.0)
@@ -237,6 +235,6 @@ def test_an_idle_wire_needs_no_wake_up() -> None:
     assert wire.wake is None
 
 
-def test_a_path_is_known_only_while_it_is_open() -> None:
+def test_path_of_a_wire_that_is_not_open_raises_runtime_error() -> None:
     with pytest.raises(RuntimeError, match="not open"):
         _ = Wire([simulated(Own(1))], name="hall-1").path

@@ -18,8 +18,8 @@ from multidrop.sim import EncodedDrive, Simulator, Wire, serve, simulated
 PATIENCE = 60.0
 
 
-def test_a_signal_ends_it_though_its_handler_is_not_called() -> None:
-    """A signal may come just before it sleeps: here another thread has it, which runs no handler."""
+def test_signal_ends_serve_even_if_its_handler_has_not_run() -> None:
+    """As for a signal just before the sleep: here another thread gets the signal, and no handler runs."""
 
     def terminate() -> None:
         time.sleep(0.2)
@@ -55,7 +55,7 @@ class IllDrive(EncodedDrive):
         raise Ill("of this drive")
 
 
-def test_a_drive_that_fails_is_silent_and_the_other_wires_go_on(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_drive_gives_no_reply_and_other_wires_continue(caplog: pytest.LogCaptureFixture) -> None:
     wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
     simulator = Simulator(wires)
 
@@ -73,7 +73,7 @@ def test_a_drive_that_fails_is_silent_and_the_other_wires_go_on(caplog: pytest.L
     assert [record.name for record in caplog.records if record.levelname == "ERROR"] == ["multidrop.sim"]
 
 
-def test_a_thread_that_ends_says_so(
+def test_ended_simulator_thread_logs_its_failure(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     simulator = Simulator([Wire([EncodedDrive(Toy(1))])])
@@ -90,8 +90,8 @@ def test_a_thread_that_ends_says_so(
 
 
 @pytest.mark.slow
-def test_simulated_time_passes_faster() -> None:
-    """A motor's ramp of 10 s takes less than one."""
+def test_speed_makes_simulated_time_pass_faster() -> None:
+    """With `speed=20` a motor's ramp of 10 s takes less than one second."""
     sim = simulated(YD1000(1))
     with Simulator([Wire([sim])], speed=20) as simulator, Bus(simulator.wires[0].path) as bus:
         fan = bus.attach(YD1000, 1)
@@ -102,6 +102,6 @@ def test_simulated_time_passes_faster() -> None:
 
 
 @pytest.mark.parametrize("speed", [0, -1, float("inf"), float("nan")])
-def test_speed_is_a_positive_number(speed: float) -> None:
+def test_speed_that_is_not_positive_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="is not a positive number"):
         Simulator([], speed=speed)

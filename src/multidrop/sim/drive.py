@@ -262,7 +262,7 @@ class SimulatedDrive:
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """Return an EncodedDrive's count, made of drive, table and register address; a coil has its lowest bit."""
+    """Return an EncodedDrive's count, made of drive, table and register address; a coil is its lowest bit."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 

@@ -71,9 +71,7 @@ class Memory:
             if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
-                self._read.setdefault(
-                    (table.read, cell.address), None
-                )  # unless another register is readable there
+                self._read.setdefault((table.read, cell.address), None)  # unless it is also readable
             elif table.read is not None:
                 self._read[table.read, cell.address] = cell
             if register.access is Access.READING:

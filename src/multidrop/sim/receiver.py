@@ -93,7 +93,7 @@ class Receiver:
         return Frame(body, message, intact, end - length * self.character, end)
 
     def _cut_rtu(self) -> Frame | None:
-        """Return the next request; None if there is none, or while the bytes after it may become a request."""
+        """Return the next request; None if there is none, or while bytes after it may become a request."""
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:
             at, used, message = found

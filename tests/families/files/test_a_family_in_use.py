@@ -79,7 +79,7 @@ def test_model_path_is_relative_to_the_plant_file(plant: Path, pump: type[Drive]
     assert [drive.model for drive in drives] == ["meter.toml", "pump.toml"]
 
 
-def test_the_plan_is_that_of_a_class(plant: Path) -> None:
+def test_family_file_gives_the_same_poll_plan_as_the_class(plant: Path) -> None:
     """A family from a file causes the same frames as a class."""
     loaded = load_family(plant.parent / "families" / "meter.toml")(3)
     written = Meter(3)
@@ -94,7 +94,7 @@ def test_the_plan_is_that_of_a_class(plant: Path) -> None:
     assert len(planned(loaded)) < len(written.readings())
 
 
-def test_values_are_those_of_a_class(plant: Path) -> None:
+def test_family_file_gives_the_same_values_as_the_class(plant: Path) -> None:
     loaded, written = load_family(plant.parent / "families" / "meter.toml"), Meter
     found = []
     for family in (loaded, written):
@@ -111,7 +111,7 @@ def test_values_are_those_of_a_class(plant: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_plant_of_two_files_from_the_wire_to_the_report(
+def test_plant_with_two_family_files_is_scanned_recorded_and_reported(
     run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(plant.parent)
@@ -180,7 +180,7 @@ def test_unconfirmed_file_sends_no_broadcast(tmp_path: Path, monkeypatch: pytest
     assert line.written == []
 
 
-def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:
+def test_confirmed_drive_of_a_family_file_accepts_writes(pump: type[Drive]) -> None:
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2, confirmed=1)
@@ -191,7 +191,7 @@ def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:
         assert simulated_writes(line) == ["ramp", "run"]
 
 
-def test_a_file_that_only_measures_needs_no_confirmation(plant: Path) -> None:
+def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None:
     family = load_family(plant.parent / "families" / "meter.toml")
     assert "confirmed" not in family.options
 
@@ -206,7 +206,7 @@ def test_a_file_that_only_measures_needs_no_confirmation(plant: Path) -> None:
         ("above = 5\nbelow = 7", 7, False),
     ],
 )
-def test_file_recognises_its_drives_by_the_values_of_registers(
+def test_identify_section_recognises_drives_by_register_values(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, proof: str, value: int, is_one: bool
 ) -> None:
     path = tmp_path / "meter.toml"
@@ -223,7 +223,7 @@ def test_file_recognises_its_drives_by_the_values_of_registers(
         drive.perform(drive.identify.script())
 
 
-def test_files_of_one_name_have_wear_of_their_own(plant: Path) -> None:
+def test_eeprom_writes_of_two_files_with_the_same_name_are_counted_separately(plant: Path) -> None:
     """Writes of two devices that happen to have files of one name are counted apart."""
     other = plant.parent / "other"
     other.mkdir()

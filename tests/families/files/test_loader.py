@@ -49,7 +49,7 @@ def facts(register: Register[Any]) -> dict[str, Any]:
 # ---- the class ----
 
 
-def test_a_family_is_the_class_that_one_would_write(tmp_path: Path) -> None:
+def test_family_file_equals_the_hand_written_class(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert {name: facts(one) for name, one in loaded.registers.items()} == {
         name: facts(one) for name, one in Meter.registers.items()
@@ -64,7 +64,7 @@ def test_a_family_is_the_class_that_one_would_write(tmp_path: Path) -> None:
     assert (loaded.__name__, loaded.model, loaded.declared_in) == ("Meter", "meter.toml", "meter.toml")
 
 
-def test_values_are_read_as_the_file_names_them(tmp_path: Path) -> None:
+def test_named_values_are_read_by_the_names_in_the_file(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert loaded.register("mode").format(loaded.register("mode").decode(1)) == "automatic"
     alarms = loaded.register("alarms").decode(9)
@@ -72,7 +72,7 @@ def test_values_are_read_as_the_file_names_them(tmp_path: Path) -> None:
     assert loaded.register("alarms").format(alarms) == "hot|open"
 
 
-def test_the_same_file_is_the_same_class(tmp_path: Path) -> None:
+def test_loading_the_same_file_twice_gives_the_same_class(tmp_path: Path) -> None:
     path = write_meter(tmp_path)
     first = load_family(path)
     assert load_family(str(path)) is first
@@ -81,7 +81,7 @@ def test_the_same_file_is_the_same_class(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["meter.toml", "meter.csv"])
-def test_a_file_that_changed_is_another_class(tmp_path: Path, name: str) -> None:
+def test_loading_a_changed_file_gives_another_class(tmp_path: Path, name: str) -> None:
     first = load_family(write_meter(tmp_path))
     before = (tmp_path / name).stat()
     text = {"meter.toml": METER.replace("table 2", "table 3"), "meter.csv": METER_CSV.replace("all", "two")}
@@ -92,14 +92,14 @@ def test_a_file_that_changed_is_another_class(tmp_path: Path, name: str) -> None
     assert list(again.registers) == list(first.registers)
 
 
-def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     path = write_meter(tmp_path)
     for file in (path, tmp_path / "meter.csv"):
         file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
     assert load_family(path).title == "Meter M-1"
 
 
-def test_every_detail_of_a_register(tmp_path: Path) -> None:
+def test_every_key_of_a_register_is_loaded(tmp_path: Path) -> None:
     text = (
         HEAD
         + """\
@@ -129,7 +129,7 @@ def test_registers_written_by_function_10h(tmp_path: Path) -> None:
     assert [loaded.register(name).table.write for name in "ab"] == [0x10, 0x06]
 
 
-def test_addresses_of_a_file_may_be_unit_ids_of_modbus_tcp(tmp_path: Path) -> None:
+def test_family_addresses_may_be_unit_ids_0_to_255(tmp_path: Path) -> None:
     head = HEAD + "addresses = [0, 255]\n[reading]\nlevel = { at = 1 }\n"
     loaded = family(tmp_path, head)
     assert loaded.addresses == range(256)
@@ -212,7 +212,7 @@ TOLD = [
 ]
 
 
-def test_more_than_twenty_mistakes_are_reported_at_once(tmp_path: Path) -> None:
+def test_more_than_twenty_mistakes_are_reported_together(tmp_path: Path) -> None:
     (tmp_path / "twenty.csv").write_text(TWENTY_CSV)
     path = tmp_path / "twenty.toml"
     path.write_text(TWENTY)
@@ -256,7 +256,9 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ),
     ],
 )
-def test_identify_and_verb_sections_are_checked(tmp_path: Path, section: str, mistakes: list[str]) -> None:
+def test_mistakes_in_identify_and_verb_sections_are_reported(
+    tmp_path: Path, section: str, mistakes: list[str]
+) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
     (tmp_path / "t.toml").write_text(first + rest)
     told: tuple[str, ...] = ()
@@ -375,7 +377,7 @@ def test_mistake_is_reported_with_its_place(tmp_path: Path, text: str, told: lis
         (b"name,at\n\na b,1\n", "c.csv: line 3, a b: 'a b' cannot be a register's name"),
     ],
 )
-def test_a_mistake_of_a_csv_file_has_its_line(tmp_path: Path, data: bytes, told: str) -> None:
+def test_mistake_in_a_csv_file_is_reported_with_its_line(tmp_path: Path, data: bytes, told: str) -> None:
     (tmp_path / "c.csv").write_bytes(data)
     found = mistakes(tmp_path, HEAD + 'registers = ["c.csv"]\n')
     assert any(told in mistake for mistake in found), found
@@ -384,20 +386,20 @@ def test_a_mistake_of_a_csv_file_has_its_line(tmp_path: Path, data: bytes, told:
 @pytest.mark.parametrize(
     "text", ["name;at;unit\na;0x10;V\n", "name\tat\tunit\na\t16\tV\n", 'Name,At,Unit\n"a","10H",V\n']
 )
-def test_a_csv_file_of_any_delimiter(tmp_path: Path, text: str) -> None:
+def test_csv_file_may_use_any_delimiter(tmp_path: Path, text: str) -> None:
     (tmp_path / "c.csv").write_text(text)
     loaded = family(tmp_path, HEAD + 'registers = ["c.csv"]\n')
     assert (loaded.register("a").address, loaded.register("a").unit) == (16, "V")
 
 
-def test_a_csv_file_of_numbered_registers(tmp_path: Path) -> None:
+def test_csv_file_may_use_numbered_registers_such_as_40001(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text("name,at\na,40001\nb,300010\nc,00001\nd,10002\n")
     loaded = family(tmp_path, '[family]\ntitle = "T"\nmanual = "M"\nregisters = ["c.csv"]\n')
     found = [(one.table.name, one.address) for one in loaded.registers.values()]
     assert found == [("holding register", 0), ("input register", 9), ("coil", 0), ("discrete input", 1)]
 
 
-def test_all_cells_of_a_csv_file(tmp_path: Path) -> None:
+def test_every_column_of_a_csv_file_is_loaded(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text(
         "name,at,access,step,span,values,kept,while_running,harmless\n"
         "a,1,setting,0.5,0 | 50,,eeprom,no,\n"
@@ -411,7 +413,7 @@ def test_all_cells_of_a_csv_file(tmp_path: Path) -> None:
     assert [(each.name, each.value) for each in b.values] == [("off", 0), ("on", 16)]
 
 
-def test_missing_and_invalid_files(tmp_path: Path) -> None:
+def test_missing_or_invalid_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FamilyError, match="there is no such file"):
         load_family(tmp_path / "none.toml")
     for path in (tmp_path, Path("/dev/zero")):
@@ -419,20 +421,20 @@ def test_missing_and_invalid_files(tmp_path: Path) -> None:
             load_family(path)
 
 
-def test_mistakes_are_bounded(tmp_path: Path) -> None:
+def test_number_of_reported_mistakes_is_limited(tmp_path: Path) -> None:
     text = HEAD + "[reading]\n" + "".join(f"a{number} = 5\n" for number in range(300))
     found = mistakes(tmp_path, text)
     assert (len(found), found[-1]) == (201, "t.toml: 100 more mistakes are not shown; correct these first")
 
 
-def test_every_key_is_in_the_reference() -> None:
+def test_every_key_is_documented_in_the_reference() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "family-file.md").read_text("utf-8")
     missing = [key for key in (*FAMILY_KEYS, *REGISTER_KEYS) if f"`{key}`" not in page]
     assert missing == []
     assert [section for section in SECTIONS if f"[{section}]" not in page] == []
 
 
-def test_texts(tmp_path: Path) -> None:
+def test_texts_are_declared_and_read(tmp_path: Path) -> None:
     entries = 'serial = { at = 0xFC00, length = 8, order = "BA" }\nkind = { at = "30011", length = 2 }\n'
     loaded: Any = family(tmp_path, HEAD + "[text]\n" + entries)
     assert (loaded.serial.address, loaded.serial.length, loaded.serial.order) == (0xFC00, 8, "BA")
@@ -457,7 +459,7 @@ def test_texts(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:
+def test_mistakes_in_texts_are_reported(tmp_path: Path, entry: str, told: str) -> None:
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
     assert any(told in mistake for mistake in found), found
 
@@ -471,7 +473,7 @@ groups = [{ code = "P00.", at = "0000H", count = 3 }, { code = "P", at = "1000H"
 """
 
 
-def test_rule_of_parameters(tmp_path: Path) -> None:
+def test_parameters_section_gives_the_address_rule(tmp_path: Path) -> None:
     more = 'line = ["P00.00"]\npasswords = ["P001"]\nnever = { "P00.02" = "it starts a test" }\n'
     found = parameters_of(family(tmp_path, HEAD + RULE + more))
     assert {code: (one.name, one.address) for code, one in found.items()} == {
@@ -496,12 +498,12 @@ def test_rule_of_parameters(tmp_path: Path) -> None:
         ('groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"', "firmware = 'x' is not a register"),
     ],
 )
-def test_mistakes_of_parameters(tmp_path: Path, rule: str, told: str) -> None:
+def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: str, told: str) -> None:
     text = f"{HEAD}[reading]\na = {{ at = 1 }}\n[parameters]\n{rule}\n"
     assert any(told in mistake for mistake in mistakes(tmp_path, text))
 
 
-def test_details_of_a_number(tmp_path: Path) -> None:
+def test_number_format_and_order_of_a_register_are_loaded(tmp_path: Path) -> None:
     text = (
         HEAD
         + """\

@@ -55,7 +55,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
 @pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(st.sampled_from(SEEDS), st.integers(0, 2**32))
-def test_a_damaged_file_is_taken_or_refused(seed: bytes, number: int) -> None:
+def test_damaged_file_loads_or_is_refused_with_sentences(seed: bytes, number: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         read("family", mutated(seed, random.Random(number)), Path(folder))
 

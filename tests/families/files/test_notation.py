@@ -35,7 +35,7 @@ from multidrop.families.files.notation import Counting, sent_as
         (40001, 0, "input", (40001, "input")),
     ],
 )
-def test_addresses_on_the_wire(
+def test_toml_address_gives_the_address_on_the_wire(
     given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address(given, table, "holding") == sent
@@ -54,7 +54,9 @@ def test_addresses_on_the_wire(
         ("0016", 0, (16, "holding")),
     ],
 )
-def test_addresses_in_csv_cells(cell: str, counts_from: int | None, sent: tuple[int, str]) -> None:
+def test_csv_cell_gives_the_address_on_the_wire(
+    cell: str, counts_from: int | None, sent: tuple[int, str]
+) -> None:
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
 
 
@@ -84,13 +86,13 @@ def test_invalid_addresses_are_refused(given: Any, sentence: str) -> None:
 
 
 @table("table", ["holding", "input", "coil", "discrete"])
-def test_every_address_can_be_written_as_it_is_sent(table: str) -> None:
+def test_every_address_has_a_notation_with_counts_from_0(table: str) -> None:
     for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
         written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
         assert Counting(0).address(written, table, "holding") == (address, table)
 
 
-def test_a_digit_that_contradicts_its_table() -> None:
+def test_address_digit_that_contradicts_its_table_is_refused() -> None:
     with pytest.raises(
         ValueError, match='"30001" begins with 3, which is table input, and table is "holding"'
     ):
@@ -108,7 +110,7 @@ def test_a_digit_that_contradicts_its_table() -> None:
         ("1" * 400, "is outside 0 to FFFFH"),
     ],
 )
-def test_cells_that_are_refused(cell: str, sentence: str) -> None:
+def test_invalid_csv_cells_are_refused_with_an_example(cell: str, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         Counting(0).address_in_cell(cell, None, "holding")
     assert sentence in str(refused.value)

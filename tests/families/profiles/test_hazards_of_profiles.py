@@ -59,7 +59,7 @@ class Line:
         assert self.drive.state().condition is Condition.RUNNING
 
 
-def test_a_start_and_a_stop(line: Line) -> None:
+def test_start_runs_the_motor_and_stop_ends_the_run(line: Line) -> None:
     line.runs()
     assert len(line.starts) == 1
     assert abs(line.sim.motor.target) == pytest.approx(20, abs=0.01)
@@ -71,7 +71,7 @@ def test_a_start_and_a_stop(line: Line) -> None:
     assert line.sim.motor.energised
 
 
-def test_a_stop_is_watched(line: Line) -> None:
+def test_stop_waits_until_the_motor_is_at_rest(line: Line) -> None:
     line.runs()
     line.set_ramps(20.0)
     before = line.bus.seconds
@@ -80,7 +80,7 @@ def test_a_stop_is_watched(line: Line) -> None:
     assert line.sim.motor.frequency == 0
 
 
-def test_a_trip_while_starting(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.drive.set_frequency(20)
     monkeypatch.setattr(line.sim.motor, "run", lambda direction: line.sim.trip(FAULT))
     with pytest.raises(NotVerified, match="tripped"):
@@ -92,7 +92,7 @@ def test_a_trip_while_starting(line: Line, monkeypatch: pytest.MonkeyPatch) -> N
     assert len(line.starts) == 1
 
 
-def test_a_reset_never_starts_the_motor(line: Line) -> None:
+def test_reset_never_starts_the_motor(line: Line) -> None:
     """Also if the run command was active at the trip, and the drive obeys its level."""
     line.runs()
     line.sim.trip(FAULT)
@@ -112,7 +112,7 @@ def test_a_reset_never_starts_the_motor(line: Line) -> None:
 
 
 @pytest.mark.parametrize("lost", range(4))
-def test_reset_with_lost_replies_never_starts(line: Line, lost: int) -> None:
+def test_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -> None:
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -144,7 +144,7 @@ def test_fault_that_remains_is_reported(line: Line, monkeypatch: pytest.MonkeyPa
     assert not line.starts
 
 
-def test_a_start_without_a_setpoint_is_refused(line: Line) -> None:
+def test_start_without_a_setpoint_is_refused(line: Line) -> None:
     with pytest.raises(WriteForbidden, match="set_frequency"):
         line.drive.start()
     assert line.writes == []
@@ -154,7 +154,7 @@ def test_a_start_without_a_setpoint_is_refused(line: Line) -> None:
     assert not line.starts
 
 
-def test_a_power_cycle_forgets_the_setpoint(line: Line, model: str) -> None:
+def test_start_after_a_power_cycle_requires_a_new_setpoint(line: Line, model: str) -> None:
     """The motor stays off, and the next start reports it if the drive shows its setpoint."""
     line.runs()
     line.sim.power_cycle()
@@ -183,7 +183,7 @@ LOCAL = {
 
 
 @pytest.mark.parametrize("model", LOCAL)
-def test_a_drive_in_local_control_is_not_started(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_in_local_control_is_refused(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, model)
     line.drive.set_frequency(20)
     line.sim.is_local = True
@@ -196,7 +196,7 @@ def test_a_drive_in_local_control_is_not_started(model: str, monkeypatch: pytest
 NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
 
 
-def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
+def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.drive.set_frequency(20)
     if model in NO_DIRECTION:
         with pytest.raises(WriteForbidden, match="direction"):
@@ -218,7 +218,7 @@ def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     assert line.drive.state().condition is Condition.RUNNING
 
 
-def test_a_start_word_is_never_plainly_written(line: Line) -> None:
+def test_write_of_a_start_word_is_refused(line: Line) -> None:
     control = line.drive.control
     for count in range(0x10000):
         request = Message(1, 6, control.address, data=count.to_bytes(2))
@@ -242,14 +242,14 @@ def test_harmless_counts_never_start_the_motor(line: Line) -> None:
             assert not line.sim.motor.energised
 
 
-def test_a_frequency_out_of_range_is_refused(line: Line) -> None:
+def test_frequency_out_of_range_is_refused(line: Line) -> None:
     for hz in (-1, 5000):
         with pytest.raises(ValueError, match="Hz"):
             line.drive.set_frequency(hz)
     assert line.writes == []
 
 
-def test_a_ramp_goes_on_from_the_setpoint_in_force(line: Line) -> None:
+def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
     """In Hz, even if the reference is an unreadable percentage."""
     line.drive.set_frequency(20)
     begun = len(line.writes)
@@ -258,7 +258,7 @@ def test_a_ramp_goes_on_from_the_setpoint_in_force(line: Line) -> None:
     assert line.sim.motor.target == pytest.approx(22, abs=0.01)
 
 
-def test_a_jog_that_goes_on_through_a_stop_is_stopped_on_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jog_that_continues_after_a_stop_gets_its_own_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.option["stop_time"] = 3.0
@@ -310,7 +310,7 @@ def test_stop_jog_is_not_sent_to_another_make(monkeypatch: pytest.MonkeyPatch) -
     assert line.writes == []
 
 
-def test_a_cia402_drive_without_mains_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_a_cia402_drive_without_mains_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "schneider-atv320")
     line.drive.set_frequency(20)
     line.sim.stays_off = True
@@ -320,7 +320,9 @@ def test_a_cia402_drive_without_mains_is_not_started(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("name", ["off2", "off3"])
-def test_a_profidrive_is_not_started_through_an_off(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_a_profidrive_during_off2_or_off3_is_refused(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     line = Line(monkeypatch, "abb-acs355")
     line.drive.set_frequency(20)
     setattr(line.sim, name, True)
@@ -340,7 +342,7 @@ def test_off2_during_a_run_is_reported_and_not_overridden(monkeypatch: pytest.Mo
     assert line.drive.state().condition is Condition.STOPPED
 
 
-def test_a_locked_trip_is_not_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_of_a_locked_trip_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "danfoss-fc51")
     line.sim.trip(FAULT)
     line.sim.is_locked = True
@@ -351,7 +353,7 @@ def test_a_locked_trip_is_not_reset(monkeypatch: pytest.MonkeyPatch) -> None:
     line.runs()
 
 
-def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_an_optidrive_of_the_first_guide_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "optidrive-e3")
     line.sim.is_first_reading = True
     line.drive.set_frequency(20)
@@ -374,7 +376,7 @@ OF_ANOTHER = {  # values that the family shows at most while a setting is not in
 
 @pytest.mark.parametrize("first", OF_ANOTHER)
 @pytest.mark.parametrize("second", OF_ANOTHER)
-def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_drive_s(
+def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
     monkeypatch: pytest.MonkeyPatch, first: str, second: str
 ) -> None:
     """One make's stop is another's run, but one value or two stale settings are not a proof."""
@@ -397,7 +399,7 @@ def test_a_stop_is_withheld_only_if_the_status_and_another_value_are_another_dri
         assert line.writes == []
 
 
-def test_a_stop_of_a_drive_that_was_known_is_never_kept_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_of_a_drive_that_was_identified_before_is_always_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     line.runs()
     line.sim["device"] = 0

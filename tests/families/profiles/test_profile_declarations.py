@@ -21,7 +21,7 @@ every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFIL
 
 
 @every_profile
-def test_each_profile_is_documented(profile: type[Drive]) -> None:
+def test_every_profile_is_documented(profile: type[Drive]) -> None:
     assert profile.__doc__
     assert len(profile.__doc__) > 400
     assert profile.registers == {}
@@ -29,7 +29,7 @@ def test_each_profile_is_documented(profile: type[Drive]) -> None:
 
 
 @every_profile
-def test_no_harmless_word_is_a_start_or_a_reset(profile: Any) -> None:
+def test_no_harmless_count_is_a_start_or_reset_word(profile: Any) -> None:
     harmless = profile.roles["control"].harmless
     assert profile.stop_word in harmless
     assert profile.coast_word is None or profile.coast_word in harmless
@@ -60,7 +60,7 @@ def test_family_may_add_the_reverse_bit() -> None:
             control = command(1, IntFlag("Bits", {"jog": 1 << 8}))
 
 
-def test_output_frequency_must_be_0_only_at_rest() -> None:
+def test_output_frequency_that_may_be_0_while_turning_is_refused() -> None:
     for frequency in (reading(0x60, "Hz", part=(0, 3)), reading(0x60, "Hz", offset=-50)):
         with pytest.raises(DeclarationError, match="output_frequency: it is 0 where the motor stands alone"):
             type("Half", (Atv320,), {"output_frequency": frequency})
@@ -73,7 +73,7 @@ def test_only_roles_may_have_harmless_counts() -> None:
             sleeve = command(0x50, harmless=(1,))
 
 
-def test_all_mistakes_of_a_family_are_reported_at_once() -> None:
+def test_all_mistakes_of_a_family_are_reported_together() -> None:
     class Words(IntEnum):
         RUN = 1
 
@@ -101,7 +101,7 @@ def test_all_mistakes_of_a_family_are_reported_at_once() -> None:
     }
 
 
-def test_status_of_two_words_is_refused() -> None:
+def test_status_register_of_two_words_is_refused() -> None:
     with pytest.raises(DeclarationError, match="status: it is one word"):
 
         class Wide(Profidrive):
@@ -111,7 +111,7 @@ def test_status_of_two_words_is_refused() -> None:
             output_frequency = reading(5, "Hz")
 
 
-def test_a_control_word_that_is_a_coil_is_refused() -> None:
+def test_control_word_declared_as_a_coil_is_refused() -> None:
     with pytest.raises(DeclarationError, match="control"):
 
         class Coil(Profidrive):
@@ -121,21 +121,21 @@ def test_a_control_word_that_is_a_coil_is_refused() -> None:
             output_frequency = reading(5, "Hz")
 
 
-def test_a_reference_that_counts_backwards_is_refused() -> None:
+def test_reference_with_a_negative_step_is_refused() -> None:
     with pytest.raises(DeclarationError, match="reference: a greater count is more of it"):
 
         class Backwards(Acs355):
             reference = setting(1, "%", step=-0.005, span=(0, 100), number_format=NumberFormat.I16)
 
 
-def test_signed_status_is_refused() -> None:
+def test_signed_status_register_is_refused() -> None:
     with pytest.raises(DeclarationError, match="status: it is one word of bits"):
 
         class Signed(Acs355):
             status = reading(3, number_format=NumberFormat.I16)
 
 
-def test_percentage_needs_maximum_frequency() -> None:
+def test_percentage_reference_requires_maximum_frequency() -> None:
     drive = Fc51(1, confirmed=1)
     wire = Wire(drive)
     with pytest.raises(WriteForbidden, match="maximum_frequency = HZ") as refusal:
@@ -174,7 +174,7 @@ def identify(model: str, **says: Any) -> Wire:
 
 
 @table("model", WELL)
-def test_a_drive_of_the_family_is_taken_for_one(model: str) -> None:
+def test_identify_accepts_a_drive_of_the_family(model: str) -> None:
     wire = identify(model)
     assert set(wire.reads) == set(WELL[model])
     assert wire.sent == []
@@ -205,9 +205,7 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
 
 
 @table(("model", "says", "sentence"), STRANGERS)
-def test_a_drive_that_shows_something_else_is_refused(
-    model: str, says: dict[str, Any], sentence: str
-) -> None:
+def test_identify_refuses_a_drive_with_other_values(model: str, says: dict[str, Any], sentence: str) -> None:
     with pytest.raises(WriteForbidden, match=sentence):
         identify(model, **says)
 
@@ -220,7 +218,7 @@ def test_drive_that_refuses_a_role_is_not_identified() -> None:
 # ---- derived once more ----
 
 
-def test_a_family_may_be_derived_from() -> None:
+def test_family_class_can_be_extended_by_a_subclass() -> None:
     class Longer(Acs355):
         """Some more registers of the same drive."""
 
@@ -230,14 +228,14 @@ def test_a_family_may_be_derived_from() -> None:
     assert set(Longer.registers) == {*Acs355.registers, "output_current"}
 
 
-def test_a_shown_setpoint_has_the_unit_of_the_one_that_is_written() -> None:
+def test_reference_in_force_must_have_the_unit_of_the_reference() -> None:
     with pytest.raises(DeclarationError, match=r"its unit is not that of reference, 'Hz'"):
 
         class Mixed(VfdEl):
             reference_in_force = reading(0x2102, "%", step=0.01)
 
 
-def test_an_unknown_state_is_not_taken_for_stopped() -> None:
+def test_unknown_status_is_never_reported_as_stopped() -> None:
     drive = Goodrive(1)
     Wire(drive, {"status": 9, "output_frequency": 0.0})
     assert drive.state().condition.value == "unknown"

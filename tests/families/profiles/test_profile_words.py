@@ -93,21 +93,21 @@ STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
 
 
 @table("model", STARTS)
-def test_a_start(model: str) -> None:
+def test_start_sends_the_words_of_the_manual(model: str) -> None:
     status, words = STARTS[model]
     found = wire(model, status)
     found.drive.start()
     assert sent(found) == list(words)
 
 
-def test_the_abb_waits_between_its_words() -> None:
+def test_abb_start_waits_between_its_words() -> None:
     found = wire("abb-acs355", [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS])
     found.drive.start()
     assert found.seconds >= 0.1
 
 
 @pytest.mark.parametrize("model", ["abb-acs355", "siemens-v20"])
-def test_a_running_profidrive_is_not_switched_off_by_a_start(model: str) -> None:
+def test_start_of_a_running_profidrive_sends_no_off_word(model: str) -> None:
     found = wire(model, ABB_RUNS)
     found.drive.start()
     assert [frame[-5:] for frame in sent(found)] == ["04 7F"]
@@ -128,7 +128,7 @@ STOPS = {
 
 
 @table("model", STOPS)
-def test_a_stop_and_a_coast(model: str) -> None:
+def test_stop_and_coast_send_the_words_of_the_manual(model: str) -> None:
     status, stop, coast = STOPS[model]
     found = wire(model, status, output_frequency=[12.0, 0.0])
     found.drive.stop()
@@ -166,14 +166,14 @@ RESETS: Mapping[str, tuple[list[int], dict[str, Any], tuple[str, ...]]] = {
 
 
 @table("model", RESETS)
-def test_a_reset(model: str) -> None:
+def test_reset_sends_the_words_of_the_manual(model: str) -> None:
     status, says, words = RESETS[model]
     found = wire(model, status, **says)
     found.drive.reset_fault()
     assert sent(found) == list(words)
 
 
-def test_a_locked_trip_is_not_reset() -> None:
+def test_reset_of_a_locked_trip_is_refused() -> None:
     found = wire("danfoss-fc51", FC_LOCK)
     with pytest.raises(WriteForbidden, match="take its mains away"):
         found.drive.reset_fault()
@@ -192,14 +192,14 @@ REVERSES = {
 
 
 @table("model", REVERSES)
-def test_reverse(model: str) -> None:
+def test_reverse_start_sends_the_word_of_the_manual(model: str) -> None:
     status, word = REVERSES[model]
     found = wire(model, status)
     found.drive.start(Direction.REVERSE)
     assert sent(found)[-1] == word
 
 
-def test_a_jog_has_its_direction() -> None:
+def test_jog_sends_the_word_of_its_direction() -> None:
     found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
     found.drive.jog()
     assert sent(found) == [DELTA + "00 13"]
@@ -215,7 +215,7 @@ def test_a_jog_has_its_direction() -> None:
     ("model", "status"),
     [("delta-vfd-el", DELTA_RUNS), ("delta-vfd-el", DELTA_REVERSE), ("invt-goodrive", GD_RUNS)],
 )
-def test_a_motor_that_turns_is_not_jogged(model: str, status: Any) -> None:
+def test_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
     found = wire(model, [status])
     for direction in (None, *Direction):
         with pytest.raises(WriteForbidden, match=r"turns, and may go on through a jog: call stop\(\) first"):
@@ -239,7 +239,7 @@ SETPOINTS = {
 
 
 @table("model", SETPOINTS)
-def test_a_setpoint(model: str) -> None:
+def test_setpoint_is_written_in_the_manuals_scale(model: str) -> None:
     drive: Drive = MAKE[model](1)
     found = Wire(drive)
     drive.set_frequency(25)
@@ -262,14 +262,14 @@ HINDRANCES = [
 
 
 @table(("model", "status", "sentence"), HINDRANCES)
-def test_start_is_refused_with_the_hindrance(model: str, status: int, sentence: str) -> None:
+def test_refused_start_names_the_reason(model: str, status: int, sentence: str) -> None:
     found = wire(model, status)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert all(frame[-5:] == "04 76" for frame in sent(found))
 
 
-def test_an_optidrive_of_the_first_guide_is_never_taken_for_stopped() -> None:
+def test_optidrive_of_the_first_guide_is_never_reported_as_stopped() -> None:
     found = wire("optidrive-e3", 0x0100, output_frequency=20.0)  # "high byte 1: running"
     assert found.drive.state().condition is Condition.DECELERATING
     found = wire("optidrive-e3", 0x0000)
@@ -301,7 +301,9 @@ STATES = [
 
 
 @table(("model", "status", "says", "condition"), STATES)
-def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condition) -> None:
+def test_status_is_decoded_to_the_condition(
+    model: str, status: int, says: dict[str, Any], condition: Condition
+) -> None:
     assert wire(model, status, **says).drive.state().condition is condition
 
 
@@ -317,7 +319,7 @@ def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condi
         ("optidrive-e3", E3_RUNS),
     ],
 )
-def test_running_at_0_hz_is_not_stopped(model: str, running: int) -> None:
+def test_run_at_0_hz_is_not_reported_as_stopped(model: str, running: int) -> None:
     found = wire(model, running, output_frequency=0.0)
     found.drive.option["stop_time"] = 5.0
     with pytest.raises(Unconfirmed, match="5 s it is not seen to have stopped"):
@@ -328,14 +330,14 @@ def test_running_at_0_hz_is_not_stopped(model: str, running: int) -> None:
     ("shown", "sentence"),
     [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz, not the setpoint that was written")],
 )
-def test_a_delta_that_follows_another_setpoint_is_not_started(shown: float, sentence: str) -> None:
+def test_start_of_a_delta_that_follows_another_setpoint_is_refused(shown: float, sentence: str) -> None:
     found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert found.sent == []
 
 
-def test_an_invt_that_goes_on_jogging_is_stopped_as_one() -> None:
+def test_stop_of_an_invt_that_continues_to_jog_sends_stop_jog_immediately() -> None:
     """At once, and not when all the time that a stop may take is over."""
     found = wire("invt-goodrive", GD_RUNS)
     found.drive.option["stop_time"] = 5.0
@@ -345,7 +347,7 @@ def test_an_invt_that_goes_on_jogging_is_stopped_as_one() -> None:
     assert found.seconds < 5.5
 
 
-def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:
+def test_start_of_an_invt_after_a_jog_requires_a_stop() -> None:
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
     found.drive.jog()
     found.sent.clear()
@@ -365,16 +367,14 @@ def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:
         ([ATV_OFF, ATV_READY], ("00 06", "00 07"), "not switched on"),
     ],
 )
-def test_a_cia402_drive_goes_up_step_by_step(
-    status: list[int], words: tuple[str, ...], sentence: str
-) -> None:
+def test_cia402_start_waits_for_each_state(status: list[int], words: tuple[str, ...], sentence: str) -> None:
     found = wire("schneider-atv320", status)
     with pytest.raises(NotVerified, match=sentence):
         found.drive.start()
     assert sent(found) == [ATV + word for word in words]
 
 
-def test_a_profidrive_that_does_not_get_ready_to_operate_is_switched_off() -> None:
+def test_profidrive_that_does_not_become_ready_is_switched_off() -> None:
     found = wire("abb-acs355", [ABB_OFF, ABB_READY])
     with pytest.raises(NotVerified, match="not ready to operate"):
         found.drive.start()
@@ -415,7 +415,7 @@ def test_renumbered_stop_is_the_only_stop_of_a_turning_motor_without_jogs() -> N
     assert sent(found) == [DELTA + "00 06"]
 
 
-def test_words_that_a_family_leaves_out_are_unsupported() -> None:
+def test_verbs_without_a_word_in_the_family_are_unsupported() -> None:
     control = numbered({"forward": 1, "stop": 0, "reset_fault": 9})
     drive: Any = type("Short", (Goodrive,), {"control": control})(1, confirmed=1)
     drive.commanded = 40.0
@@ -436,13 +436,13 @@ def test_words_that_a_family_leaves_out_are_unsupported() -> None:
         ({**EXCHANGED, "stop": 0x10000}, "control: STOP = 65536 is not within 0 to 65535"),
     ],
 )
-def test_wrong_numbers_of_words_are_reported(words: Mapping[str, int], mistake: str) -> None:
+def test_invalid_word_numbers_are_reported(words: Mapping[str, int], mistake: str) -> None:
     with pytest.raises(DeclarationError) as wrong:
         type("Wrong", (Goodrive,), {"control": numbered(words)})
     assert any(each.startswith(mistake) for each in wrong.value.mistakes)
 
 
-def test_renumbered_words_are_not_bits() -> None:
+def test_renumbering_is_refused_for_a_profile_of_bits() -> None:
     with pytest.raises(DeclarationError, match="its words are whole numbers"):
         type("Bits", (Goodrive,), {"control": command(0x2000, IntFlag("Bits", {"forward": 1, "stop": 2}))})
 

@@ -321,7 +321,7 @@ TABLES = {
 TABLES["yaskawa-v1000"] = TABLES["yaskawa-a1000"].replace("03/10 0034 signature          - Signature\n", "")
 
 
-def test_the_families_by_name() -> None:
+def test_shipped_families_are_found_by_name() -> None:
     assert list(SHIPPED) == sorted(TABLES)
     assert {*SHIPPED} == {*COMMANDED, *READ_ONLY}
     assert not set(SHIPPED) & set(MODELS)
@@ -331,7 +331,7 @@ def test_the_families_by_name() -> None:
 
 
 @every_family
-def test_the_registers_are_those_of_the_manual(name: str) -> None:
+def test_registers_equal_the_typed_table_of_the_manual(name: str) -> None:
     inherited = rows(MODELS[EXTENDED[name]]) if name in EXTENDED else set()
     assert rows(shipped_family(name)) - inherited == typed(TABLES[name])
 
@@ -355,7 +355,7 @@ def test_shipped_family_names_its_sources_and_is_marked_untested(name: str) -> N
 
 
 @every_family
-def test_every_register_names_a_page_of_an_edition(name: str) -> None:
+def test_every_register_names_a_page_of_a_listed_edition(name: str) -> None:
     family = shipped_family(name)
     words = [edition.partition(" p. ")[0].partition(", sheet")[0] for edition in EDITIONS[name]]
     assert all(word in family.manual or word in "Schneider_ATV312.yaml" for word in words)
@@ -364,7 +364,7 @@ def test_every_register_names_a_page_of_an_edition(name: str) -> None:
         assert any(edition in register.place for edition in EDITIONS[name]), (register.name, register.place)
 
 
-def test_pump_controller_is_only_read(
+def test_pump_controller_family_has_no_commands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     family = shipped_family("erman-er-g-220-03")
@@ -385,7 +385,9 @@ def test_pump_controller_is_only_read(
 
 
 @every_commanded_family
-def test_no_command_is_sent_before_confirmation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_command_except_a_stop_is_sent_before_confirmation(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     family = shipped_family(name)
     bus, drive, _ = one(monkeypatch, family(1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
@@ -405,7 +407,7 @@ def test_identification_registers_are_not_polled(name: str) -> None:
 
 @pytest.mark.slow
 @every_commanded_family
-def test_a_motor_is_commanded_through_the_engine(name: str) -> None:
+def test_motor_is_started_and_stopped_over_a_real_line(name: str) -> None:
     drive: Any = shipped(name, 1)
     sim = simulated(shipped(name, 1))
     assert isinstance(sim, MotorDrive)
@@ -423,7 +425,7 @@ def test_a_motor_is_commanded_through_the_engine(name: str) -> None:
     assert not sim.motor.energised
 
 
-def test_a_plant_file_names_them(tmp_path: Path) -> None:
+def test_plant_file_can_use_shipped_families_by_name(tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     names = [name for name in SHIPPED if 9600 in shipped_family(name).baudrates]
     assert len(names) > len(SHIPPED) - 3
@@ -440,7 +442,7 @@ def test_a_plant_file_names_them(tmp_path: Path) -> None:
     assert [type(polled.drive).model for polled in line.drives] == names
 
 
-def test_the_command_line_lists_and_checks_them(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_lists_and_checks_shipped_families(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models"]) == 0
     listed = capsys.readouterr().out
     assert all(f"\n{name} " in listed for name in (*MODELS, *SHIPPED)[1:])
@@ -472,7 +474,7 @@ def load(tmp_path: Path, text: str) -> type[Drive]:
 HEAD = '[family]\ntitle = "Own"\nmanual = "Own manual"\ncounts_from = 0\n'
 
 
-def test_a_file_may_name_any_profile(tmp_path: Path) -> None:
+def test_family_file_can_use_every_profile(tmp_path: Path) -> None:
     roles = (
         "[command]\ncontrol = { at = 1 }\nreset = { at = 2 }\n[setting]\nreference = { at = 3, unit = "
         '"Hz", step = 0.1, span = [0, 50] }\n[reading]\nstatus = { at = 4 }\nfault = { at = 5 }\n'
@@ -482,7 +484,7 @@ def test_a_file_may_name_any_profile(tmp_path: Path) -> None:
         assert issubclass(load(tmp_path, f'{HEAD}profile = "{name}"\n{roles}'), profile)
 
 
-def test_all_mistakes_of_a_file_with_a_profile_are_reported_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_file_with_a_profile_are_reported_together(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"own\.toml") as wrong:
         load(
             tmp_path,
@@ -503,12 +505,12 @@ def test_all_mistakes_of_a_file_with_a_profile_are_reported_at_once(tmp_path: Pa
         assert sentence in told or sentence.partition(": ")[2] in told, sentence
 
 
-def test_a_profile_that_is_not_known(tmp_path: Path) -> None:
+def test_unknown_profile_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"profile = 'profdrive' is not known; did you mean profidrive\?"):
         load(tmp_path, f'{HEAD}profile = "profdrive"\n[reading]\nspeed = {{ at = 1 }}\n')
 
 
-def test_registers_are_read_in_blocks_if_the_manual_allows_it() -> None:
+def test_adjacent_registers_are_read_in_one_request_if_the_manual_allows_it() -> None:
     assert shipped_family("delta-vfd-el").most_registers
     assert {register.access for register in shipped_family("abb-acs355").readings()} == {Access.READING}
 
@@ -524,12 +526,12 @@ def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
     )
 
 
-def test_a_family_of_a_package_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_family_of_an_installed_package_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, toy="toy:Toy", broken="no_such_module:Drive")
     assert find_model("toy").__name__ == "Toy"
 
 
-def test_a_built_in_family_goes_before_an_installed_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_built_in_family_takes_precedence_over_an_installed_one(monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, yd1000="toy:Toy")
     assert find_model("yd1000") is YD1000
 
@@ -565,7 +567,7 @@ def test_models_lists_installed_families_and_warns_of_broken_ones(
         ({"acmes": "toy:Toy"}, r"there is no model 'acme'; did you mean acmes"),
     ],
 )
-def test_a_package_that_cannot_be_used_is_one_sentence(
+def test_unusable_package_raises_a_one_sentence_error(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, str], sentence: str
 ) -> None:
     installed(monkeypatch, **values)
@@ -587,7 +589,7 @@ CHF100A_LOG = {
 }
 
 
-def test_a_log_of_a_chf100a_decodes_to_the_keypads_values() -> None:
+def test_chf100a_registers_decode_to_the_keypads_values() -> None:
     family = shipped_family("invt-chf100a")
     registers = family.registers
     assert {name: registers[name].decode(raw) for name, (raw, _) in CHF100A_LOG.items()} == {
@@ -598,7 +600,7 @@ def test_a_log_of_a_chf100a_decodes_to_the_keypads_values() -> None:
 
 
 @pytest.mark.parametrize("name", ["delixi-e", "powtran-pi130"])
-def test_stop_and_coast_are_the_other_way_round_than_in_an_invt(name: str) -> None:
+def test_delixi_e_has_the_stop_and_coast_words_of_invt_exchanged(name: str) -> None:
     words = shipped_family(name).register("control").values
     assert words is not None
     assert (int(words["COAST"]), int(words["STOP"])) == (5, 6)
