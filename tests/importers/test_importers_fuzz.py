@@ -149,7 +149,7 @@ PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
 
 
 def entries_of(needed: str, keys: str) -> st.SearchStrategy[list[dict[str, Any]]]:
-    """Return a strategy for lists of entries: the required keys, and other keys with random values or null."""
+    """Return a strategy for lists of entries: required keys, and other keys with random values or null."""
     value = {key: PLAUSIBLE.get(key, ANYTHING) for key in (*needed.split(), *keys.split())}
     plausible = st.fixed_dictionaries(
         {key: value[key] for key in needed.split()}, optional={key: value[key] for key in keys.split()}

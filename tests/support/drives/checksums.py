@@ -1,4 +1,4 @@
-"""The three checksums, written from the documents, independent of the library."""
+"""Compute the three checksums after the documents, independent of the library."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Decoded frames of the documents, typed from them manually; tests/data/frames.csv has the bytes.
+"""The frames printed in the documents, decoded manually; tests/data/frames.csv has their bytes.
 
-Errata are numbered as in their notes: E1 to E14 of ERMAN ER-G-220, protocol description v1.4.
+E1 to E14 are errata of the ERMAN ER-G-220 protocol description v1.4, numbered as in docs and tests.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _line(text: str) -> str:
     return f":{text}\\r\\n"
 
 
-# printed request: its message, and the message of each printed reply; "same" is a copy of the request
+# Printed request: its message, then the message of each printed reply; "same" means a copy of the request.
 MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
     "01 01 00 00 00 0C 3C 0F": (
         Message(1, 0x01, 0, 12),
@@ -42,10 +42,10 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
             "01 83 03 01 31": Message(1, 0x03, exception=3),
         },
     ),
-    "01 04 00 01 00 05 61 C9": (  # E1: corrected checksum
+    "01 04 00 01 00 05 61 C9": (  # E1, with a corrected checksum
         Message(1, 0x04, 1, 5),
         {
-            "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03": FrameFault.BAD_LENGTH,  # E2
+            "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03": FrameFault.BAD_LENGTH,  # E2: wrong byte count
             "01 04 0A 01 F4 00 00 00 D6 00 00 02 32 7F 1B": Message(
                 1, 0x04, 1, 5, words(500, 0, 214, 0, 562)
             ),
@@ -56,7 +56,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x05, 0, data=ON),
         {"same": Message(1, 0x05, 0, data=ON), "01 85 03 02 91": Message(1, 0x05, exception=3)},
     ),
-    "01 06 00 01 01 1D 19 93": (  # E3: valid frame, which our drives must not send
+    "01 06 00 01 01 1D 19 93": (  # E3: a valid frame that the library must never send
         Message(1, 0x06, 1, data=words(285)),
         {},
     ),
@@ -64,7 +64,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x06, 2, data=words(285)),
         {"same": Message(1, 0x06, 2, data=words(285)), "01 86 03 02 61": Message(1, 0x06, exception=3)},
     ),
-    "01 0F 00 00 00 09 02 01 01 25 2C": (  # E4: as E3
+    "01 0F 00 00 00 09 02 01 01 25 2C": (  # E4: like E3
         Message(1, 0x0F, 0, 9, bytes([0x01, 0x01])),
         {
             "01 0F 00 00 00 09 95 CD": Message(1, 0x0F, 0, 9),
@@ -101,7 +101,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
     ),
 }
 
-# one-register writes: function 06, start, value
+# Writes of one register: function 06, address, value.
 for _text, _start, _value in (
     ("01 06 20 01 13 88 DE 9C", 0x2001, 5000),
     ("01 06 20 00 00 02 03 CB", 0x2000, 2),
@@ -120,7 +120,7 @@ for _text, _start, _value in (
     _write = Message(1, 0x06, _start, data=words(_value))
     MEANING[_text] = _write, {"same": _write}
 
-# Delixi's set-type packets: K, P1P0, D3..D0
+# Delixi's packets that set a value: K, P1P0, D3..D0.
 for _text, _k, _p, _d in (
     (_line("010200020000000005"), 2, 2, 0),
     (_line("0104000100001388A1"), 4, 1, 5000),
@@ -132,7 +132,7 @@ for _text, _k, _p, _d in (
 
 @dataclass(frozen=True)
 class Printed:
-    """A row of frames.csv with its message; a reply also has its request."""
+    """A row of frames.csv with its decoded message; a reply also has its request."""
 
     framing: Framing
     direction: str

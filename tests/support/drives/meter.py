@@ -1,4 +1,4 @@
-"""An energy meter of 39 floats and a serial number, at the addresses of the Eastron SDM630's document."""
+"""An energy meter with 39 floats and a serial number, at the addresses of the Eastron SDM630's document."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ADDRESSES = {
 
 
 def floats() -> dict[str, Register[float]]:
-    """Return new registers for each class."""
+    """Return the meter's float registers by name, as new objects for each class that declares them."""
     return {
         name: reading(address, table=INPUT, number_format=NumberFormat.F32)
         for name, address in ADDRESSES.items()

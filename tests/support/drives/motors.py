@@ -1,4 +1,4 @@
-"""A drive of each family, the writes that start its motor, and the requests a simulated drive receives."""
+"""A drive of each family, the writes that start its motor, and a record of received requests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAKE: dict[str, Callable[[int], Drive]] = {
 }
 assert set(MAKE) == set(MODELS)
 
-# Writes that start the motor, for each family, by address and value, in the documents' words.
+# Writes (address, value) that start the motor, by family, from the documents.
 STARTS: dict[str, Callable[[Message], bool]] = {
     "erman-er-g-220": lambda each: each.function in (5, 15) and each.start == 0 and each.data != b"\0\0",
     "invt-che": lambda each: each.start == 0x1000 and each.data[-1] in (1, 2, 3, 4),
@@ -37,14 +37,14 @@ DELIXI_WRITES = (2, 4, 5, 6)
 
 
 def quick(kind: str) -> type[Drive]:
-    """Return the family without silences, which responders do not need."""
+    """Return the family with all line silences set to 0, because responders need none."""
     family = FAMILIES[kind]
     without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
     return type(family.__name__, (family,), without)
 
 
 class ReceivedRequests:
-    """The requests that reach a simulated drive; `loses(request)` returns True to lose the reply."""
+    """Records the requests that a simulated drive receives; if `loses(request)`, the reply is lost."""
 
     def __init__(self, sim: MotorDrive) -> None:
         self.sim = sim

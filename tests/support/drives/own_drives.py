@@ -1,4 +1,4 @@
-"""Drives as users declare them: a fan, and a device of the servers by other authors."""
+"""Drive classes as users declare them: a fan, and the device served by pymodbus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Run(IntEnum):
 
 
 class Fan(Drive):
-    """A fan controller whose start and stop are one plain setting."""
+    """A fan controller that starts and stops with one ordinary setting."""
 
     model = "fan"
     speed = reading(0x0010, "rpm", step=1)
@@ -59,6 +59,6 @@ class Device(Drive):
 
 
 class Mistaken(Device):
-    """The same device, with a register that the server lacks."""
+    """The same device, declared with an additional register that the server lacks."""
 
     absent = reading(300, "A")

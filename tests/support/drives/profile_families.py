@@ -1,4 +1,4 @@
-"""The shipped families that command motors, as their owners declare them, and the writes that start each."""
+"""The shipped families that command motors, with the options of a plant file, and their start words."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OF_PROFILE = tuple(name for name in COMMANDED if name not in EXTENDED)
 
 
 def shipped(name: str, address: int) -> Drive:
-    """Return a drive of a shipped family as its owner declares it."""
+    """Return a drive of a shipped family with the options that its owner must set, such as `confirmed`."""
     family = shipped_family(name)
     is_percent = issubclass(family, Profile) and family.reference.unit == "%"
     options = {"maximum_frequency": 50} if is_percent else {}
@@ -27,14 +27,14 @@ def shipped(name: str, address: int) -> Drive:
 
 ALL: dict[str, Callable[[int], Drive]] = {name: partial(shipped, name) for name in OF_PROFILE}
 
-# One family of each profile, for the tests that do the same with every profile.
+# One family of each profile, for tests that run once per profile.
 REPRESENTATIVES = (
     *("abb-acs355", "siemens-v20", "schneider-atv320", "danfoss-fc51", "delta-vfd-el", "invt-goodrive"),
     *("delixi-e", "powtran-pi130", "optidrive-e3", "yaskawa-a1000"),
 )
 MAKE = {name: ALL[name] for name in REPRESENTATIVES}
 
-# Classes to derive from.
+# Family classes for tests that derive from them.
 Acs355: Any = shipped_family("abb-acs355")
 Atv320: Any = shipped_family("schneider-atv320")
 Fc51: Any = shipped_family("danfoss-fc51")
@@ -58,7 +58,7 @@ def _jog_or_run(word: int) -> bool:
     return word in (1, 2, 3, 4)
 
 
-# Writes that start the motor, by address and word, in the manuals' words; typed manually.
+# Writes (address, word) that start the motor, typed from the manuals.
 STARTS: dict[str, Callable[[Message], bool]] = {
     "abb-acs355": _at(0, lambda word: word & 0x09 == 0x09),
     "siemens-v20": _at(99, lambda word: word & 0x09 == 0x09),

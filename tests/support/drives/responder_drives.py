@@ -1,6 +1,6 @@
-"""Drives of a responder, independent of the library: registers, and the writes that start motors.
+"""The drives behind a responder, independent of the library: registers, and the writes that start motors.
 
-Typed from the documents. A write that revokes a stop also counts as one that moves a motor.
+Typed from the documents. A write that cancels a stop also counts as a write that moves the motor.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ COIL_ON = 0xFF00
 
 
 class DriveRequest(NamedTuple):
-    """A request: `value` is a read's count or a write's value."""
+    """A request; `value` is the number of registers to read, or the raw count to write."""
 
     address: int
     function: int
@@ -28,19 +28,19 @@ Judge = Callable[[DriveRequest], bool]
 
 @dataclass(frozen=True)
 class Kind:
-    """A family: its memory at rest and while the motor turns, and the writes that start or stop it."""
+    """A family: its registers at rest and while the motor turns, and the writes that start or stop it."""
 
     name: str
     moves: Judge
     stops: Judge
-    memory: Mapping[int, int]  # by register, for all read functions
-    turning: Mapping[int, int]  # replaces entries while the motor turns
-    mark: str  # a register that verbs do not read
+    memory: Mapping[int, int]  # raw counts by address, for all read functions
+    turning: Mapping[int, int]  # replaces entries of `memory` while the motor turns
+    mark: str  # name of a register that no verb reads
     protocol: str = STANDARD
-    makes: Mapping[str, Any] = field(default_factory=dict)  # options of its class
+    makes: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments for the class
     halts: tuple[str, ...] = ("stop",)
-    own_address: int | None = None  # register of its own address
-    live: int = 3  # the function that reads `turning`
+    own_address: int | None = None  # address of the register that holds the drive's own address
+    live: int = 3  # function code whose reads show `turning`
 
 
 def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
@@ -48,7 +48,7 @@ def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
 
 
 def _erman_moves(asked: DriveRequest) -> bool:
-    """Return True for START on, or STOP or EMERGENCY STOP off (section 10, commands)."""
+    """Return True if the write sets START, or clears STOP or EMERGENCY STOP (section 10, commands)."""
     start = (asked.start, asked.value) == (0, COIL_ON)
     return asked.function == 15 or (
         asked.function == 5 and (start or (asked.start in (1, 2) and asked.value == 0))
@@ -67,7 +67,7 @@ KINDS = {
             "erman-er-g-220",
             _erman_moves,
             _erman_stops,
-            {2: 200, 3: 500, 4: 0, 0x0C: 10, 0x0D: 1},  # functions 03 and 04 share no address
+            {2: 200, 3: 500, 4: 0, 0x0C: 10, 0x0D: 1},  # functions 03 and 04 have no address in common
             {0x0401: 1, 1: 200, 3: 15},
             "braking_threshold",
             halts=("stop", "emergency_stop"),
@@ -131,23 +131,23 @@ KINDS = {
             {},
             {0x0010: 900},
             "current",
-            makes={"confirmed": 1},  # by its owner: its replies do not identify it
+            makes={"confirmed": 1},  # declared by its owner, because no reply identifies it
         ),
     )
 }
 
 
 class ResponderDrive:
-    """One drive: its registers, and whether its motor turns.
+    """One drive of a responder: its registers, and whether its motor turns.
 
-    After a stop the motor takes `ramp` seconds to halt.
+    After a stop the motor turns for another `ramp` seconds.
     """
 
     def __init__(self, kind: Kind, address: int, ramp: float = 0.0) -> None:
         self.kind = kind
         self.address = address
         self.ramp = ramp
-        self.runs = False  # the last command
+        self.runs = False  # True after a run command, False after a stop
         self._stands_at = 0.0
         self.switch_on()
 
@@ -156,20 +156,20 @@ class ResponderDrive:
         return self.runs or time.monotonic() < self._stands_at
 
     def switch_on(self) -> None:
-        """Restart after a power failure: the motor halts, and registers have their factory values."""
+        """Restart as after a power failure: the motor is at rest, and all registers have factory values."""
         self.runs = False
         self._memory = dict(self.kind.memory)
         if self.kind.own_address is not None:
             self._memory[self.kind.own_address] = self.address
-        self._coils = {0: 0, 1: 0, 2: 0}  # of ERMAN
+        self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's START, STOP and EMERGENCY STOP
 
     def turn(self) -> None:
-        """Start the motor as if manually."""
+        """Start the motor as if on the panel."""
         self.runs = True
         self._coils[0] = COIL_ON
 
     def hold(self, address: int, value: int) -> None:
-        """Keep this value for all reads of the address."""
+        """Return this value for all further reads of the address."""
         self._memory[address] = value
 
     def word(self, address: int, function: int) -> int:
@@ -178,7 +178,7 @@ class ResponderDrive:
         return self._memory.get(address, 0) if turning is None else turning
 
     def state(self) -> int:
-        """Return the state for function 03 of Delixi's own protocol."""
+        """Return the run state for function 03 of Delixi's own protocol."""
         return 2 if self.turns else 1
 
     def write(self, asked: DriveRequest) -> None:

@@ -1,4 +1,4 @@
-"""Run verbs without a bus: a table answers reads, and writes become frames."""
+"""Run verbs without a bus: a table answers their reads, and their writes are recorded as frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.drive.register import COIL, Carrier, Register
 
 
 def frame(drive: Drive, register: Register[Any], value: Any) -> str:
-    """Return the frame that writes this value, in the documents' notation, computed without the library."""
+    """Return the frame that writes this value, as the documents print it; computed without the library."""
     raw = (
         value.value if isinstance(value, Enum) else round(Fraction(str(value)) / Fraction(str(register.step)))
     )
@@ -35,12 +35,12 @@ def frame(drive: Drive, register: Register[Any], value: Any) -> str:
 
 
 class Wire:
-    """A drive whose replies the test sets.
+    """A drive whose replies are set by the test.
 
-    `says` has a value for each register's name, or a list of values for successive reads, whose last one
-    stays; an exception in it is raised. `loses` has the exceptions of the first writes of a frame, and
-    `turns` updates `says` after a frame. Later reads return a written value unless `says` has another.
-    Register rules hold as on a bus; their reads are not counted in `reads`.
+    `says` has a value by register name, or a list of values for successive reads, the last of which repeats.
+    An exception among the values is raised. `loses` lists, by frame, exceptions that its first writes raise.
+    `turns` has, by frame, updates of `says` after a write. A written value is read back unless `says` has a
+    value. Rules between registers apply as on a bus; their reads are not recorded in `reads`.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Wire:
         drive.perform = self.run
 
     def say(self, says: Mapping[str, Any]) -> None:
-        """Replace the values from now on."""
+        """Update the values of later reads."""
         self.says |= {name: list(each) if isinstance(each, list) else [each] for name, each in says.items()}
 
     def run(self, script: Script[Any]) -> Any:
@@ -133,7 +133,7 @@ def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
 
 
 def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
-    """Return the same from a typed table; a step is "-" if there is none, "?" if it is not stated."""
+    """Parse a typed table into such tuples; a step "-" means none, "?" not stated."""
     found = set()
     for line in table.strip().splitlines():
         functions, address, name, step, *unit = line.split()
@@ -141,7 +141,7 @@ def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
     return found
 
 
-# The readings that both Delixi protocols share.
+# Readings that both Delixi protocols have, for `typed`.
 DELIXI_MONITORS = """
 01F4 output_frequency     0.01 Hz
 01F5 reference_frequency  ? Hz

@@ -1,4 +1,4 @@
-"""An undocumented family as a user would declare it, and a device that rejects or ignores some requests."""
+"""Toy, a family as a user would declare it, and a device that rejects or ignores some reads."""
 
 from collections.abc import Collection, Iterable
 from enum import IntEnum, IntFlag
@@ -50,7 +50,7 @@ class Toy(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Accept any drive: a test's line has only toys."""
+        """Accept any drive, because a test's line has only toys."""
         yield from ()
 
     @verb
@@ -77,31 +77,31 @@ class Toy(Drive):
 
 
 class PatientToy(Toy):
-    """A toy with long timeouts for busy machines, even if it answered fast before."""
+    """A toy with long timeouts for busy test machines, even after fast replies."""
 
     response_timeout = 60.0
-    response_delay = 15.0  # a learned timeout is at least four times this
+    response_delay = 15.0  # s; a learned timeout is at least four times as long
 
 
 class Unsure(Toy):
-    """A toy that cannot identify its drives."""
+    """A toy without an `identify` script."""
 
     identify = Drive.identify
 
 
 def family(registers: int, **declared: Any) -> type[Drive]:
-    """Return a class with this many adjacent registers, named r0 and so on, and no other declaration."""
+    """Return a drive class that declares only adjacent registers r0, r1, ..., `registers` of them."""
     readings = {f"r{at}": reading(at) for at in range(registers)}
     return type("Plain", (Drive,), {"__doc__": "Of this test.", **readings, **declared})
 
 
 def expected_values(addresses: Iterable[int]) -> dict[str, float]:
-    """Return a picky device's values at these addresses, by register name."""
+    """Return the values of a `Picky` device at these addresses, by register name."""
     return {f"r{at}": 100 + at for at in addresses}
 
 
 class Picky(SimulatedDrive):
-    """Rejects reads of some addresses; rejects or ignores reads of too many registers."""
+    """A device that rejects reads of some addresses, and rejects or ignores reads of too many registers."""
 
     def __init__(
         self, drive: Drive, refused: Collection[int] = (), most: int = 125, silent_beyond: int = 125

@@ -1,4 +1,4 @@
-"""Every family in each of its framings, on one line."""
+"""Drives of every family in each of its framings, for one line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from multidrop.drive import Drive
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Wire
 
-VARIANTS = (  # family, framing, and baud rate of the fast line
+VARIANTS = (  # family, framing, and baud rate for `fast_drives`
     (ErmanERG220, Framing.RTU, 1_000_000),
     (InvtCHE, Framing.RTU, 500_000),
     (InnovertIBD, Framing.RTU, 500_000),
@@ -18,7 +18,7 @@ VARIANTS = (  # family, framing, and baud rate of the fast line
     (YD1000, Framing.RTU, 1_000_000),
 )
 REASONS = {str(each) for each in Status} - {str(Status.OK)}
-TIMEOUT = 0.02  # s, the minimum, which drives reach that mostly answer at once
+TIMEOUT = 0.02  # s, the shortest timeout, learnt for drives that mostly reply immediately
 LATEST = 3 * TIMEOUT
 
 
@@ -30,7 +30,7 @@ def real_drives() -> list[Drive]:
 
 
 def fast_drives() -> list[Drive]:
-    """Return the same drives on a line with almost no character and silence times."""
+    """Return the drives with almost no character times and silences."""
     return [
         type(family.__name__, (family,), {"baudrates": (baudrate,), "needed_silence": lambda drive: 0.0})(
             address, name=f"{family.model} {framing}", framing=framing

@@ -1,4 +1,4 @@
-"""A gateway's desks, with a simulated drive on a line and a clock that the test sets."""
+"""A gateway's command desks, with a simulated drive on a line and a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ids = count(1)
 
 
 class FailingLog(CommandLog):
-    """A command log whose disk does as the test sets before each record."""
+    """A command log that calls a function of the test before each record, to simulate disk failures."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -41,9 +41,9 @@ class FailingLog(CommandLog):
 
 
 class Desks:
-    """The desks of one gateway, which is master of its line while `is_master`.
+    """The command desks of one gateway, which is master of its line while `is_master` is set.
 
-    While `is_guarded`, frames of the former master may still arrive.
+    While `is_guarded` is set, frames of the former master may still arrive.
     """
 
     def __init__(self, bus: Bus, sim: SimulatedDrive, folder: Path, may: Mapping[str, Any]) -> None:
@@ -72,12 +72,12 @@ class Desks:
 
     @property
     def writes(self) -> list[tuple[str, int]]:
-        """Return the writes that the drive accepted so far."""
+        """Return the writes that the drive has accepted, as (register name, raw count)."""
         return [(one.name, one.raw) for one in self.sim.counters.writes]
 
     @property
     def written(self) -> set[str]:
-        """Return the written registers as a set: a slow reply makes a stop repeat."""
+        """Return the names of written registers as a set, because a slow reply makes a stop repeat."""
         return {name for name, _ in self.writes}
 
     @property
@@ -89,7 +89,7 @@ class Desks:
         return self.desk.offer(LINE, json.dumps(what).encode())
 
     def offered(self, hz: float = 20.0, **what: Any) -> str:
-        """Return the token of an offer, by default a setpoint write."""
+        """Offer a command, by default a setpoint write; return the offer's token."""
         answer = self.ask(**(what or {"register": "frequency", "value": hz}))
         assert isinstance(answer, Offered), answer
         return answer.token
@@ -105,7 +105,7 @@ class Desks:
         return await self.stop_by(json.dumps(what).encode())
 
     async def stop_by(self, data: bytes) -> CommandAnswer | None:
-        """Return the answer to a stop message, or None."""
+        """Send a stop message; return the desk's answer, or None."""
         answer = await self.stops.stop(LINE, data)
         while answer is not None and answer.outcome is CommandOutcome.UNDER_WAY:
             answer = await self.stops.stop(LINE, data)
@@ -114,7 +114,7 @@ class Desks:
 
 
 def _patiently(patience_s: float) -> AbstractContextManager[Any]:
-    """Lengthen the library's timeouts for a busy machine; the desk's clock is the test's."""
+    """Lengthen the library's timeouts for a busy test machine; the desk uses the test's clock."""
 
     def patient(limit: Callable[[], float]) -> AbstractContextManager[None]:
         return written_before(lambda: (until := limit()) and until + patience_s * 1e9)

@@ -1,4 +1,4 @@
-"""Command drill: kill and suspend processes of a fleet, and judge by the writes that the drives received.
+"""Command drill: kill and suspend processes of a fleet, then check the writes that the drives received.
 
 Each line has one simulated drive and one client, which writes a different setpoint each time. So the drive's
 list of writes shows how often each command was executed, independent of any log.
@@ -27,25 +27,25 @@ from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, Off
 from multidrop.fleet.errors import FleetError
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-HIGHEST = 4999  # raw counts of the setpoint; a drive gets each value once
+HIGHEST = 4999  # highest raw setpoint; a drive gets each value once
 STOP_EVERY = 20  # every 20th command of a drive is a stop
 SENT = (CommandOutcome.DONE, CommandOutcome.FAILED)
 UNSENT = (CommandOutcome.NOT_SENT, CommandOutcome.REFUSED)
 
 
 class CommandRecord(NamedTuple):
-    """One command: its setpoint (None: a stop), how it was requested, and its reported result."""
+    """One command: its raw setpoint (None for a stop), how it was requested, and its reported result."""
 
     drive: str
     raw: int | None
     way: str
-    offered_s: float  # monotonic time of the offer
+    offered_s: float  # monotonic time of the offer, in s
     told: CommandOutcome
-    sent: int  # how often the drive received it
+    sent: int  # number of times the drive received it
 
 
 class Verdict(NamedTuple):
-    """The drives' writes compared with the results that clients received."""
+    """Numbers from comparing the drives' writes with the results reported to clients."""
 
     told: Counter[str]
     ways: Counter[str]
@@ -53,12 +53,12 @@ class Verdict(NamedTuple):
     twice: int
     wrongly: int
     unknown_sent: int
-    unnoted: int  # executed without an entry in a gateway's log
-    oldest_s: float  # from the offer until the drive received the write
+    unnoted: int  # commands executed without an entry in a gateway's log
+    oldest_s: float  # longest time from an offer until the drive received the write
 
 
 class UnreliableCommands(FleetCommands):
-    """A client whose messages are duplicated and delayed, as by a faulty network or program."""
+    """A client whose messages are duplicated and delayed at random, as by a faulty network."""
 
     def __init__(self, urls: Sequence[str], log: Path, dice: random.Random) -> None:
         super().__init__(urls, by="drill", log=log)
@@ -94,7 +94,7 @@ class UnreliableCommands(FleetCommands):
 
 
 class CommandDrill(FleetProcesses):
-    """Three gateways, three NATS nodes, and lines with one drive each."""
+    """A fleet of three gateways and three NATS nodes, and lines with one simulated drive each."""
 
     def __init__(
         self, folder: Path, nats: Cluster, simulator: Simulator, sims: dict[str, SimulatedDrive]
@@ -125,7 +125,7 @@ class CommandDrill(FleetProcesses):
     # ---- clients ----
 
     async def ask(self, commands: int, seconds: float, seed: int = 1, *, is_attacked: bool = True) -> Verdict:
-        """Send this many commands in this many seconds under attack, and judge the result."""
+        """Send `commands` commands in `seconds` s while processes are attacked; return the verdict."""
         dice = random.Random(seed)
         await self.await_masters()
         askers = [self._asker(drive, commands, seconds, dice.random()) for drive in self.sims]
@@ -140,7 +140,7 @@ class CommandDrill(FleetProcesses):
         return self._judge(asked, deeds)
 
     async def await_masters(self) -> None:
-        """Wait until each line has a master that answers."""
+        """Wait until each line has a master that answers commands."""
         ends = time.monotonic() + PATIENCE_S
         async with FleetCommands(self.nats.urls, by="drill", log=self.folder / "ready.jsonl") as asker:
             for drive in self.sims:
@@ -225,7 +225,7 @@ class CommandDrill(FleetProcesses):
         self.kill(dice.choice(GATEWAYS))
 
     def _stop_gateway(self, dice: random.Random) -> None:
-        """Suspend a gateway; if it is suspended for longer than its lease, the kernel kills it."""
+        """Suspend a gateway for a random time; if that exceeds its lease, the kernel kills it."""
         victim = self.gateways[dice.choice(GATEWAYS)]
         victim.send_signal(signal.SIGSTOP)
         time.sleep(dice.choice((dice.uniform(0.05, 1.5), dice.uniform(0.5, 3.5))))

@@ -1,4 +1,4 @@
-"""Drills: gateways as processes, three NATS nodes, and a hall of lines that records who sent when."""
+"""Fleet drills: gateway processes, three NATS nodes, and serial servers that record who sent when."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from multidrop.fleet.servers.connections import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-JUDGED_S = 11.0  # an election may come 9 s after a death
+JUDGED_S = 11.0  # s; an election may start 9 s after a process died
 
 
 class FleetProcesses:
-    """Gateways as processes, of a fleet that `fleet init` has made from this plant."""
+    """The gateway processes of a fleet that `fleet init` created from this plant file."""
 
     def __init__(
         self, folder: Path, nats: Cluster, plant: str, places: Mapping[str, Namespace] | None = None
     ) -> None:
         self.folder = folder
         self.nats = nats
-        self.places = places or {}  # namespaces of gateways; the others run here
+        self.places = places or {}  # network namespaces by gateway; other gateways run without one
         self._environment = {
             **os.environ,
             "MULTIDROP_NATS": ",".join(nats.urls),
@@ -85,7 +85,7 @@ class FleetProcesses:
 
 
 class FleetDrill(FleetProcesses):
-    """A fleet of processes; each round performs an action and measures its effect on the lines."""
+    """A fleet drill; each round performs an action and measures the resulting gaps on the lines."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class FleetDrill(FleetProcesses):
         super().__init__(folder, nats, self.hall.plant(), places)
 
     def settle(self) -> None:
-        """Restart dead processes, and wait until gateways, leases, paths and leaders are complete."""
+        """Restart dead processes, and wait until every gateway, lease, path and leader is in place."""
         for node in self.nats.nodes:
             with suppress(ProcessLookupError):
                 node.go_on()
@@ -130,14 +130,14 @@ class FleetDrill(FleetProcesses):
         time.sleep(1.0)
 
     def _start_what_died(self) -> None:
-        """Start missing gateways: the kernel kills those that a busy machine suspends."""
+        """Restart dead gateways, because the kernel kills those that a busy machine suspends too long."""
         for name in GATEWAYS:
             running = self.gateways.get(name)
             if running is None or running.poll() is not None:
                 self.start(name)
 
     def are_leaders_home(self) -> bool:
-        """Return True if each node leads one bucket of each group; otherwise one action would act as two."""
+        """Return True if each node leads one bucket of each group; else killing a node hits several."""
         leads = [node.leads() for node in self.nats.nodes]
         return all(
             sum(f"KV_{bucket}" in found for bucket in group) == 1
@@ -153,7 +153,7 @@ class FleetDrill(FleetProcesses):
         return time.monotonic() - begun
 
     def judge(self, deed: Callable[[], object], seconds: float = JUDGED_S) -> dict[str, float]:
-        """Perform the action; return each line's longest gap (s) in the following seconds."""
+        """Perform the action; return each line's longest gap (s) without requests in the next `seconds`."""
         self.hall.reset()
         deed()
         time.sleep(seconds)
@@ -163,7 +163,7 @@ class FleetDrill(FleetProcesses):
     # ---- actions ----
 
     def do_nothing(self) -> None:
-        """Do nothing, which shows this machine's usual gaps."""
+        """Do nothing, to measure this machine's usual gaps."""
 
     def kill_gateway(self) -> None:
         self.kill(self.random.choice(GATEWAYS))
@@ -194,7 +194,7 @@ class FleetDrill(FleetProcesses):
         self.random.choice(self.nats.nodes).kill()
 
     def end_one_record(self) -> None:
-        """Delete one record of a lease, as a slightly late gateway does."""
+        """Delete one record of a lease, as happens if a gateway renews it slightly too late."""
         asyncio.run(_end_record(self.nats, self.random.choice(GATEWAYS), self.random.choice(names.LEASES)))
 
     def stop_node(self) -> None:
@@ -253,7 +253,7 @@ async def _end_record(nats: Cluster, gateway: str, bucket: str) -> None:
     other = LeaseBucket(bucket, lambda: path, "another")
     while True:
         record = await other.get(gateway)
-        with suppress(Conflict):  # renewed by its gateway in between
+        with suppress(Conflict):  # its gateway renewed it in between
             await other.put(gateway, {**record.value, "ended": True}, record.revision)
             break
     await path.close()
@@ -289,11 +289,11 @@ def drilled(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill
 
 # ---- the state that `multidrop fleet status` prints ----
 
-LOOK_S = 0.25  # between queries; a query costs as much CPU as seconds of a gateway
+LOOK_S = 0.25  # s between queries; one query uses as much CPU as a gateway does in seconds
 
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
-    """Return the present state of a fleet, or an empty one if its servers give none, as during an election.
+    """Return the fleet's state as a dict; it is empty if the servers give none, as during an election.
 
     The query runs in this process, because tests repeat it often.
     """
@@ -310,13 +310,13 @@ def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
     return found
 
 
-# ---- drills in network namespaces, whose cables are cut ----
+# ---- drills in network namespaces whose connections are cut ----
 
 NODES = 3
 
 
 class Cuts:
-    """Cuts of a drill's cables; every cut heals after 1 to 8 s."""
+    """Network cuts for a drill; every cut is undone after 1 to 8 s."""
 
     def __init__(self, drill: FleetDrill) -> None:
         self.drill = drill
@@ -333,7 +333,7 @@ class Cuts:
         self._lost(others, some)
 
     def gateway(self) -> None:
-        """Cut a gateway and its lines, which leaves unsent frames in its buffers."""
+        """Cut a gateway off everything, also its lines, which leaves unsent frames in its socket buffers."""
         self.dice.choice(self.gateways).cut()
 
     def gateway_from_nodes(self) -> None:
@@ -355,7 +355,7 @@ class Cuts:
         self._lost([*self.nodes, *self.gateways], [self.dice.choice(self.nodes)])
 
     def gateway_and_node(self) -> None:
-        """Cut off a gateway with one node: they reach only each other."""
+        """Cut off a gateway together with one node, so that they reach only each other."""
         inside = [self.dice.choice(self.gateways), self.dice.choice(self.nodes)]
         self._part(inside, [one for one in (*self.gateways, *self.nodes) if one not in inside])
 
@@ -373,7 +373,7 @@ CUTS: dict[str, Callable[[Cuts], None]] = {
 
 
 def cut(drill: FleetDrill, name: str, seconds: float = 0.0) -> None:
-    """Cut by this name, and heal after this long; 0 means 1 to 8 s."""
+    """Make the cut with this name, and undo it after `seconds`; 0 means 1 to 8 s."""
     cuts = Cuts(drill)
     CUTS[name](cuts)
     time.sleep(seconds or drill.random.uniform(1, 8))
@@ -383,7 +383,7 @@ def cut(drill: FleetDrill, name: str, seconds: float = 0.0) -> None:
 
 @contextmanager
 def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill]:
-    """Give a fleet like `drilled` in namespaces; `network` skips or fails if there are none."""
+    """Yield a fleet like `drilled`, in network namespaces; skip or fail if the machine allows none."""
     with (
         network(NODES + len(GATEWAYS)) as made,
         cluster(folder / "nats", places=made.namespaces[:NODES]) as nats,
@@ -397,7 +397,7 @@ def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator
 
 
 class MachineDrill(FleetDrill):
-    """Machines with one gateway and one node each."""
+    """A drill on simulated machines, each with one gateway and one NATS node."""
 
     def kill_machine(self) -> None:
         name = self.random.choice(GATEWAYS)
@@ -425,7 +425,7 @@ MACHINES: dict[str, Callable[[MachineDrill], None]] = {
 
 @contextmanager
 def drilled_on_machines(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[MachineDrill]:
-    """Give a fleet on three machines; `network` skips or fails without namespaces."""
+    """Yield a fleet on three simulated machines; skip or fail if the machine allows no namespaces."""
     with (
         network(NODES) as made,
         cluster(folder / "nats", places=made.namespaces) as nats,

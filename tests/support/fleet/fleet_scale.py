@@ -1,4 +1,4 @@
-"""A large fleet: gateway state machines in several processes, a real cluster, and fake lines."""
+"""A large fleet: gateway state machines in several processes, a real NATS cluster, and fake lines."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ PATIENCE_S = 240.0
 
 
 class MemberProcess:
-    """A process, and the number of lines of each of its gateways with the time of the last change."""
+    """A process of gateways; records each gateway's number of lines and the time of the last change."""
 
     def __init__(self, urls: Sequence[str], gateways: Sequence[str]) -> None:
         self.gateways = list(gateways)
         self.counts = dict.fromkeys(gateways, 0)
-        self.changed_s = 0.0  # CLOCK_MONOTONIC
+        self.changed_s = 0.0  # time of the last change, CLOCK_MONOTONIC
         self.is_ready = False
         self.polled: dict[str, list[str]] = {}
         command = [sys.executable, str(PROGRAM), ",".join(urls), *gateways]
@@ -53,7 +53,7 @@ class MemberProcess:
                 self.counts[said["gateway"]] = said["lines"]
 
     def ask(self) -> dict[str, list[str]]:
-        """Return the lines that each gateway polls."""
+        """Return the lines that each gateway polls, by gateway name."""
         self.polled = {}
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
@@ -87,7 +87,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 class LargeFleet:
-    """A number of lines, shared by the gateways of all processes."""
+    """A fleet whose lines are shared by the gateways of several processes."""
 
     def __init__(self, nats: Cluster, lines: dict[str, Any]) -> None:
         self.nats = nats
@@ -103,14 +103,14 @@ class LargeFleet:
             await path.close()
 
     def start(self, *groups: Sequence[str]) -> float:
-        """Start a process for each group of gateways; return when all were ready (CLOCK_MONOTONIC)."""
+        """Start a process for each group of gateways; return when all were ready (CLOCK_MONOTONIC, s)."""
         started = [MemberProcess(self.nats.urls, group) for group in groups]
         self.processes += started
         until(lambda: all(process.is_ready for process in started), "the processes are ready")
         return time.monotonic()
 
     def cpu_s(self) -> float:
-        """Return the CPU time (s) of gateways and servers."""
+        """Return the total CPU time (s) used by gateways and servers."""
         servers = sum(cpu_s_of(node.process.pid) for node in self.nats.nodes)
         return servers + sum(process.cpu_s() for process in self.processes)
 
@@ -118,19 +118,19 @@ class LargeFleet:
         return sum(sum(process.counts.values()) for process in self.processes)
 
     def settled(self, since_s: float) -> float:
-        """Wait until all lines are polled; return the seconds from `since_s` to the last one."""
+        """Wait until all lines are polled; return the seconds from `since_s` to the last change."""
         until(lambda: self.polled() == len(self.lines), "all lines are polled")
         return max(process.changed_s for process in self.processes) - since_s
 
     def kill(self, process: MemberProcess) -> float:
-        """Kill a process; return the seconds until others poll all its lines."""
+        """Kill a process; return the seconds until other gateways poll all its lines."""
         self.processes.remove(process)
         begun = time.monotonic()
         process.kill()
         return self.settled(begun)
 
     def check(self) -> None:
-        """Wait until each line has exactly one gateway."""
+        """Wait until each line is polled by exactly one gateway."""
         wanted = sorted(self.lines)
 
         def found() -> list[str]:
@@ -154,7 +154,7 @@ def plant_of_fake_lines(lines: int) -> dict[str, Any]:
 
 @contextmanager
 def large_fleet(nats: Cluster, lines: dict[str, Any]) -> Iterator[LargeFleet]:
-    """Give a fleet with this plant and no gateway."""
+    """Yield a fleet for this plant, without any gateway yet."""
     fleet = LargeFleet(nats, lines)
     try:
         yield fleet

@@ -1,4 +1,4 @@
-"""Fakes of a fleet: records in memory, lines and a mastership that record their calls."""
+"""Fakes for fleet tests: a bucket in memory, and lines and a mastership that record calls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from multidrop.fleet.servers.buckets import Record, WriteAnswers
 
 
 class HandClock:
-    """A clock in ns that a test sets."""
+    """A clock in ns that the test sets."""
 
     def __init__(self, now: int = 1000 * SECOND) -> None:
         self.now = now
@@ -26,13 +26,13 @@ class HandClock:
 
 
 class MemoryBucket:
-    """A bucket that compares revisions like the servers, and fails as a test sets."""
+    """A bucket in memory that compares revisions like the servers, and fails if the test asks for it."""
 
     def __init__(self, name: str = "lease") -> None:
         self.name = name
         self.records: dict[str, Record] = {}
         self.last = 0
-        self.asked = 0  # calls of `newest`
+        self.asked = 0  # number of calls of `newest`
         self.is_down = False
         self.loses_answers = False
         self.before_put: Callable[[str], object] = lambda key: None  # called before each put
@@ -87,7 +87,7 @@ class MemoryBucket:
 
 
 class GatedBucket(MemoryBucket):
-    """A bucket that blocks puts from `shut` until `open`, before or after it stores them."""
+    """A bucket that, from `shut` until `open`, blocks a put before or after storing the record."""
 
     def __init__(self, name: str = "lease", *, answers: bool = False) -> None:
         super().__init__(name)
@@ -116,7 +116,7 @@ class GatedBucket(MemoryBucket):
 
 
 class RecordingMastership:
-    """A mastership that records its deadline, and raises the engine's errors."""
+    """A fake mastership that records its deadline, and raises the same errors as the engine."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.clock = clock
@@ -146,7 +146,7 @@ class RecordingMastership:
 
 
 class RecordingLines:
-    """Fake lines: which gateway had which line when, and whether two ever had one at a time."""
+    """The fake lines of one gateway; `hall` records when it takes a line, and any overlap."""
 
     def __init__(self, name: str, mastership: RecordingMastership, hall: Hall) -> None:
         self.name = name
@@ -169,12 +169,12 @@ class RecordingLines:
 
 
 class Hall:
-    """The lines of all gateways, as the drives see them."""
+    """The lines of all gateways, from the drives' view."""
 
     def __init__(self) -> None:
         self.gateways: list[RecordingLines] = []
         self.overlaps: list[str] = []
-        self.at: dict[str, float] = {}  # time of each line's last claim
+        self.at: dict[str, float] = {}  # s, time of each line's last claim
 
     def add(self, name: str, mastership: RecordingMastership) -> RecordingLines:
         lines = RecordingLines(name, mastership, self)

@@ -23,7 +23,7 @@ LOOK_S = 0.02
 
 
 class NoLines:
-    """Lines that open and close immediately."""
+    """Fake lines that open and close immediately."""
 
     async def take(self, line: str, description: Any) -> None:
         pass
@@ -36,7 +36,7 @@ class NoLines:
 
 
 class NoMastership:
-    """A mastership that raises the engine's errors and sends nothing."""
+    """A fake mastership that raises the same errors as the engine."""
 
     def extend(self, until_ns: int) -> None:
         if until_ns <= boottime_ns():

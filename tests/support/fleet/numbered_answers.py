@@ -1,4 +1,4 @@
-"""Simulated drives that number their answers, and a judge that finds each number again in a poller's rows.
+"""Simulated drives that number their replies, and a check that each number appears in a poller's rows.
 
 The drives speak Modbus TCP, whose replies name their requests. So each request that left has one row, with
 the number of its own answer or none, however late the answer came.
@@ -13,13 +13,13 @@ from multidrop.families import InnovertIBD
 from multidrop.sim import SimulatedDrive
 from multidrop.sim.memory import MemoryCell
 
-NUMBERED = "motor_speed"  # without a scale: its value is the count itself
-DRIVES = 2  # on each line
+NUMBERED = "motor_speed"  # a register whose value is its raw count
+DRIVES = 2  # drives on each line
 PORT = "tcp://127.0.0.1:0"
 
 
 class NumberedDrive(SimulatedDrive):
-    """A drive whose motor speed is the number of reads of it."""
+    """A drive whose motor speed register counts its own reads."""
 
     answers = 0
 
@@ -35,7 +35,7 @@ def drive_name(line: str, address: int) -> str:
 
 
 def plant_file(ports: dict[str, str]) -> str:
-    """Return the plant file of these lines, by their ports."""
+    """Return a plant file with these lines, given as port by line name."""
     return "\n".join(
         f'[[line]]\nname = "{line}"\nport = "{port}"\n'
         + "".join(
@@ -48,27 +48,27 @@ def plant_file(ports: dict[str, str]) -> str:
 
 
 class KeptRow(NamedTuple):
-    """A row: when it was requested, and the answer's number; None for a miss."""
+    """A row: the time of its request in ns, and the number in the reply; None for a miss."""
 
     time_ns: int
     number: int | None
 
 
 class Answers(NamedTuple):
-    """The answers of one drive."""
+    """How many replies one drive sent, and how many of them have a row, are missing, or came late."""
 
     answered: int = 0
     kept: int = 0
-    late: int = 0  # a row reports that the answer came too late
+    late: int = 0  # rows that report a reply that came too late
     lost: int = 0
     doubled: int = 0
 
 
 def judge_drive(rows: Iterable[KeptRow], answered: int) -> Answers:
-    """Return how many of a drive's answers have a row."""
+    """Return how many of a drive's `answered` replies have a row."""
     kept = late = lost = doubled = misses = last = 0
     ordered = sorted(rows, key=lambda row: row.time_ns)
-    for row in (*ordered, KeptRow(1 << 63, answered + 1)):  # no gap after the last answer
+    for row in (*ordered, KeptRow(1 << 63, answered + 1)):  # detects missing replies at the end
         if row.number is None:
             misses += 1
             continue

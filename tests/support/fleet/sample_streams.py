@@ -1,4 +1,4 @@
-"""A path to NATS servers with an empty stream of samples."""
+"""A connection to NATS servers with an empty stream of samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.fleet.servers.connections import ServerPath
 
 @asynccontextmanager
 async def empty_stream(servers: Cluster) -> AsyncIterator[ServerPath]:
-    """Give a path to servers with an empty stream."""
+    """Yield a connected path to the servers, with an empty stream of samples."""
     async with samples_path(servers.urls) as path:
         with suppress(FleetError):
             await samples_stream._ask(path, "STREAM.DELETE.samples", {})

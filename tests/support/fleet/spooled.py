@@ -1,4 +1,4 @@
-"""Batches of a plant, and their rows in a spool or a stream."""
+"""Batches of numbered exchanges, and their rows read back from a spool or a stream."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MISSED = 9  # exchanges with this remainder modulo 10 are misses
 
 
 def numbered(first: int, count: int, drives: Names = DRIVES) -> Batch:
-    """Make `count` exchanges of ten registers in the core's memory, as a poll does.
+    """Return a batch of `count` exchanges with ten registers each, in the core's memory as after a poll.
 
     Exchange `n` was sent at `n * STEP` of the monotonic clock, to drive `n % 4`; register `r` has the value
     `n % 60000 + r`. Each tenth is a miss.
@@ -48,7 +48,7 @@ def numbered(first: int, count: int, drives: Names = DRIVES) -> Batch:
 
 
 def rows_of(table: Any) -> list[tuple[Any, ...]]:
-    """Return rows as tuples of plain numbers and texts, in order of time, drive and register."""
+    """Return a table's rows as tuples of numbers and texts, sorted by time, drive and register."""
     columns = [table.column(name) for name in table.schema.names]
     columns[0] = columns[0].cast("int64")
     return sorted(
@@ -56,7 +56,7 @@ def rows_of(table: Any) -> list[tuple[Any, ...]]:
     )
 
 
-@lru_cache(maxsize=16)  # tests that damage one file read the others repeatedly
+@lru_cache(maxsize=16)  # tests that damage one file read the undamaged files repeatedly
 def _rows_of_file(data: bytes) -> list[tuple[Any, ...]]:
     return rows_of(unpack(data))
 
@@ -71,7 +71,7 @@ def rows_in(folder: Path) -> list[tuple[Any, ...]]:
 
 
 def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
-    """Return the numbers of the exchanges; fail unless each has all its rows."""
+    """Return the numbers of the exchanges in these rows; fail unless each exchange has all its rows."""
     found = [row[1] // STEP for row in rows]
     assert found == [number for number in found[::10] for _ in range(10)]
     return found[::10]
@@ -79,11 +79,11 @@ def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
 
 # ---- a process that fills a spool: `python spooled.py FOLDER FIRST` ----
 
-EXCHANGES = 20  # per batch
+EXCHANGES = 20  # exchanges per batch
 
 
 def main(folder: Path, first: int) -> None:
-    """Fill a spool until killed; print the number of exchanges, from `first` on, that are stored."""
+    """Fill a spool with exchanges from number `first` on until killed; print how many are stored."""
     spool = Spool(folder, "gateway-1")
     print(0, flush=True)
     for number in count(1):

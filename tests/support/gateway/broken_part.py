@@ -1,4 +1,4 @@
-"""A part of the gateway that fails in every call."""
+"""A gateway part whose every call fails."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 @dataclass(frozen=True)
 class Settings:
-    """The part's settings: how it fails."""
+    """The part's settings, which say how it fails."""
 
     breaks: str = "always"
 
@@ -18,7 +18,7 @@ class Settings:
 
 
 class BrokenFeed:
-    """A feed whose every method raises."""
+    """A feed whose every method raises an exception."""
 
     def take(self, batch: Any) -> NoReturn:
         raise RuntimeError("no room on the disk")

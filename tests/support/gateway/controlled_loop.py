@@ -1,4 +1,4 @@
-"""Time that tests set: an asyncio loop whose timers take no real time, and a clock."""
+"""Simulated time for tests: an asyncio loop whose timers take no real time, and a clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _PassingSelector(selectors.SelectSelector):
 
 
 class ControlledLoop(asyncio.SelectorEventLoop):
-    """An event loop with its own time in s."""
+    """An event loop with simulated time in s."""
 
     def __init__(self) -> None:
         self.passing = _PassingSelector()
@@ -33,13 +33,13 @@ class ControlledLoop(asyncio.SelectorEventLoop):
 
 
 def run_controlled(main: Coroutine[Any, Any, R]) -> R:
-    """Run a coroutine to its end on a loop with simulated time."""
+    """Run a coroutine to its end on a loop with simulated time; return its result."""
     with asyncio.Runner(loop_factory=ControlledLoop) as runner:
         return runner.run(main)
 
 
 class Clock:
-    """A clock of monotonic seconds."""
+    """A clock in monotonic seconds that the test sets."""
 
     def __init__(self) -> None:
         self.now = 100.0

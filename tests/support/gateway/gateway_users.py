@@ -1,7 +1,7 @@
-"""Concurrent users of a gateway in their own process, which counts their results.
+"""Concurrent users of a gateway in a separate process, which counts their results.
 
-Viewers that receive each frame, stalled viewers, a scraper, history queries, Modbus masters, and a listener
-of an MQTT broker.
+The users are viewers that receive each frame, stalled viewers, a metrics scraper, history queries, Modbus
+masters, and an MQTT listener.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from simulated_pumps import FIRST_READING, POLLED, UNPOLLED
 
 VIEWERS, STALLED, MASTERS = 5, 10, 2
 SCRAPE_S = QUERY_S = 1.0
-MASTER_S = 0.02  # between a master's requests
-PASS_EVERY = 10  # the second master reads an unpolled register in one of ten requests
-ASKED_ONES = 200  # a stalled viewer's requests before it stops reading
+MASTER_S = 0.02  # s between a Modbus master's requests
+PASS_EVERY = 10  # one in ten requests of the second master reads an unpolled register
+ASKED_ONES = 200  # requests that a stalled viewer sends without reading
 PATIENCE_S = 30.0
-ROUND_S = 1.0  # before a user reconnects
-WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # the registers that masters read
+ROUND_S = 1.0  # s before a user reconnects
+WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # polled registers; common block
 
 SERVE = """[serve]
 listen = "127.0.0.1:{http}"
@@ -51,31 +51,31 @@ units = {{ {units} }}
 
 
 class Place(NamedTuple):
-    """Ports of a gateway, and the requests to it."""
+    """A gateway's ports, and what its users request."""
 
     http: int
     modbus: int
     broker: int
     drives: int
-    first: int  # first address of the polled words
-    unpolled: int  # an unpolled address
+    first: int  # first address of the polled registers
+    unpolled: int  # address of an unpolled register
     series: list[str]
 
 
 def place_of(drives: int, http: int, modbus: int, broker: int) -> Place:
-    """Return the ports and requests of a gateway with this many simulated pumps."""
+    """Return the ports and requests for a gateway with `drives` simulated pumps."""
     series = [f"pump-{number}.{name}" for number in range(1, drives + 1) for name in POLLED]
     return Place(http, modbus, broker, drives, FIRST_READING, UNPOLLED, series)
 
 
 def serve_tables(place: Place, rotate: str) -> str:
-    """Return the tables `[serve]` of a plant file with all parts of the gateway."""
+    """Return the `[serve]` tables of a plant file that enable all parts of the gateway."""
     units = ", ".join(f"pump-{number} = {number}" for number in range(1, place.drives + 1))
     return SERVE.format(http=place.http, modbus=place.modbus, broker=place.broker, units=units, rotate=rotate)
 
 
 class Users:
-    """All users; `counts` has their results, and `failures` the unexpected ones."""
+    """All users; `counts` has the number of each result, `failures` that of each unexpected result."""
 
     def __init__(self, place: Place) -> None:
         self.place = place
@@ -113,7 +113,7 @@ class Users:
     # ---- HTTP ----
 
     async def _viewer(self) -> None:
-        """Read frames without delay and check their numbers."""
+        """Receive frames as fast as possible and check their numbers."""
         reader, writer = await asyncio.open_connection("127.0.0.1", self.place.http)
         with closing(writer):
             newest = -1
@@ -131,7 +131,7 @@ class Users:
                 self.count("frames")
 
     async def _stalled(self) -> None:
-        """Request many frames without reading until released."""
+        """Request many frames, and read nothing until released."""
         with closing(socket.socket()) as peer:
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             peer.setblocking(False)
@@ -140,7 +140,7 @@ class Users:
             while True:
                 await asyncio.sleep(ROUND_S)
                 info = peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)
-                if info[0] != 1:  # not established
+                if info[0] != 1:  # the TCP connection is not established
                     self.count("stalled, let go")
                     return
 
@@ -179,11 +179,11 @@ class Users:
     # ---- Modbus TCP ----
 
     async def _cached_master(self) -> None:
-        """Read the polled words of each drive in turn."""
+        """Read the polled registers of each drive in turn, as a Modbus master."""
         await self._master(lambda turn: (self.place.first, WORDS), "reads")
 
     async def _uncached_master(self) -> None:
-        """Read the common block of each drive in turn, and occasionally an unpolled register."""
+        """Read the common registers of each drive in turn, and sometimes an unpolled register."""
 
         def wanted(turn: int) -> tuple[int, int]:
             return (COMMON, COMMON_WORDS) if turn % PASS_EVERY else (self.place.unpolled, 1)
@@ -218,7 +218,7 @@ def _request(path: str) -> bytes:
 
 
 async def _get(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path: str) -> tuple[int, bytes]:
-    """Return status and body of a request on a persistent connection."""
+    """Send a GET request on a persistent connection; return status and body."""
     writer.write(_request(path))
     head = (await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE_S)).decode("latin-1").lower()
     length = re.search(r"content-length: (\d+)", head)
@@ -227,7 +227,7 @@ async def _get(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path:
     return status, gzip.decompress(body) if "content-encoding: gzip" in head else body
 
 
-# ---- the process ----
+# ---- the users' process ----
 
 
 class GatewayUsers:
@@ -241,7 +241,7 @@ class GatewayUsers:
         return self._process.pid
 
     def counts(self) -> tuple[Mapping[str, float], Mapping[str, int]]:
-        """Return the results so far, and the unexpected ones."""
+        """Return the numbers of results so far, and of unexpected results."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(file=self._process.stdin, flush=True)
@@ -251,7 +251,7 @@ class GatewayUsers:
 
 @contextmanager
 def gateway_users(place: Place) -> Iterator[GatewayUsers]:
-    """Start the users in their own process; the MQTT listener is mosquitto_sub."""
+    """Start the users in a separate process; the MQTT listener is mosquitto_sub."""
     words = [sys.executable, __file__, json.dumps(place)]
     with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -293,7 +293,7 @@ async def _live(place: Place) -> None:
 
 
 def main(place: list[Any]) -> None:
-    """Use the gateway until terminated."""
+    """Run all users until the process is terminated."""
     with suppress(asyncio.CancelledError):
         asyncio.run(_live(Place(*place)))
 

@@ -1,4 +1,4 @@
-"""A gateway that polls a simulated plant in a thread, and HTTP requests to it."""
+"""Run a gateway with a simulated plant in a thread, and send HTTP requests to it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from multidrop.gateway.live import frames
 from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-for module, name in (  # longer timeouts for a busy machine, whose disks do not hang
+for module, name in (  # longer timeouts, because the test machine may be busy
     *((parts, "BUILD_S"), (reload, "READ_S")),
     *((settings_module, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
 ):
@@ -52,7 +52,7 @@ class Answer(NamedTuple):
 
 
 class Served:
-    """A running gateway, its simulated drives by name, and a secret for each right."""
+    """A running gateway, its simulated drives by name, and a token's secret for each right."""
 
     def __init__(
         self,
@@ -65,16 +65,16 @@ class Served:
         self._loop = loop
         self.sims = sims
         self.secrets = secrets
-        self._seen = -1  # the newest frame requested
+        self._seen = -1  # newest frame number returned by `frame_number`
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
-        """The gateway's loop."""
+        """The gateway's event loop."""
         assert self._loop is not None
         return self._loop
 
     def request(self, method: str, path: str, body: object = None, **headers: str) -> Answer:
-        """Send a request on a new connection; in a header's name, _ becomes -."""
+        """Send a request on a new connection; return the response. In header names _ becomes -."""
         connection = http.client.HTTPConnection("127.0.0.1", self.gateway.port, timeout=PATIENCE)
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
         data = None
@@ -95,11 +95,11 @@ class Served:
         return self.request("POST", path, body, **headers)
 
     def command(self, path: str, body: Mapping[str, object], **headers: str) -> Answer:
-        """Send a write or a verb as a user who has seen the newest frame."""
+        """Send a write or a verb, with the number of the newest frame as a page does."""
         return self.post(path, {**body, "seen": self.frame_number()}, **headers)
 
     def frame_number(self) -> int:
-        """Return a frame number that was not returned before."""
+        """Wait for a new frame; return its number."""
         writer = {"authorization": self.bearer(Right.WRITE)}
         self._seen = int(self.get(f"/api/frame?after={self._seen}", **writer).json["n"])
         return self._seen
@@ -111,12 +111,12 @@ class Served:
         return self.get("/api/frame").json
 
     def await_state(self, drive: str, *states: str) -> None:
-        """Wait until a frame shows a drive in one of these states."""
+        """Wait until a frame shows the drive in one of these states."""
         until(lambda: self.frame()["drives"][drive]["state"] in states)
 
 
 def certificate(folder: Path, name: str) -> None:
-    """Make a certificate and its key with openssl."""
+    """Create a certificate and its key with openssl."""
     subprocess.run(
         [
             *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"),
@@ -130,7 +130,7 @@ def certificate(folder: Path, name: str) -> None:
 
 
 def tokens() -> tuple[dict[Right, str], tuple[Token, ...]]:
-    """Return a secret and a token for each right."""
+    """Return a secret by right, and the tokens for these secrets."""
     made = {right: new_token(name, right) for right, name in NAMES.items()}
     return {right: secret for right, (secret, _) in made.items()}, tuple(token for _, token in made.values())
 
@@ -146,7 +146,7 @@ def plant_text(port: str, drives: Sequence[str], serve: str = "") -> str:
 
 
 def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUSB0") -> Plant:
-    """Return a plant from a file with this table `[serve]`, without opening a port."""
+    """Write a plant file with this `[serve]` table; return the plant, with no port opened."""
     path = folder / "plant.toml"
     path.write_text(plant_text(port, drives or ("pump-1", "pump-2"), serve))
     return Plant.load(path)
@@ -156,7 +156,7 @@ def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUS
 def served(
     folder: Path, serve: str = "", *drives: str, environment: Mapping[str, str] | None = None, **settings: Any
 ) -> Iterator[Served]:
-    """Run a gateway of simulated INVT CHE drives with tokens; `settings` override the file's."""
+    """Run a gateway with simulated INVT CHE drives and tokens; `settings` override those of the file."""
     names = drives or ("pump-1", "pump-2")
     sims = {name: simulated(InvtCHE(n, name=name, baudrate=38400)) for n, name in enumerate(names, 1)}
     secrets, known = tokens()
@@ -175,9 +175,9 @@ def served(
 
 @contextmanager
 def running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
-    """Run a gateway in a thread with ten times the frame rate of a page; raise its failure at the end.
+    """Run a gateway in a thread, at ten times the usual frame rate; yield its event loop.
 
-    Gives its loop.
+    An exception in the gateway is raised when the block ends.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frames, "LEAST_S", 0.02)
@@ -220,12 +220,12 @@ def _running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
         raise failures[0]
 
 
-# ---- the command ----
+# ---- the command `multidrop serve` ----
 
 
 @contextmanager
 def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
-    """Write a plant file and simulate its line until the context ends."""
+    """Write a plant file and simulate its line during the block; yield the file's path."""
     drives = [simulated(InvtCHE(address, name=f"pump-{address}", baudrate=38400)) for address in (1, 2)]
     with Simulator([Wire(drives, unpaced=True)]) as simulator:
         path = folder / "plant.toml"
@@ -235,7 +235,7 @@ def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
 
 @contextmanager
 def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run the command; give it with its printed address when it is ready."""
+    """Run the command; yield the process and its printed address once it is ready."""
     words = [*MULTIDROP, "serve", str(path), *options]
     with BoundProcess(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment

@@ -1,4 +1,4 @@
-"""A Modbus server in a thread with fake rows and commands, and a client of plain sockets."""
+"""Run a Modbus server in a thread with fake rows and commands; a Modbus client on plain sockets."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.modbus_server.unit_ids import MAIN
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
-PATIENCE = 30.0  # s, for required events
+PATIENCE = 30.0  # s, longest wait for an expected event
 
 
 class FakeHub:
-    """Rows by drive and register, of an age that the test sets; other registers were never polled."""
+    """Fake rows by drive and register, with an age set by the test; other registers were never polled."""
 
     def __init__(self) -> None:
         self.values: dict[tuple[str, str], float | None] = {}
-        self.ages: dict[tuple[str, str], float] = {}  # s
+        self.ages: dict[tuple[str, str], float] = {}  # s, age of each row
         self.states: dict[str, str] = {}
         self.woken_ns = 0
 
@@ -56,7 +56,7 @@ DONE = CommandResult(CommandOutcome.DONE, "done")
 
 
 class FakeCommands:
-    """Commands that record their calls, with results that the test sets."""
+    """Fake commands that record their calls and return results set by the test."""
 
     def __init__(self) -> None:
         self.told: CommandResult | Callable[[], Awaitable[CommandResult]] = DONE
@@ -83,7 +83,7 @@ class FakeCommands:
 
 
 class FakeLine:
-    """A line that answers uncached reads: each address with its number, or as the test sets."""
+    """A fake line that answers uncached reads: each address with its own number, or as the test sets."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, int, int, int]] = []
@@ -99,9 +99,9 @@ class FakeLine:
 
 
 def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
-    """Return a plant of drives with their lines' names, which polls all readable registers without a rate.
+    """Return a plant of drives, given with line names, that polls all readable registers, without a rate.
 
-    Each server computes the rates of a plant, which would take most of a short test.
+    Without a rate, because a server's calculation of poll rates would dominate a short test.
     """
     lines: dict[str, list[PolledDrive]] = {}
     for line, drive in drives:
@@ -115,7 +115,7 @@ def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
 
 @contextmanager
 def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
-    """Run a server, created in its own loop, in a thread until the block ends."""
+    """Run a server in a thread with its own event loop until the block ends."""
     ready: list[ModbusServer] = []
     failures: list[BaseException] = []
     begun = threading.Event()
@@ -160,7 +160,7 @@ def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
 
 
 class Gateway(NamedTuple):
-    """A server with its fakes."""
+    """A running server with its fakes."""
 
     server: ModbusServer
     hub: FakeHub
@@ -173,7 +173,7 @@ class Gateway(NamedTuple):
 
 @contextmanager
 def serving(plant: Plant, settings: ModbusSettings) -> Iterator[Gateway]:
-    """Run a server of this plant over fakes."""
+    """Run a server for this plant with fake rows, commands and lines."""
     hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
     fakes: Any = plant, hub, commands
     with in_thread(lambda: ModbusServer(*fakes, settings, line.ask)) as server:
@@ -181,7 +181,7 @@ def serving(plant: Plant, settings: ModbusSettings) -> Iterator[Gateway]:
 
 
 def request(transaction: int, unit: int, function: int, *words: int, data: bytes = b"") -> bytes:
-    """Return a request's frame, packed as in the messaging guide."""
+    """Return a Modbus TCP request frame, packed after the messaging guide."""
     body = struct.pack(f">BB{len(words)}H", unit, function, *words) + data
     return struct.pack(">HHH", transaction, 0, len(body)) + body
 
@@ -203,7 +203,7 @@ class RawReply(NamedTuple):
 
 
 class RawClient:
-    """A Modbus TCP client that sends any bytes."""
+    """A Modbus TCP client that can send arbitrary bytes."""
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
@@ -233,7 +233,7 @@ class RawClient:
             return None
 
     def ask(self, unit: int, function: int, *words: int, data: bytes = b"") -> RawReply:
-        """Return the reply to one request."""
+        """Send one request; return its reply."""
         self.send(request(7, unit, function, *words, data=data))
         reply = self.receive()
         assert reply is not None

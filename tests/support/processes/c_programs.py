@@ -1,4 +1,4 @@
-"""Build C programs with files of the core under the sanitizers, and run them."""
+"""Build C test programs together with files of the core, with sanitizers, and run them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OPTIONS = ["-std=c11", "-D_DEFAULT_SOURCE"]
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 CC = os.environ.get("CC", "cc")
-SKIPPED = 77  # exit status of a test program that prints why it cannot run here
+SKIPPED = 77  # exit status of a test program that cannot run here; it prints why
 
 
 def build_and_run(
@@ -28,14 +28,14 @@ def build_and_run(
     arguments: Sequence[str] = (),
     sanitizers: Sequence[str] = SANITIZERS,
 ) -> None:
-    """Build the named test program with these files of the core, and run it.
+    """Build a test program with these C files of the core, and run it.
 
-    `objects` caches compiled files for all programs and workers.
+    `objects` is the cache folder of compiled files, shared by all programs and test workers.
     """
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
     sources = [f"csrc/{name}.c" for name in core]
-    random.shuffle(sources)  # workers that start together compile different files first
+    random.shuffle(sources)  # so that concurrent workers compile different files first
     parts = [compiled(source, objects, sanitizers) for source in (f"tests/c/{program.name}.c", *sources)]
     _run([CC, *sanitizers, *parts, "-lm", "-o", program])
     run = subprocess.run([program, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -45,21 +45,21 @@ def build_and_run(
 
 
 def compiled(source: str, objects: Path, sanitizers: Sequence[str]) -> Path:
-    """Return the object file of a source; wait if another worker compiles it."""
+    """Compile a source, or wait for another worker that does; return the object file's path."""
     name = f"{Path(source).stem}{''.join(sanitizers)}".translate({ord(","): "-", ord("="): "-"})
     made = objects / f"{name}.o"
     with (objects / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not made.exists():
             half = made.with_suffix(".half")
-            # -O0 compiles twice as fast; .ci/run also builds with -O2
+            # -O0 compiles twice as fast as -O2; .ci/run also builds with -O2
             _run([CC, *OPTIONS, "-g", "-O0", *STRICT, *sanitizers, "-Icsrc", "-c", source, "-o", half])
             half.rename(made)
     return made
 
 
 def preloaded(name: str, folder: Path) -> str:
-    """Build a shared library; return its path for LD_PRELOAD."""
+    """Build the shared library of this name; return its path for LD_PRELOAD."""
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
     library = folder / f"{name}.so"

@@ -1,4 +1,4 @@
-"""Run commands as users do, in this process or in another."""
+"""Run `multidrop` commands as users do, in separate processes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from multidrop.families.registry import find_model
 
 MULTIDROP = [sys.executable, "-m", "multidrop"]
 TOY = f"{Path(__file__).parents[1]}/drives/toy.py:Toy"
-find_model(TOY)  # imports the file now, because its notice would otherwise appear in the middle of a test
+find_model(TOY)  # load the file now, so that its log entry does not appear during a test
 Run = Callable[..., tuple[int, str, str]]
 TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a user's model is a program\n"
 
 
 def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end; `most_bytes` simulates a full disk."""
+    """Run a command to its end; with `most_bytes`, files are limited to this size, like on a full disk."""
 
     def limit() -> None:
         import resource  # not on Windows
@@ -42,7 +42,7 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
 
 @contextmanager
 def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
-    """Start a command; give its process and output."""
+    """Start a command; yield its process and its output stream."""
     with BoundProcess([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -52,7 +52,7 @@ def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
 
 
 def plant_file(directory: Path, *, dead: bool = False) -> Path:
-    """Write a plant file: one line with a simulated drive and, with `dead`, one that is not simulated."""
+    """Write a plant file with one simulated drive and, if `dead`, a second drive that never replies."""
     line = f'[[line]]\nname = "hall-1"\nport = "{directory}/ports/hall-1"\n'
     drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
     path = directory / f"{'with-dead' if dead else 'living'}.toml"

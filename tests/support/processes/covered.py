@@ -1,7 +1,7 @@
-"""Print coverage of Python and C, and the lines that the tests did not reach.
+"""Print the test coverage of Python and C, and the lines that no test reached.
 
-`python tests/support/processes/covered.py PATH...`: coverage.py's JSON report, the directory of a core built
-with --coverage, or both. tests/README.md explains the lines that are not reached.
+Usage: `python tests/support/processes/covered.py PATH...`. A PATH is coverage.py's JSON report, or the
+directory of a core built with --coverage. tests/README.md explains the lines that no test reaches.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Reach:
     lines: int = 0
     branches: int = 0
     taken: int = 0
-    missed: set[int] = field(default_factory=set)  # line numbers
+    missed: set[int] = field(default_factory=set)  # numbers of lines that were not reached
     untaken: set[tuple[int, int]] = field(default_factory=set)  # branches not taken, as (from, to)
 
 
@@ -60,14 +60,14 @@ def of_c(build: Path) -> dict[str, Reach]:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Return line numbers as ranges: 1-3 7 9-10."""
+    """Return line numbers as text with ranges: 1-3 7 9-10."""
     runs = groupby(enumerate(sorted(numbers)), lambda each: each[1] - each[0])
     ends = [[number for _, number in run] for _, run in runs]
     return " ".join(f"{end[0]}-{end[-1]}" if len(end) > 1 else f"{end[0]}" for end in ends)
 
 
 def room(name: str) -> str:
-    """Return the row's name: a C file of the core, or a Python directory."""
+    """Return the table row for a file: the C file itself, or the directory of a Python file."""
     return name if name.endswith((".c", ".h")) else name.rpartition("/")[0] + "/"
 
 

@@ -1,4 +1,4 @@
-"""Simulate full and read-only disks without a mount, as root too."""
+"""Simulate full and read-only disks without a mount; works for root too."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOBODY = 65534
 
 @contextmanager
 def full_at(size: int) -> Iterator[None]:
-    """Limit files of this process to this size; longer writes are cut off."""
+    """Limit files of this process to `size` bytes; writes beyond the limit are cut off."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -25,7 +25,7 @@ def full_at(size: int) -> Iterator[None]:
 
 @contextmanager
 def read_only_directory() -> Iterator[Path]:
-    """Give a directory that rejects new files; root becomes `nobody`, because root can write anywhere."""
+    """Yield a directory that rejects new files; root becomes `nobody`, because root can write anywhere."""
     user = os.geteuid()
     with TemporaryDirectory() as directory:
         Path(directory).chmod(0o555)

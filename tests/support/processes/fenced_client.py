@@ -1,9 +1,9 @@
-"""Poll several lines in a forked process whose lease is renewed, and which others suspend.
+"""Poll several lines in a forked process whose lease a test renews, and which the test suspends.
 
-Each line of standard input starts one process: FD LEASE GUARD BEYOND PORT... FD is an inherited socket: the
-process requests each renewal with one byte and receives it as one byte. LEASE and GUARD are in s. BEYOND is
-how many seconds it may send after its lease expired: 0, except to test without the check before each write.
-The process id is printed.
+Each line of standard input starts one process: FD LEASE GUARD BEYOND PORT... Its process id is printed. FD is
+an inherited socket: the process requests each renewal with one byte, and a renewal is one byte. LEASE and
+GUARD are in s. BEYOND is how many seconds the process may send after its lease expired: 0, except to test
+without the check before each write.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from multidrop.drive.register import HOLDING, reading
 
 
 class Counted(Drive):
-    """A drive with one register and an immediate reply."""
+    """A drive with one register, which replies immediately."""
 
     framings = (Framing.RTU,)
     baudrates = (115_200,)
@@ -44,7 +44,7 @@ def live(
     observer: socket.socket, lease: float, guard: float, timer: float, beyond: float, ports: list[str]
 ) -> None:
     mastership = Mastership(guard)
-    mastership.guard_s = timer  # only for the kernel's timer: claiming a line listens for the guard time
+    mastership.guard_s = timer  # for the kernel's timer only: claims still use `guard`
     drives = [
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]
@@ -58,14 +58,14 @@ def live(
             observer.send(b"?")
             if not observer.recv(1):
                 return
-            with suppress(ValueError):  # a renewal that arrives after suspension is void
+            with suppress(ValueError):  # a renewal that arrives after a suspension is invalid
                 mastership.extend(asked_ns + round((lease + beyond) * 1e9))
             poller.take()
             time.sleep(lease / 3)
 
 
 def main() -> None:
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system reaps child processes
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # let the system reap child processes
     faulthandler.register(signal.SIGUSR1)
     for words in map(str.split, sys.stdin):
         fd, lease, guard, timer, beyond, *ports = words

@@ -1,7 +1,7 @@
-"""A master that is suspended at random moments, its successor, and a far end that counts requests.
+"""Suspend a master at random moments, take over its lines, and count its late requests at the far end.
 
-The observer grants renewals like a fleet, and takes over when the last one is older than lease and guard by
-its own clock. Every request after that is stale: another master would be on the line.
+The test grants renewals like a fleet. It takes over once the last renewal is older than lease plus guard, by
+its own clock. Every later request is stale: by then another master would use the line.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pathlib import Path
 from checksums import rtu
 
 CLIENT = Path(__file__).with_name("fenced_client.py")
-REQUEST = 8  # bytes
+REQUEST = 8  # bytes of a request
 REPLY = rtu("01 03 02 00 07")
-IDLE_S = 0.005  # by then everything sent on this machine has arrived
-WATCHED_S = 0.08  # after the master continues
+IDLE_S = 0.005  # s after which everything sent on this machine has arrived
+WATCHED_S = 0.08  # s to watch after the master continues
 PATIENCE_S = 60.0
 
 
@@ -36,11 +36,11 @@ def now_s() -> float:
 
 
 class FarEnd:
-    """Serial servers with one drive each, which reply immediately and count requests."""
+    """Serial servers with one drive each; they reply immediately and count requests."""
 
     def __init__(self, lines: int) -> None:
         self.requests = 0
-        self._idle = 0  # checks without new requests
+        self._idle = 0  # number of checks in a row without new requests
         self._selector = selectors.DefaultSelector()
         self._servers = [socket.create_server(("127.0.0.1", 0)) for _ in range(lines)]
         self.ports = [f"socket://127.0.0.1:{server.getsockname()[1]}" for server in self._servers]
@@ -72,7 +72,7 @@ class FarEnd:
             connection.close()
 
     def settle(self, seconds: float) -> None:
-        """Wait until requests stop arriving, for at most this long."""
+        """Wait until requests stop arriving, at most `seconds`."""
         before, end = self._idle, now_s() + seconds
         while self._idle < before + 2 and now_s() < end:
             time.sleep(0.001)
@@ -87,22 +87,22 @@ class FarEnd:
 
 @dataclass
 class Round:
-    """One suspension: requests after the takeover, and whether the kernel killed the former master."""
+    """Result of one suspension: stale requests, and whether the kernel killed the former master."""
 
     stale: int
     is_killed: bool
 
 
 class Fence:
-    """Masters of this many lines, one after another; each sends `beyond` s after its mastership expired."""
+    """Masters of several lines, one after another; each may send for `beyond` s after its lease expired."""
 
     def __init__(
         self, lines: int, lease: float, guard: float, *, timer: float = 0.0, beyond: float = 0.0
     ) -> None:
         self.far = FarEnd(lines)
         self._lease, self._guard, self._beyond = lease, guard, beyond
-        self.early = 0  # masters that died before their suspension
-        self._timer = timer or guard  # the kernel's timer uses half of this guard; a long guard disables it
+        self.early = 0  # masters that died before the test suspended them
+        self._timer = timer or guard  # the kernel's timer fires after half of it
         self._ours, self._theirs = socket.socketpair()
         self._theirs.set_inheritable(True)
         self._client = subprocess.Popen(
@@ -125,7 +125,7 @@ class Fence:
 
     @contextmanager
     def _master(self) -> Iterator[int]:
-        """Start a process that polls, and kill it at the end."""
+        """Start a process that polls, yield its id, and kill it at the end."""
         assert self._client.stdin
         assert self._client.stdout
         times = (self._lease, self._guard, self._timer, self._beyond)
@@ -144,7 +144,7 @@ class Fence:
                 self._ours.recv(4096)
 
     def _grant(self, seconds: float) -> bool:
-        """Wait for a renewal request and grant it; return False if none arrives."""
+        """Wait up to `seconds` for a renewal request and grant it; return False if none arrives."""
         if not select.select([self._ours], [], [], max(seconds, 0))[0]:
             return False
         self._ours.recv(4096)
@@ -152,9 +152,9 @@ class Fence:
         return True
 
     def stop_once(self, chance: random.Random) -> Round:
-        """Suspend a polling master at a random moment, take over, and let it continue.
+        """Suspend a polling master at a random moment, take over, and let it continue; return the result.
 
-        Retry with another master if the kernel killed this one earlier because the machine was busy.
+        If the kernel killed the master before, because the test machine was busy, retry with another master.
         """
         while True:
             with self._master() as master:
@@ -163,14 +163,14 @@ class Fence:
                 self.early += 1
 
     def _is_polling(self, master: int) -> bool:
-        """Wait until the process has polled its lines for a while; return False if it died."""
+        """Wait until the process polls its lines steadily; return False if it died."""
         asked, granted, end = self.far.requests, 0, now_s() + PATIENCE_S
         while self.far.requests < asked + 20 * len(self.far.ports):
             granted += self._grant(0.01)
             if _await_death(master, 0):
                 return False
             if now_s() > end:
-                _signal(master, signal.SIGUSR1)  # prints the stack of each thread
+                _signal(master, signal.SIGUSR1)  # prints the stack of each of its threads
                 time.sleep(1.0)
                 requests = self.far.requests - asked
                 raise AssertionError(
@@ -186,9 +186,9 @@ class Fence:
                 seen_s = now_s()
         _signal(master, signal.SIGSTOP)
         while (left := seen_s + self._lease + self._guard - now_s()) > 0:
-            if self._grant(left):  # a renewal it requested before the suspension
+            if self._grant(left):  # a renewal that it requested before the suspension
                 seen_s = now_s()
-        # the takeover: no renewals after this
+        # Take over: grant no renewals from here on.
         self.far.settle(1.0)
         before = self.far.requests
         time.sleep(chance.uniform(0, 0.02))

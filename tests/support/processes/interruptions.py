@@ -1,4 +1,4 @@
-"""Raise Ctrl-C or another failure before any chosen line or bytecode of the code under test."""
+"""Raise KeyboardInterrupt or another exception before a chosen line or bytecode of the code under test."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PACKAGE = str(Path(multidrop.__file__).parent)
 
 
 def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractContextManager[list[str]]:
-    """Raise KeyboardInterrupt before the nth line that counts, if there are so many."""
+    """Raise KeyboardInterrupt before the nth line in frames for which `counts` is true, if there is one."""
     return failing_at(nth, counts, KeyboardInterrupt())
 
 
 def failing_at(
     nth: int, counts: Callable[[FrameType], bool], failure: BaseException
 ) -> AbstractContextManager[list[str]]:
-    """Raise `failure` before the nth line that counts; give a list that receives the line."""
+    """Raise `failure` before the nth line in such frames; yield a list to which the line's place is added."""
 
     def fail() -> None:
         raise failure
@@ -35,7 +35,7 @@ def failing_at(
 def calling_at(
     nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object], event: str = "opcode"
 ) -> Iterator[list[str]]:
-    """Call `call` before the nth opcode, or line, that counts; give a list that receives its place."""
+    """Call `call` before the nth opcode or line in such frames; yield a list to which its place is added."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 
@@ -61,12 +61,12 @@ def calling_at(
 
 
 class Interruption(BaseException):
-    """Raised in place of KeyboardInterrupt, which would end the test run."""
+    """Raised instead of KeyboardInterrupt, which would end the test run."""
 
 
 @contextmanager
 def interrupted_before(nth: int, failure: type[BaseException] = Interruption) -> Iterator[list[str]]:
-    """Raise before the nth bytecode of the package on this thread; give a list that receives its place."""
+    """Raise `failure` before the package's nth bytecode on this thread; yield a list for its place."""
     left = nth
     found: list[str] = []
 
@@ -91,7 +91,7 @@ def interrupted_before(nth: int, failure: type[BaseException] = Interruption) ->
 
 
 def every(step: int, act: Callable[[int], bool]) -> int:
-    """Call `act` with 1, 1 + step and so on until it is not interrupted; return how often it was."""
+    """Call `act` with 1, 1 + step and so on until one is not interrupted; return how many calls were interrupted."""
     for times in count():
         if not act(1 + times * step):
             return times

@@ -1,4 +1,4 @@
-"""Results of libmodbus and pymodbus on frames as our types: a message, or the reason for rejection."""
+"""How libmodbus and pymodbus decode frames, in this project's types: a message, or why it was rejected."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from peers import build_with_libmodbus, require_module
 
 from multidrop.core import Framing, Message
 
-Verdict = Message | str  # a string is the reason for rejection
+Verdict = Message | str  # a message, or the reason for rejection
 
 JUDGE = Path(__file__).parents[2] / "c" / "libmodbus_judge.c"
-EXCEPTIONS = range(12)  # errno of libmodbus for exceptions 00 to 0B; its own errors follow
+EXCEPTIONS = range(12)  # libmodbus' errno offsets for exceptions 00 to 0B; larger ones are its own errors
 EMBBADEXC = 14
 UNKNOWN_CODE = "an exception without a code"
 NO_FUNCTION = "it has no such function"
@@ -36,11 +36,11 @@ def _text(octets: bytes) -> str:
     return octets.hex() or "-"
 
 
-# ---- libmodbus: a program that reads all cases at once ----
+# ---- libmodbus: a C program that reads all cases together ----
 
 
 class Libmodbus:
-    """libmodbus as server and client."""
+    """Runs libmodbus as server and as client."""
 
     def __init__(self, built: Path) -> None:
         self._program = build_with_libmodbus(JUDGE, built)
@@ -51,13 +51,13 @@ class Libmodbus:
         return done.stdout.splitlines()
 
     def hear(self, requests: Sequence[SampleFrame]) -> list[Understood | str]:
-        """Return what its server does on these requests, which are all addressed to it."""
+        """Return the server's result for each of these requests, which are all addressed to it."""
         return [
             _received(line) for line in self._run(f"request {_text(request.frame)}" for request in requests)
         ]
 
     def ask(self, replies: Sequence[SampleFrame]) -> list[tuple[bytes, Verdict]]:
-        """Return its client's requests, and how it decodes these replies."""
+        """Return the client's request for each of these replies, and how the client decodes the reply."""
         asked = [reply.request for reply in replies]
         lines = [
             f"reply {ask.address} {ask.function} {ask.start} {ask.count} {_text(ask.data)} "
@@ -69,7 +69,7 @@ class Libmodbus:
 
 @dataclass(frozen=True)
 class Understood:
-    """A server's result: bytes used, its reply, and the changed cells (table, address)."""
+    """A server's result: number of bytes used, its reply, and the changed cells by (table, address)."""
 
     used: int
     reply: bytes
@@ -102,7 +102,7 @@ def _answered(request: Message, line: str) -> tuple[bytes, Verdict]:
 
 
 def _confirmed(request: Message, values: str) -> Message:
-    """Return the reply of a client that accepted these values or the confirmation of its write."""
+    """Return the reply that a client must have decoded, given the values that it returned."""
     if request.function in ECHOES:
         return request
     data = b""
@@ -112,7 +112,7 @@ def _confirmed(request: Message, values: str) -> Message:
     return Message(request.address, request.function, request.start, request.count, data)
 
 
-# ---- the required result of a server with these cells ----
+# ---- the result that the standard requires of a server ----
 
 
 def expected(used: int, request: Message) -> Understood:
@@ -123,7 +123,7 @@ def expected(used: int, request: Message) -> Understood:
 
 
 def _cell(function: int, address: int) -> int:
-    """Return the initial value of a table's address."""
+    """Return the initial value at an address of the function's table."""
     fill = {
         1: int(address % 3 == 0),
         2: int(address % 5 == 0),
@@ -134,7 +134,7 @@ def _cell(function: int, address: int) -> int:
 
 
 def _carry_out(request: Message, changes: dict[tuple[int, int], int]) -> bytes:
-    """Return the reply's PDU: function and data."""
+    """Carry out a request: add the changed cells to `changes`; return the reply's PDU (function and data)."""
     function, start, count = request.function, request.start, request.count
     if function == 8:
         return bytes([function]) + start.to_bytes(2) + request.data
@@ -167,7 +167,7 @@ def _carry_out(request: Message, changes: dict[tuple[int, int], int]) -> bytes:
 
 
 class Pymodbus:
-    """pymodbus as server and client, without ports."""
+    """Runs pymodbus as server and as client, without ports."""
 
     def __init__(self, framing: Framing) -> None:
         framer = require_module("pymodbus.framer")
@@ -183,11 +183,11 @@ class Pymodbus:
         self._client = make(self._pdu.DecodePDU(False))
 
     def hear(self, said: SampleFrame) -> Verdict:
-        """Return the request that its server decodes."""
+        """Return how the server decodes the request."""
         return self._open(self._server, said, address=0)
 
     def ask(self, said: SampleFrame) -> Verdict:
-        """Return how its client decodes the reply."""
+        """Return how the client decodes the reply."""
         found = self._open(self._client, said, said.request.address)
         if isinstance(found, Message) and found.function in READS and not found.exception:
             return replace(found, start=said.request.start, count=said.request.count)
@@ -211,13 +211,13 @@ class Pymodbus:
         return bytes(self._client.buildFrame(self._pdu_of(self._client, reply)))
 
     def _pdu_of(self, framer: Any, message: Message) -> Any:
-        head = bytes([message.address, message.function, 0, 0])  # 0 is the subfunction of 08
+        head = bytes([message.address, message.function, 0, 0])  # two bytes of 0: subfunction of function 08
         kind = framer.decoder.lookupPduClass(head)
         return kind(dev_id=message.address, transaction_id=message.transaction, **_fields(message))
 
 
 def _fields(message: Message) -> dict[str, Any]:
-    """Return the message's fields by pymodbus's names."""
+    """Return the message's fields under pymodbus's names."""
     function = message.function
     if function == 0x08:
         return {"message": message.data}
@@ -249,7 +249,7 @@ def _said(pdu: Any) -> Message:
 
 
 def _octets(said: Any) -> bytes:
-    """Return the data of function 08, which pymodbus keeps as bytes, one number or several."""
+    """Return the data of function 08 as bytes; pymodbus holds bytes, a number, or a list of numbers."""
     if isinstance(said, bytes):
         return said
     return pack_words([said] if isinstance(said, int) else said)

@@ -1,8 +1,8 @@
 """Apply a parameter file in a forked process that may be killed.
 
-Each line of standard input starts one: PORT FILE REPORT. It is forked from this process, which has imported
-everything; its id is printed, and at its end its exit status. An application that ends writes its own and
-earlier writes to REPORT.
+Each line of standard input, PORT FILE REPORT, forks such a process; that is fast, because everything is
+imported. Its process id is printed and, when it ends, its exit status. A process that completes records its
+own and earlier parameter writes in REPORT.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from multidrop import Bus, BusError, DelixiNative, params
 
 DRIVE: Any = {"address": 1, "baudrate": 38400}
-TRIES = 20  # replies may be missed on a busy machine
+TRIES = 20  # attempts, because replies may be missed on a busy machine
 
 
 def apply(port: str, file: str, report: str) -> None:

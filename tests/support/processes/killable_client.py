@@ -1,12 +1,11 @@
 """Poll, record and write in a forked process until killed, and report the rows and writes on disk.
 
-Each line of standard input starts one: PORT DIRECTORY LIFE NUMBER. It is forked from this process, which has
-imported everything; its id and its exit status are printed. It records into DIRECTORY/LIFE.arrows and .csv,
-and writes NUMBER and the following numbers to the drive. It appends to DIRECTORY/LIFE.told as soon as the
-call has returned:
+Each line of standard input, PORT DIRECTORY LIFE NUMBER, forks such a process; its id and its exit status are
+printed. It records into DIRECTORY/LIFE.arrows and .csv, and writes NUMBER and the following numbers to the
+drive. As soon as a call has returned, it appends to DIRECTORY/LIFE.told:
     rows N      both recordings have N rows
     wrote N     the number N was written
-Ledger and audit log are in DIRECTORY, for all lives.
+All these processes share the EEPROM ledger and the audit log in DIRECTORY.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ NAME = "counted"
 
 
 class Counted(Drive):
-    """A drive that counts its reads; the memory of its writable number is unknown."""
+    """A drive that counts its reads, and has a writable number of unknown memory type."""
 
     framings = (Framing.RTU,)
     baudrates = (115_200,)

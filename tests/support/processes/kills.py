@@ -1,4 +1,4 @@
-"""Kill the processes of a test; count threads and descriptors, to find leaks."""
+"""Kill a test's processes; count threads and descriptors to find leaks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, AnyStr
 
 
 class BoundProcess(subprocess.Popen[AnyStr]):
-    """A process that is killed if its block fails: `Popen` would wait for its end."""
+    """A process that is killed if its `with` block fails, whereas `Popen` would wait for its end."""
 
     def __exit__(
         self,
@@ -25,7 +25,7 @@ class BoundProcess(subprocess.Popen[AnyStr]):
 
 
 def kill_all(processes: Iterable[subprocess.Popen[Any]]) -> None:
-    """Kill processes, suspended ones too, and wait for their end."""
+    """Kill processes, even suspended ones, and wait for their end."""
     killed = list(processes)
     for process in killed:
         process.kill()
@@ -38,5 +38,5 @@ def descriptors() -> int:
 
 
 def threads() -> int:
-    """Count the threads except the logging thread, which starts with the first entry and stays."""
+    """Return the number of threads, except the logging thread, which starts at the first log entry."""
     return sum(thread.name != "multidrop log" for thread in threading.enumerate())

@@ -1,4 +1,4 @@
-"""Programs and modules by other authors to compare with; if one is missing, skip the test, or fail in CI."""
+"""Require programs and modules by other authors; if one is missing, skip the test, or fail it in CI."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 
 def require_program(name: str) -> str:
-    """Return the program's path."""
+    """Return the path of an installed program."""
     path = shutil.which(name)
     if path is None:
         _missing(f"the program {name} is not installed")
@@ -23,7 +23,7 @@ def require_program(name: str) -> str:
 
 
 def build_with_libmodbus(source: Path, built: Path) -> Path:
-    """Compile the C program with libmodbus into the directory `built`; return its path."""
+    """Compile a C program with libmodbus into the directory `built`; return the program's path."""
     require_program("pkg-config")
     flags = subprocess.run(
         ["pkg-config", "--cflags", "--libs", "libmodbus"], capture_output=True, text=True, check=False
@@ -36,7 +36,7 @@ def build_with_libmodbus(source: Path, built: Path) -> Path:
 
 
 def require_module(name: str) -> ModuleType:
-    """Return the imported module; the name may be dotted."""
+    """Import and return a module; the name may be dotted."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError:
@@ -44,7 +44,7 @@ def require_module(name: str) -> ModuleType:
 
 
 def require_installed(name: str) -> None:
-    """Check for the module without an import, at the top of a test file that needs it."""
+    """Check that a module is installed, without importing it; for the top of a test file."""
     if find_spec(name) is None:
         _missing(f"the Python module {name} is not installed")
 

@@ -1,4 +1,4 @@
-"""`multidrop sniff` in another process, and lines with a passive listener."""
+"""Run `multidrop sniff` in another process, on lines with a passive listener."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from multidrop.core import set_settings
 
 
 class Sniffer:
-    """A running `multidrop sniff`; its objects are complete when the block ends."""
+    """A running `multidrop sniff`; its decoded JSON objects are complete when the block ends."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.told: list[dict[str, Any]] = []
@@ -40,7 +40,7 @@ class Sniffer:
         return dict(self.told[-1]["summary"])
 
 
-# Checks the pairing of replies: on a busy machine they may come after the master's timeout.
+# Checks the pairing of replies, which on a busy machine may come after the master's timeout.
 PATIENT = """
 import sys
 from multidrop.cli import main
@@ -73,7 +73,7 @@ def sniffing(port: str, *words: object, patient: bool = False) -> Iterator[Sniff
 
 
 def unread(port: str) -> int:
-    """Return the number of bytes that the listener has not read."""
+    """Return the number of bytes waiting at the listener's port."""
     count = array.array("i", [0])
     fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
     try:
@@ -85,9 +85,9 @@ def unread(port: str) -> int:
 
 @contextmanager
 def tapped(drives: str, baudrate: int, hear: Callable[[bytes], bytes] = bytes) -> Iterator[tuple[str, str]]:
-    """Give the paths of the master's port and of the listener's; `drives` is the port of the drives.
+    """Yield the paths of the master's and the listener's ports; `drives` is the port of the drives.
 
-    `hear(said)` returns the bytes that the listener receives for these.
+    `hear(said)` returns the bytes that the listener receives in place of `said`.
     """
     behind = os.open(drives, os.O_RDWR | os.O_NOCTTY)
     set_settings(behind, baudrate, "8N1")
@@ -116,5 +116,5 @@ def _copy(behind: int, master: int, tap: int, stop: int, hear: Callable[[bytes],
                     return
                 with suppress(OSError):
                     said = os.read(key.fd, 1024)
-                    os.write(tap, hear(said))  # first, to deliver a request before its reply
+                    os.write(tap, hear(said))  # the listener gets a request before its reply
                     os.write(master if key.fd == behind else behind, said)

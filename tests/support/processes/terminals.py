@@ -1,4 +1,4 @@
-"""Commands on their own terminal, and its screen."""
+"""Run commands on a terminal of their own, and read its screen."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from commands import MULTIDROP
 
 
 class Terminal:
-    """A pty with a running command, and all its output."""
+    """A command running on its own pty, with all its output so far."""
 
     def __init__(self, words: list[str], size: tuple[int, int], **environment: str) -> None:
         self.fd, slave = pty.openpty()
@@ -54,13 +54,13 @@ class Terminal:
 
 
 class ClosingTerminal(Terminal):
-    """A terminal of a separate session, which gets SIGHUP when it closes."""
+    """A terminal with its own session, whose processes get SIGHUP when the terminal closes."""
 
     def _begin(self, words: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
         slave = self.slave
 
         def take_terminal() -> None:
-            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # restores the default
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # restore the default action
             fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
 
         process = subprocess.Popen(
@@ -81,7 +81,7 @@ class ClosingTerminal(Terminal):
 
 @contextmanager
 def closing_terminal(*words: object, size: tuple[int, int] = (80, 24)) -> Iterator[ClosingTerminal]:
-    """Give a terminal that the test closes."""
+    """Run a command on a terminal that the test closes; yield the terminal."""
     terminal = ClosingTerminal([*MULTIDROP, *map(str, words)], size)
     try:
         yield terminal

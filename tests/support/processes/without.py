@@ -1,6 +1,6 @@
 """A pytest plugin that hides pandas, polars and DuckDB.
 
-`PYTHONPATH=tests/support/processes pytest -p without`
+Usage: `PYTHONPATH=tests/support/processes pytest -p without`
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _find_spec = importlib.util.find_spec
 
 
 class Hiding:
-    """An import finder that does not find them."""
+    """An import finder that raises for the hidden modules."""
 
     @staticmethod
     def find_spec(name: str, *place: object) -> None:

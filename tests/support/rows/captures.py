@@ -1,4 +1,4 @@
-"""Captures of printed exchanges, and how Wireshark and the library decode them."""
+"""Write captures of the exchanges printed in documents, and decode them with Wireshark and the library."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def decimal(text: str) -> list[int]:
 
 
 def spans(path: Path) -> dict[str, list[FrameSpan]]:
-    """Return the frames of a capture, by line."""
+    """Return the frames in a capture file, by line name."""
     found: dict[str, list[FrameSpan]] = {}
     splitters: dict[str, Splitter] = {}
     with Capture(path) as capture:

@@ -1,4 +1,4 @@
-"""Random Modbus requests and replies, whole and damaged, reproducible by seed."""
+"""Generate random Modbus requests and replies, intact and damaged, reproducibly from a seed."""
 
 from __future__ import annotations
 
@@ -14,25 +14,32 @@ from multidrop.core import Framing, Message
 READS = (0x01, 0x02, 0x03, 0x04)
 FUNCTIONS = (*READS, 0x05, 0x06, 0x08, 0x0F, 0x10)
 BITS = (0x01, 0x02, 0x0F)
-MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}  # application protocol V1.1b3
+MOST = {
+    0x01: 2000,
+    0x02: 2000,
+    0x03: 125,
+    0x04: 125,
+    0x0F: 1968,
+    0x10: 123,
+}  # longest reads and writes (V1.1b3)
 ECHOES = (0x05, 0x06, 0x08)
 COIL_VALUES = (b"\xff\x00", b"\x00\x00")
 
-Body = bytes  # without start, end and checksum
+Body = bytes  # frame without start, end and checksum
 
 
 @dataclass(frozen=True)
 class SampleFrame:
-    """A frame and its undamaged original; a reply also has its request."""
+    """A frame, perhaps damaged, and its undamaged message; a reply also has its request."""
 
     framing: Framing
     frame: bytes
     request: Message
-    damage: str  # "" if undamaged
+    damage: str  # kind of damage, "" if undamaged
 
     @property
     def body(self) -> Body:
-        """Return the body as far as it can be located."""
+        """Return the frame's body, as far as the damage allows."""
         if self.framing is Framing.RTU:
             return self.frame[:-2]
         digits = self.frame.partition(b":")[2].partition(b"\r")[0]
@@ -42,7 +49,7 @@ class SampleFrame:
             return b""
 
     def octet(self, at: int) -> int:
-        """Return a byte of the body, or -1 past its end."""
+        """Return the body's byte at index `at`, or -1 past its end."""
         return self.body[at] if at < len(self.body) else -1
 
     @property
@@ -80,7 +87,7 @@ def random_request(chance: random.Random) -> Message:
 
 
 def random_reply(chance: random.Random, request: Message) -> Message:
-    """Return a reply that a drive could send."""
+    """Return a random valid reply to the request."""
     if chance.random() < 0.15:
         code = chance.choice((1, 2, 3, 4, 6, 0x0B, 0x12, chance.randint(1, 255)))
         return Message(request.address, request.function, exception=code)
@@ -94,7 +101,7 @@ def random_reply(chance: random.Random, request: Message) -> Message:
 
 def _random_data(chance: random.Random, function: int, count: int) -> bytes:
     data = bytearray(chance.randbytes(data_bytes(function, count)))
-    if function in BITS and count % 8:  # unused bits of the last byte are 0 (6.1 of the application protocol)
+    if function in BITS and count % 8:  # unused bits of the last byte are 0 (application protocol, 6.1)
         data[-1] &= (1 << count % 8) - 1
     return bytes(data)
 
@@ -124,7 +131,7 @@ Change = Callable[[random.Random, Body], Body]
 
 
 def _put(at: int, choices: Callable[[random.Random, int], int], chance: random.Random, body: Body) -> Body:
-    """Replace a byte, if the body is long enough."""
+    """Return the body with its byte at `at` replaced, if the body is long enough."""
     if at >= len(body):
         return body
     return body[:at] + bytes([choices(chance, body[at]) & 0xFF]) + body[at + 1 :]
@@ -152,11 +159,11 @@ REPAIRED: dict[str, Change] = {
     "bit flipped": _flip,
     "address": partial(_put, 0, lambda chance, _: chance.choice((0, 248, 255, chance.randrange(256)))),
     "function": partial(_put, 1, _another_function),
-    "third byte": partial(_put, 2, _near),  # a reply's byte count, or an exception code
+    "third byte": partial(_put, 2, _near),  # byte count or exception code of a reply
     "start": partial(_put, 3, _near),
     "value": partial(_put, 5, _near),
     "count": _another_count,
-    "byte count": partial(_put, 6, _near),  # of a request
+    "byte count": partial(_put, 6, _near),  # byte count of a request
     "shorter": lambda chance, body: body[: chance.randrange(1, len(body))],
     "longer": lambda chance, body: body + chance.randbytes(chance.choice((1, 2, 8))),
     "exception": lambda chance, body: bytes([body[0], body[1] | 0x80, chance.choice((0, 1, 2, 9, 0x20))]),
@@ -185,14 +192,14 @@ TEXT: dict[str, Change] = {
 
 
 def frames(seed: int, framing: Framing, number: int, *, replies: bool) -> list[SampleFrame]:
-    """Return requests or replies: whole, damaged with a correct checksum, damaged on the line, or foreign."""
+    """Return `number` requests or replies: intact, damaged (some with a valid checksum), or foreign."""
     chance = random.Random(seed)
     left = LEFT if framing is Framing.RTU else LEFT | TEXT
     found = []
     while len(found) < number:
         request = random_request(chance)
         if replies and request.address == 0:
-            continue  # a request without a reply
+            continue  # this request has no reply
         body = reply_body(random_reply(chance, request)) if replies else request_body(request)
         damage = chance.choice(("", "repaired", "left"))
         if replies and chance.random() < 0.1:

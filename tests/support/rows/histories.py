@@ -1,4 +1,4 @@
-"""Histories for tests, made of segments, and their expected buckets computed in plain Python."""
+"""Record histories for tests in segments, and compute their expected buckets in plain Python."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ METADATA = {"plant": "завод.toml", "drives": {"pump-1": {"registers": {"spe
 
 
 def batch(names: Names, drive: int, numbers: Iterable[int], begin: int, step: int) -> Batch:
-    """Make a row of each number in the core's memory, as a poll does; each tenth is a miss.
+    """Return a batch with a row per number, in the core's memory as after a poll; each tenth is a miss.
 
-    Its request was sent at `number * step` of the monotonic clock, which is UTC minus `begin`.
+    A row's request was sent at `number * step` ns of the monotonic clock, which is UTC minus `begin`.
     """
     numbers = list(numbers)
     columns = Columns(len(numbers))
@@ -51,7 +51,7 @@ _SPEED = Names(["speed"])
 
 
 def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> list[Row]:
-    """Make rows of six series at irregular times; about one in seven is a miss."""
+    """Return rows of six series at irregular times; about one in seven is a miss."""
     dice = random.Random(seed)
     rows, time = [], begin
     for _ in range(count):
@@ -61,7 +61,7 @@ def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> l
             Row(
                 time,
                 time - NOON + 10 * DAY,
-                None if is_miss else 1 << dice.randrange(10, 24),  # exact in a float's 24 bits
+                None if is_miss else 1 << dice.randrange(10, 24),  # exactly representable in a float
                 f"pump-{dice.randrange(3)}",
                 ("speed", "current")[dice.randrange(2)],
                 None if is_miss else dice.uniform(-50, 50),
@@ -72,7 +72,7 @@ def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> l
 
 
 def record(folder: Path, segments: Sequence[Sequence[Row]], piece: int = 40, after: int = 0) -> None:
-    """Write a segment of each list of rows."""
+    """Write each list of rows as a segment of a history."""
     folder.mkdir(exist_ok=True)
     with SegmentWriter(folder / "rows.arrows", METADATA, every=1e9, after=after) as writer:
         for rows in segments:
@@ -86,7 +86,7 @@ def rows_in(history: History, *of: object) -> list[Row]:
 
 
 def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
-    """Compare the buckets with the same computation in plain Python."""
+    """Check the buckets against a computation from the rows in plain Python."""
     drive, _, register = series.rpartition(".")
     mine: dict[int, list[float | None]] = {}
     for row in rows:
@@ -108,11 +108,11 @@ def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
 
 STEP = SECOND // 100
 RUN = 9 * 3600 * SECOND
-ROWS = 30  # per batch
+ROWS = 30  # rows per batch
 
 
 def main(folder: Path, run: int) -> None:
-    """Record into a history until killed; print the number of rows written so far.
+    """Record into a history until killed; print how many rows are written.
 
     Row `n` of run `r` has the drive `run-r` and was sent at `n * 10 ms` of the monotonic clock; each run
     starts 9 hours after the previous one.

@@ -1,4 +1,4 @@
-"""Minimal files of other programs with all their features, for the importers' tests and fuzzer."""
+"""Example files of other programs, small but with all features, for the importers' tests and fuzzer."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ select:
 output:
   - { platform: modbus_controller, id: speed, address: 60, register_type: holding, value_type: U_WORD }
 """
-FILES = {  # by the suffix that selects the importer
+FILES = {  # by suffix, which selects the importer
     ".tsv": (IOBROKER,),
     ".csv": (MODPOLL, NEURON, OWN),
     ".toml": (TELEGRAF,),
@@ -194,7 +194,7 @@ def only(folder: Path, name: str, contents: str | dict[str, Any]) -> ImportedDev
 
 
 def omissions(device: ImportedDevice) -> list[str]:
-    """Return the importer's sentences about omitted entries."""
+    """Return the importer's sentences about entries that could not be imported."""
     return [str(lost) for lost in device.lost]
 
 
@@ -206,7 +206,7 @@ def entries(device: ImportedDevice) -> dict[str, Any]:
 
 
 def gaps(device: ImportedDevice, name: str) -> list[str]:
-    """Return the gaps of a register or a text that its family file marks."""
+    """Return the gaps that the family file marks for this register or text."""
     mark = f"# gap: {name}: "
     lines = family_text(device, "source").splitlines()
     return [line.removeprefix(mark) for line in lines if line.startswith(mark)]

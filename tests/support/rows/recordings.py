@@ -1,4 +1,4 @@
-"""Recordings and their rows: written for a test, and read by the library and by pyarrow."""
+"""Write recordings for tests, and read their rows with the library and with pyarrow."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ SCHEMA = pa.schema(
     ]
 )
 
-FILE_SCHEMA = pa.schema(  # of .arrows: dictionary-encoded names, and a rounded-up uncertainty
+FILE_SCHEMA = pa.schema(  # schema of .arrows: dictionary-encoded names, rounded-up uncertainty
     [
         *(SCHEMA.field(name) for name in ("time", "monotonic_ns")),
         pa.field("uncertainty_ns", pa.float32()),
@@ -77,7 +77,7 @@ FILE_SCHEMA = pa.schema(  # of .arrows: dictionary-encoded names, and a rounded-
 
 
 def is_kept(found: Row, written: Row) -> bool:
-    """Return True if .arrows kept the row: its uncertainty may only have grown slightly."""
+    """Return True if .arrows returned the written row; its uncertainty may be slightly larger."""
     bound, least = found.uncertainty_ns, written.uncertainty_ns
     if bound is None or least is None:
         is_near = bound is least
@@ -87,7 +87,7 @@ def is_kept(found: Row, written: Row) -> bool:
 
 
 def record_as_before(path: Path, *batches: Any, metadata: bytes = b"{}") -> Path:
-    """Write batches in the format of version 0.1 with pyarrow: texts, and whole nanoseconds."""
+    """Write batches with pyarrow in the file format of version 0.1: plain texts, integer nanoseconds."""
     with pa.ipc.new_stream(path, SCHEMA.with_metadata({"multidrop": metadata})) as stream:
         for batch in batches:
             stream.write_batch(pa.record_batch(batch).cast(SCHEMA))
@@ -95,7 +95,7 @@ def record_as_before(path: Path, *batches: Any, metadata: bytes = b"{}") -> Path
 
 
 def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
-    """Return the rows as pyarrow reads them, with numeric time stamps."""
+    """Return a pyarrow table's rows, with numeric time stamps."""
     numbers = table.set_column(0, "time", table.column("time").cast(pa.int64()))
     return [Row(*row.values()) for row in numbers.to_pylist()]
 

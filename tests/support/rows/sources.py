@@ -1,4 +1,4 @@
-"""The project's sources, parsed once, for tests of its rules."""
+"""Parse the project's sources, once, for tests of the project's code rules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BUILT = {"_build", "__pycache__", "corpus"}
 
 
 def files(*rooms: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:
-    """Return the files of these rooms with these suffixes, except build products."""
+    """Return the files below these directories with these suffixes, except build products."""
     return [
         path
         for room in rooms
@@ -34,13 +34,13 @@ def place(path: Path, line: int) -> str:
 
 
 def run_time_imports(path: Path) -> set[str]:
-    """Return the modules that a file imports at run time, in functions too."""
+    """Return the modules that a file imports at run time, including imports in functions."""
     at_run_time, for_types = _imports(path)
     return at_run_time - for_types
 
 
 def type_imports(path: Path) -> set[str]:
-    """Return the modules that a file imports only for annotations."""
+    """Return the modules that a file imports only for type checkers."""
     return _imports(path)[1]
 
 
@@ -58,7 +58,7 @@ def _imports(path: Path) -> tuple[set[str], set[str]]:
 
 
 def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Yield each import with True if only a type checker sees it; expressions have none."""
+    """Yield each import below `node`, with True if only a type checker sees it; skips expressions."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import | ast.ImportFrom):
             yield child, for_types
@@ -72,7 +72,7 @@ def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import |
 
 
 def loop_variables(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield each name that a loop or a comprehension binds, with its line."""
+    """Yield line and name of each variable that a loop or a comprehension binds."""
     for node in ast.walk(parsed(path)):
         if isinstance(node, ast.For | ast.AsyncFor | ast.comprehension):
             for name in ast.walk(node.target):
@@ -81,7 +81,7 @@ def loop_variables(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def comments(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield each comment of a C file with its line; consecutive // lines are one comment."""
+    """Yield line and text of each comment in a C file; consecutive // lines are one comment."""
     before = -1
     text = path.read_text("utf-8")
     for match in re.finditer(r"/\*+(.*?)\*/|//+([^\n]*)", text, re.DOTALL):

@@ -1,7 +1,7 @@
-"""Table tests: one test runs a function with every row, and reports every row that fails.
+"""Table tests: one test calls a function with every row, and reports all failing rows.
 
-A row costs only its check, while a test (`pytest.mark.parametrize`) costs some milliseconds more in each test
-process. Rows that need their own fixture, or may be skipped, stay tests.
+A row costs only its check, whereas each test of `pytest.mark.parametrize` costs some extra milliseconds in
+each test process. Use the latter for rows that need a fresh fixture or may be skipped.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 Test = Callable[..., None]
-FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # skipping a row is a failure
+FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a skipped row counts as failed
 
 
 def table(
     names: str | Sequence[str], rows: Iterable[Any], ids: Iterable[object] | None = None
 ) -> Callable[[Test], Test]:
-    """Call a test with each row under these names, and report failing rows by id or value."""
+    """Return a decorator that calls a test with each row as arguments `names`; it reports failing rows."""
     columns = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
     several = not isinstance(names, str) or len(columns) > 1
     values = [tuple(row) if several else (row,) for row in rows]

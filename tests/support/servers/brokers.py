@@ -1,4 +1,4 @@
-"""MQTT brokers, a listener and a Sparkplug host by other authors; a plant whose values the test sets."""
+"""MQTT brokers, a listener and a Sparkplug host by other authors, and a fake hub with test values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from multidrop.gateway.http.rights import Caller, May
 from multidrop.gateway.live.hub import KeptRow, Known, Shown
 from multidrop.gateway.parts import PartContext
 
-PATIENCE_S = 30.0  # for an event that is immediate on an idle machine
+PATIENCE_S = 30.0  # longest wait for an event that is immediate on an idle machine
 TRIALS = 5
 
 
@@ -37,11 +37,11 @@ def free_port() -> int:
 
 
 class EndedAtOnce(Exception):
-    """Raised if a broker's process ended before it listened."""
+    """Raised if a broker's process ended before it accepted connections."""
 
 
 class Broker:
-    """A broker's process on its own port."""
+    """An MQTT broker's process on a port of its own."""
 
     def __init__(self, command: Callable[[int], Sequence[str]]) -> None:
         self._command = command
@@ -91,7 +91,7 @@ def mosquitto(folder: Path) -> Iterator[Broker]:
 
 @contextmanager
 def nats(folder: Path, program: str) -> Iterator[Broker]:
-    """Run a nats-server with its listener for MQTT."""
+    """Run a nats-server with MQTT enabled."""
 
     def command(port: int) -> list[str]:
         (folder / "nats.conf").write_text(
@@ -117,7 +117,7 @@ class Published(NamedTuple):
 
 
 def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
-    """Return a function that finds a message on this topic, with this payload unless that is None."""
+    """Return a predicate for messages on this topic, with this payload unless `payload` is None."""
     return lambda received: received.topic == topic and payload in (None, received.payload)
 
 
@@ -136,7 +136,7 @@ class Listener:
         self._probe, self._hears = topic.replace("#", "probe"), threading.Event()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
-        while not self._hears.wait(0.05):  # until the broker has subscribed it
+        while not self._hears.wait(0.05):  # until the broker has confirmed the subscription
             publish(broker, self._probe, b"probe")
 
     def _read(self) -> None:
@@ -153,7 +153,7 @@ class Listener:
                 self._received.put(Published(topic, kept == "1", bytes.fromhex(payload)))
 
     def wait_for(self, wanted: Callable[[Published], object]) -> Published:
-        """Return the next message that `wanted` accepts; earlier messages stay in `all`."""
+        """Wait for the next message that `wanted` accepts and return it; `all` keeps every message."""
         ends = time.monotonic() + PATIENCE_S
         while True:
             received = self._received.get(timeout=max(0.0, ends - time.monotonic()))
@@ -175,7 +175,7 @@ def publish(broker: Broker, topic: str, payload: bytes, *options: str) -> None:
 
 
 def sparkplug_messages() -> ModuleType:
-    """Return Eclipse's message definitions from pysparkplug, whose own client needs another paho."""
+    """Import pysparkplug's message definitions only, because its client needs another version of paho."""
     require_module("google.protobuf")
     try:
         path = distribution("pysparkplug").locate_file("pysparkplug/_protobuf/sparkplug_b_pb2.py")
@@ -194,7 +194,7 @@ PLAIN_FAN = InvtCHE(2, name="вентилятор-2")  # for nats-server, which 
 
 
 class ScriptedHub:
-    """A hub whose values the test sets, by drive and register."""
+    """A fake hub with values set by the test, by drive and register."""
 
     def __init__(self, fan: str) -> None:
         self.values: dict[tuple[str, str], float | None] = {
@@ -229,7 +229,7 @@ class ScriptedHub:
 
 
 class RecordedCommands:
-    """Command fakes that record each call and succeed."""
+    """Fake commands that record each call and succeed."""
 
     def __init__(self) -> None:
         self.may = May(write=frozenset({"pump-1.setpoint"}), verbs=frozenset({"pump-1.start"}))
@@ -256,7 +256,7 @@ class RecordedCommands:
 
 
 def inside(folder: Path, fan: Drive = FAN) -> Any:
-    """Return a part's surroundings: two drives, a hub and command fakes."""
+    """Return a PartContext for a gateway part: two drives, a fake hub and fake commands."""
     polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
     drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, fan))
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
@@ -266,7 +266,7 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
 
 
 def without_fan(known: Any) -> Plant:
-    """Return the plant of `inside` without the fan, which is also removed from the hub."""
+    """Remove the fan from the context's hub; return the context's plant without the fan."""
     known.hub.names.remove(FAN.name)
     (line,) = known.plant.lines
     plant: Plant = replace(known.plant, lines=(replace(line, drives=line.drives[:1]),))
@@ -274,7 +274,7 @@ def without_fan(known: Any) -> Plant:
 
 
 class Running:
-    """A part that runs in a thread with its own loop; `step()` waits for one publication."""
+    """A gateway part that runs in a thread with its own event loop; `step()` waits for one publication."""
 
     def __init__(self, part: Any) -> None:
         self._part = part
@@ -286,7 +286,7 @@ class Running:
         assert self._published.acquire(timeout=PATIENCE_S)
 
     def adopt(self, plant: Plant) -> None:
-        """Pass another plant to the part, in its loop."""
+        """Pass a new plant to the part, in the part's event loop."""
         self._loop.call_soon_threadsafe(self._part.adopt, plant)
 
     async def _live(self) -> None:
@@ -311,7 +311,7 @@ class Running:
         self._loop.close()
 
     def cut(self, connection: int) -> None:
-        """Cut a connection without closing it, as a power failure does."""
+        """Break a connection without an MQTT disconnect message, as a power failure does."""
         self._part._brokers[connection]._client.socket().shutdown(socket.SHUT_RDWR)
 
 
@@ -319,7 +319,7 @@ ROOT = "spBv1.0/works/{}/line"
 
 
 class Host:
-    """A host that checks that a node's sequence numbers increase by one."""
+    """A Sparkplug host that checks that a node's sequence numbers increase by one."""
 
     def __init__(self, broker: Broker) -> None:
         self._listener = Listener(broker, "spBv1.0/#")

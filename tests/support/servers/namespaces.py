@@ -1,4 +1,4 @@
-"""Network namespaces on one bridge whose cables can be cut; a lock for network changes."""
+"""Network namespaces on one bridge, whose connections can be cut; a lock for network changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 NOBODYS_CARD = "02:00:00:00:00:00"
 BRIDGES_CARD = "02:00:00:00:02:00"
-_BRIDGES = itertools.count()  # this process may have several
+_BRIDGES = itertools.count()  # numbers for this process's bridges
 
 
 def _ip(*words: str) -> None:
@@ -24,7 +24,7 @@ def _ip(*words: str) -> None:
 
 
 class Namespace:
-    """One machine; `prefix` runs a command in it."""
+    """A namespace that acts as one machine; `prefix` before a command runs the command in it."""
 
     def __init__(self, bridge: str, net: str, number: int) -> None:
         self.name = f"{bridge}-{number}"
@@ -45,11 +45,11 @@ class Namespace:
         return ["ip", "netns", "exec", self.name]
 
     def cut(self) -> None:
-        """Drop packets both ways, without an error to any side."""
+        """Drop all packets in both directions, without an error on either side."""
         _ip("link", "set", self._cable, "nomaster")
 
     def cut_to(self, others: Iterable[Namespace]) -> None:
-        """Drop all packets to these, but receive theirs."""
+        """Drop all packets to these namespaces, but receive packets from them."""
         for other in others:
             self._know(other, NOBODYS_CARD)
 
@@ -61,7 +61,7 @@ class Namespace:
         self._send_to(address, BRIDGES_CARD)
 
     def heal(self, others: Iterable[Namespace]) -> None:
-        """Undo all cuts."""
+        """Undo all cuts between this namespace and `others`."""
         _ip("link", "set", self._cable, "master", self._bridge)
         for other in others:
             self._know(other, other.card)
@@ -78,7 +78,7 @@ class Namespace:
 
 
 class Network:
-    """A bridge with the address `address`, and the connected namespaces."""
+    """A bridge with the IP address `address`, and the namespaces connected to it."""
 
     def __init__(self, number: int) -> None:
         nth = next(_BRIDGES)
@@ -86,7 +86,7 @@ class Network:
         net = f"10.{100 + os.getpid() % 50}.{(os.getpid() // 50 + 25 * nth) % 250}"
         self.address = f"{net}.1"
         self.namespaces: list[Namespace] = []
-        # A bridge without its own MAC address takes a port's, and a cut of that port would block the others.
+        # Without its own MAC address a bridge uses a port's, and cutting that port would block the others.
         _ip("link", "add", self._bridge, "address", BRIDGES_CARD, "type", "bridge")
         try:
             _ip("addr", "add", f"{self.address}/24", "dev", self._bridge)
@@ -114,7 +114,7 @@ class Network:
 
 @contextmanager
 def network(number: int) -> Iterator[Network]:
-    """Create this many namespaces; if impossible, skip the test, or fail it in CI."""
+    """Create `number` namespaces; if that is impossible, skip the test, or fail it in CI."""
     if reason := why_none():
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     with changing_network():
@@ -127,7 +127,7 @@ def network(number: int) -> Iterator[Network]:
 
 
 def why_none() -> str:
-    """Return why this machine allows no namespaces, or ""."""
+    """Return why this machine allows no network namespaces, or ""."""
     if os.geteuid() != 0 or shutil.which("ip") is None:
         return "network namespaces need root and the program ip"
     trial = ["ip", "link", "add", f"mdt{os.getpid() % 100_000}", "type", "bridge"]
@@ -148,13 +148,13 @@ def _locked(how: int) -> Iterator[None]:
 
 @contextmanager
 def steady_network() -> Iterator[None]:
-    """Prevent network changes; any number of processes may hold this."""
+    """Hold a shared lock that prevents network changes by other processes."""
     with _locked(fcntl.LOCK_SH):
         yield
 
 
 @contextmanager
 def changing_network() -> Iterator[None]:
-    """Allow network changes; one process at a time."""
+    """Hold the exclusive lock for changing the network."""
     with _locked(fcntl.LOCK_EX):
         yield

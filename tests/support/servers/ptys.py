@@ -1,4 +1,4 @@
-"""Two ptys joined like a null-modem cable, and a client that sends and receives raw bytes."""
+"""Join two ptys like a null-modem cable; open a pty as a client for raw bytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from multidrop.core import set_settings
 
 @contextmanager
 def linked_ptys() -> Iterator[tuple[str, str]]:
-    """Give the paths of two ports; each receives the other's bytes."""
+    """Yield the paths of two ports, each of which receives the bytes written to the other."""
     masters, slaves = zip(*(os.openpty() for _ in range(2)), strict=True)
     for slave in slaves:
         tty.setraw(slave)
@@ -49,7 +49,7 @@ PATIENCE = 60.0  # s to wait for a required reply
 
 @contextmanager
 def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
-    """Give a descriptor, opened and configured like a client's."""
+    """Yield a descriptor of the port, opened and configured as by a client."""
     if path.startswith("socket://"):
         host, _, port = path.removeprefix("socket://").partition(":")
         with socket.create_connection((host, int(port))) as client:

@@ -1,4 +1,4 @@
-"""NATS servers and whole fleets with the rights that `fleet rights` writes, with TLS."""
+"""Run NATS servers and whole fleets with TLS and with the rights that `fleet rights` writes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from multidrop.fleet.servers.rights import STORE
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-Change = Callable[[str], str]  # edits rights.conf
+Change = Callable[[str], str]  # edits the text of rights.conf
 
 
 def _as_written(rights: str) -> str:
@@ -34,14 +34,14 @@ def _as_written(rights: str) -> str:
 
 
 def in_one_account(rights: str) -> str:
-    """Return the same users' rights in the streams' account, as without separate accounts."""
+    """Return rights.conf with all users in the account of the streams, instead of separate accounts."""
     users = re.findall(r"\{ # .*?\n        \}\n      \}", rights, re.DOTALL)
     assert users
     return f"accounts {{ {STORE} {{ jetstream: enabled, users: [\n" + "\n".join(users) + "\n] } }\n"
 
 
 def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
-    """Make a certificate authority, and a certificate that it signed for this address."""
+    """Create a certificate authority, and a certificate signed by it for this host."""
     openssl = require_program("openssl")
     folder.mkdir(parents=True, exist_ok=True)
     own = ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
@@ -58,7 +58,7 @@ def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
 
 
 def ports_with_routes(number: int) -> list[int]:
-    """Return free ports whose cluster ports are also free."""
+    """Return free ports whose corresponding cluster ports are free too."""
     found: list[int] = []
     while len(found) < number:
         with closing(socket.socket()) as one, closing(socket.socket()) as other:
@@ -75,7 +75,7 @@ def _reloads(log: str) -> int:
 
 
 class SecuredNode(Node):
-    """A server process with its own configuration file."""
+    """A NATS server process with its own configuration file."""
 
     def __init__(self, folder: Path, name: str, port: int, monitor: int) -> None:
         self.name, self.port, self.monitor = name, port, monitor
@@ -93,7 +93,7 @@ class SecuredNode(Node):
 
 
 class SecuredCluster(Cluster):
-    """Servers, and the keys of all users."""
+    """NATS servers with rights, and the keys of all users."""
 
     def __init__(
         self, folder: Path, number: int, gateways: Sequence[str], change: Change = _as_written
@@ -111,12 +111,12 @@ class SecuredCluster(Cluster):
         return self.folder / "keys" / f"{user}.key"
 
     def give_rights_to(self, gateways: Sequence[str]) -> None:
-        """Write the rights of only these gateways, and reload the servers."""
+        """Rewrite the rights for only these gateways, and reload the servers' configuration."""
         write_files(self.folder, gateways, self.urls, self.tls, self.folder)
         self.reload()
 
     def reload(self) -> None:
-        """Reload the servers' configuration, and wait for it."""
+        """Reload the servers' configuration, and wait until it is in effect."""
         done = [_reloads(node.log()) for node in self.nodes]
         for node in self.nodes:
             node.process.send_signal(signal.SIGHUP)
@@ -126,11 +126,11 @@ class SecuredCluster(Cluster):
             time.sleep(0.02)
 
     def options(self, user: str) -> dict[str, Any]:
-        """Return the options of this user's connection."""
+        """Return the connection options of this user."""
         return connect_options(self.urls, self.key(user), self.tls.ca)
 
     def environment(self, user: str) -> dict[str, str]:
-        """Return the environment of this user's commands."""
+        """Return the environment variables for this user's commands."""
         return {
             **os.environ,
             "MULTIDROP_NATS": ",".join(self.urls),
@@ -150,7 +150,7 @@ def secured_cluster(
 
 
 def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a command as this user."""
+    """Run a `multidrop` command as this user."""
     return subprocess.run(
         [sys.executable, "-m", "multidrop", *words],
         env=servers.environment(user),
@@ -169,7 +169,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 class SecuredFleet:
-    """Gateways on six lines; each has a folder of its name."""
+    """Gateway processes for six lines; each gateway has a folder of its name."""
 
     def __init__(self, folder: Path, servers: SecuredCluster) -> None:
         self.servers = servers
@@ -181,7 +181,7 @@ class SecuredFleet:
         assert made.returncode == 0, made.stderr
 
     def start(self, name: str, kept: str = "", **environment: str) -> None:
-        """Start a gateway; `kept` names another folder."""
+        """Start a gateway; `kept` names another folder to use."""
         kept = kept or name
         words = ["fleet", "serve", name, "--folder", str(self._folder / kept)]
         with (self._folder / f"{kept}.log").open("ab") as log:
@@ -213,7 +213,7 @@ def secured_fleet(
     gateways: Sequence[str] = GATEWAYS,
     environments: Mapping[str, Mapping[str, str]] | None = None,
 ) -> Iterator[SecuredFleet]:
-    """Give a fleet on this many servers, with all gateways started."""
+    """Yield a fleet on `number` servers with all gateways started."""
     with secured_cluster(folder / "nats", number, gateways) as servers:
         fleet = SecuredFleet(folder, servers)
         try:

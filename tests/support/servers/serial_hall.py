@@ -1,7 +1,7 @@
-"""Serial servers of many lines that record who sends when: each new connection is a new master.
+"""Serial servers for many lines that record which master sends when; each connection counts as a master.
 
-A request on an older connection after the first one on a newer connection is an overlap. Old connections stay
-open to make it visible.
+If a request comes on an old connection after the first request on a newer connection, that is an overlap. Old
+connections stay open so that overlaps are detected.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 REQUEST = 8  # bytes of a Modbus RTU read
-MAKE = {0x02BC: 1, 0x02BE: 1}  # of an INNOVERT IBD: 9600 baud, address 1
+MAKE = {0x02BC: 1, 0x02BE: 1}  # registers that identify an INNOVERT IBD: 9600 baud, address 1
 
 
 @dataclass
 class LineSeen:
-    """A line's requests so far, and its masters in the order of their first request."""
+    """Requests seen on a line, and its masters in the order of their first request."""
 
     name: str
     port: int
     masters: list[int] = field(default_factory=list)
     last_s: float = 0.0
-    longest_s: float = 0.0  # longest gap between requests since `reset`
+    longest_s: float = 0.0  # longest gap without requests since `reset`, in s
     requests: int = 0
     overlaps: int = 0
 
@@ -42,10 +42,10 @@ class LineSeen:
 
 
 class SerialHall:
-    """Listens on a port for each line; answers Modbus RTU reads with zeros, and confirms each write.
+    """Listens on a port per line; replies to Modbus RTU reads with zeros, and confirms each write.
 
-    So its motors are stopped. Only two registers, which identify the make, are not 0. A line whose name is in
-    `refusing` rejects writes.
+    Zeros mean that all motors are at rest; only the two registers that identify the make are not 0. Lines
+    named in `refusing` reject writes.
     """
 
     def __init__(self, number: int, host: str = "127.0.0.1", names: Sequence[str] = ()) -> None:
@@ -80,7 +80,7 @@ class SerialHall:
     # ---- measurements ----
 
     def reset(self) -> None:
-        """Restart the measurement of gaps."""
+        """Restart the measurement of the longest gaps."""
         with self._lock:
             for line in self.lines.values():
                 line.longest_s = 0.0
@@ -94,7 +94,7 @@ class SerialHall:
             return sum(line.requests for line in self.lines.values())
 
     def gaps(self) -> dict[str, float]:
-        """Return the longest gap (s) of each line, including the present one."""
+        """Return each line's longest gap (s) without requests, including the gap up to now."""
         now = time.monotonic()
         with self._lock:
             return {line.name: max(line.longest_s, now - line.last_s) for line in self.lines.values()}
@@ -104,7 +104,7 @@ class SerialHall:
         with self._lock:
             return all(now - line.last_s < within_s for line in self.lines.values())
 
-    # ---- the thread ----
+    # ---- the servers' thread ----
 
     def _serve(self) -> None:
         while not self._is_over:
@@ -171,7 +171,7 @@ def _answer(client: socket.socket, request: bytes, *, takes_writes: bool) -> Non
 
 
 def _crc(data: bytes) -> bytes:
-    """Return the standard's checksum (Modbus over serial line V1.02, 6.2.2)."""
+    """Return the Modbus CRC (Modbus over serial line V1.02, 6.2.2)."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte

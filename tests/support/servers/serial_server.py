@@ -1,4 +1,4 @@
-"""Ports behind a network (RFC 2217), and a pty that hangs up."""
+"""A network serial port (RFC 2217), and a pty that hangs up."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from serial import rfc2217
 
 
 class SerialServer:
-    """A port behind a network (RFC 2217) with a simulated line.
+    """A network serial port (RFC 2217) with a simulated line behind it.
 
-    Its settings are only recorded, for tests to check.
+    Serial settings have no effect; they are recorded for tests to check.
     """
 
     def __init__(self, path: str) -> None:
@@ -37,7 +37,7 @@ class SerialServer:
         manager = rfc2217.PortManager(self.port, SimpleNamespace(write=client.sendall))
         back = threading.Thread(target=self._copy_back, args=(client, manager), daemon=True)
         back.start()
-        with suppress(OSError):  # the client may disconnect in between
+        with suppress(OSError):  # the client may disconnect meanwhile
             while received := client.recv(1024):
                 self._wire.sendall(b"".join(manager.filter(received)))
         with suppress(OSError):
@@ -60,9 +60,9 @@ pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is dep
 
 
 def vanishing_pty() -> tuple[str, Callable[[], None]]:
-    """Give a pty that hangs up after its first request, like an unplugged adapter.
+    """Return a pty's path, and a function that waits for a request and hangs up, like an unplugged adapter.
 
-    Its other end stays open: otherwise another program could get its number, and be reopened instead.
+    The client's end stays open here: otherwise a new pty could get the same number and be opened instead.
     """
     master, slave = os.openpty()
     path = os.ttyname(slave)

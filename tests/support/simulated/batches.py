@@ -1,4 +1,4 @@
-"""Batches as the core makes them, for tests of code that processes rows."""
+"""Create batches like the core's, for tests of code that processes rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from completions import add_miss, add_rows, new_completion
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.polling.batch import Batch, Row
 
-# 2026-11-21 09:30:00.123456789 UTC is 1 s of monotonic time before UTC_0 + 1 s
+# UTC in ns when the monotonic clock was 0: 2026-11-21 09:29:59.123456789.
 UTC_0 = 1_795_253_399_123_456_789
 SECOND = 1_000_000_000
 
@@ -29,7 +29,7 @@ def block(drive: int, *registers: int, divisor: float = 100.0) -> RowLayout:
 
 
 def completion(sent_ns: int, *, first_ns: int = 0, words: tuple[int, ...] = (), exception: int = 0) -> Any:
-    """Return a completion sent at `sent_ns`, with these words or an exception as its reply."""
+    """Return the completion of a request sent at `sent_ns`, whose reply has these words or an exception."""
     found = new_completion()
     data = b"".join(word.to_bytes(2, "big") for word in words)
     found.result = 5 + len(data)
@@ -41,7 +41,7 @@ def completion(sent_ns: int, *, first_ns: int = 0, words: tuple[int, ...] = (), 
 
 
 def example() -> Batch:
-    """Return two samples, an exception, a timeout, and a skipped read."""
+    """Return a batch with two samples, an exception, a timeout, and a skipped read."""
     columns = Columns(8)
     assert add_rows(columns, block(0, 0, 1), completion(SECOND, first_ns=SECOND + 7, words=(4999, 30)), UTC_0)
     assert add_rows(columns, block(1, 0), completion(2 * SECOND, exception=0x12), UTC_0)
@@ -76,7 +76,7 @@ EXAMPLE = [
 
 
 def counting(rows: int, start: int = 0) -> Batch:
-    """Return rows whose values count up from `start` (below 65536); every tenth is a miss."""
+    """Return a batch whose values count up from `start` (below 65536); every tenth row is a miss."""
     columns = Columns(rows)
     for at in range(start, start + rows):
         drive = block(at % 3, at % 2, divisor=1.0)
