@@ -91,7 +91,7 @@ def interrupted_before(nth: int, failure: type[BaseException] = Interruption) ->
 
 
 def every(step: int, act: Callable[[int], bool]) -> int:
-    """Call `act` with 1, 1 + step and so on until one is not interrupted; return how many calls were interrupted."""
+    """Call `act` with 1, 1 + step, ... until it returns False; return the number of calls before that."""
     for times in count():
         if not act(1 + times * step):
             return times

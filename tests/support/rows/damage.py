@@ -21,7 +21,7 @@ MOST = {
     0x04: 125,
     0x0F: 1968,
     0x10: 123,
-}  # longest reads and writes (V1.1b3)
+}  # most values per request
 ECHOES = (0x05, 0x06, 0x08)
 COIL_VALUES = (b"\xff\x00", b"\x00\x00")
 

@@ -1,8 +1,8 @@
-"""A poller and a simulated line on a simulated clock: an hour of the line takes seconds.
+"""Run a poller and a simulated line on a simulated clock: an hour takes seconds.
 
-The poller is real, with its thread, plan and schedule. Line and turns are the core's own code (csrc/line.c,
-csrc/turn.c). The descriptor, the core's thread and the clock are stand-ins: time passes only when the test
-advances it, however busy the machine is.
+The poller is real, with its thread, plan and schedule. The line's state machine and its turns are the core's
+own code (csrc/line.c, csrc/turn.c). The descriptor, the core's thread and the clock are simulated: time
+passes only when the test advances it, however busy the machine is.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ ENODEV = 19
 
 
 def transactions_of(line: Any) -> Transactions:
-    """Return how such a line uses transaction ids, as transport/line.py passes it to the core."""
+    """Return how the line uses transaction ids, as transport/line.py would pass it to the core."""
     if not line.is_tcp:
         return Transactions.NONE
     return Transactions.MATCHED if line.ids is TransactionIds.MATCH else Transactions.IGNORED
 
 
 class ClockedWire(FaultyWire):
-    """A faulty wire whose port the operating system does not know."""
+    """A faulty wire without a port of the operating system."""
 
-    ids = TransactionIds.MATCH  # of a tcp:// gateway
-    chunk = 1.0  # s; characters within it arrive together, so the line receives a whole reply at once
+    ids = TransactionIds.MATCH  # as for a tcp:// port
+    chunk = 1.0  # s; characters within this time arrive together, so the line receives a reply in one piece
 
     def open(self) -> None:
         path = "test line"
@@ -66,7 +66,7 @@ class ClockedWire(FaultyWire):
 
 
 class ClockedRowQueue(RowQueue):
-    """A row queue whose client advances time while it waits for a call."""
+    """A row queue that, instead of waiting for a call, lets simulated time advance."""
 
     pass_time: Callable[[float], None]
 
@@ -87,7 +87,7 @@ class ClockedRowQueue(RowQueue):
 
 
 class PortSurroundings(Protocol):
-    """The time and the wire of a port."""
+    """What a `ClockedPort` needs: the simulated time and the wire."""
 
     @property
     def now(self) -> int: ...
@@ -96,7 +96,7 @@ class PortSurroundings(Protocol):
 
 
 class ClockedPort:
-    """A port (core.Port) that runs the core's turns on simulated time and a simulated wire."""
+    """Replaces core.Port: runs the core's turns on simulated time and a simulated wire."""
 
     room = 256
     switching = 0.0
@@ -107,7 +107,7 @@ class ClockedPort:
         self._turn = ffi.new("struct md_turn *")
         self._wake = ffi.new("int64_t *")
         self._urgent: Any = None
-        self._kept: list[object] = []  # keeps objects alive that the core may still read
+        self._kept: list[object] = []  # keeps objects alive that the core may read
         self._received = b""
         self._guard = threading.RLock()  # like the engine's mutex
         self._is_closed = False
@@ -116,7 +116,7 @@ class ClockedPort:
         if transactions:
             lib.md_turn_set_echo(self._turn, lib.MD_NO_ECHO)
 
-    # ---- client side ----
+    # ---- methods of core.Port that clients call ----
 
     @property
     def lost(self) -> bool:
@@ -172,7 +172,7 @@ class ClockedPort:
 
     @property
     def granted(self) -> Completion | None:
-        """Return the completion of the latest urgent exchange; None while it is pending."""
+        """Return the completion of the latest urgent exchange; None while the exchange is pending."""
         return copied(self._urgent.completion) if self._urgent and self._urgent.is_done else None
 
     def end(self) -> bool:
@@ -184,14 +184,14 @@ class ClockedPort:
             lib.md_turn_close(self._turn)
             self._is_closed = True
 
-    # ---- replaces the engine's thread ----
+    # ---- in place of the engine's thread ----
 
     def hang_up(self) -> None:
         lib.md_turn_lose(self._turn, ENODEV)
         lib.md_turn_want(self._turn, self._wake, self._clocked.now)
 
     def advance(self, received: bytes) -> int:
-        """Advance until the core waits; return the time at which it continues."""
+        """Let the core process received bytes until it waits; return the time in ns at which it continues."""
         with self._guard:
             return NEVER if self._is_closed else self._advance(received)
 
@@ -228,9 +228,9 @@ class ClockedPort:
 
 
 class ClockedLine:
-    """A line with the interface that the bus uses (line.Line)."""
+    """Replaces line.Line: the interface that the bus uses."""
 
-    only_settings = None  # any drive may have any
+    only_settings = None  # no restriction on drives' settings
     why_closing = ""
     mastership = None
     may_send = True
@@ -288,12 +288,12 @@ class ClockedLine:
         self.reopen()
         return self
 
-    regain = reopen  # the poller has dropped the lost line
-    is_lost = False  # no test here stops a motor
+    regain = reopen  # like `reopen`, because the poller has dropped the lost line
+    is_lost = False  # unused, because no test here stops a motor
 
 
 class ClockedLines:
-    """Wires and a poller of a plant on them; `run` advances time and returns the new rows."""
+    """Simulated wires and a poller of the plant on them; `run` advances time and returns the new rows."""
 
     def __init__(self, wire: ClockedWire, drives: Sequence[PolledDrive]) -> None:
         wire.open()
@@ -303,7 +303,7 @@ class ClockedLines:
 
     @classmethod
     def of_lines(cls, wires: Mapping[str, ClockedWire], polled: Plant) -> ClockedLines:
-        """Return lines on several wires, by port name."""
+        """Return clocked lines on several wires, given by port name."""
         clocked = cls.__new__(cls)
         for wire in wires.values():
             wire.open()
@@ -325,7 +325,7 @@ class ClockedLines:
         self.now = self._limit = BEGIN_NS
         self.wires = dict(wires)
         self.ports: dict[str, ClockedPort | None] = {}
-        self.opened: list[str] = []  # port names, one for each time a port opened
+        self.opened: list[str] = []  # a port's name for each time it was opened
         self._queue: ClockedRowQueue | None = None
         self._leaving = False
         self._failure: BaseException | None = None
@@ -333,7 +333,7 @@ class ClockedLines:
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", self._line)
-        patch.setattr(peers, "_former", {})  # earlier peers belong to another clock
+        patch.setattr(peers, "_former", {})  # forget peers from another clock
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
@@ -343,13 +343,13 @@ class ClockedLines:
 
     @property
     def wire(self) -> ClockedWire:
-        """Return the only wire."""
+        """Return the wire, of which there must be only one."""
         (wire,) = self.wires.values()
         return wire
 
     @property
     def port(self) -> ClockedPort | None:
-        """Return the only port if it is open."""
+        """Return the port, of which there must be only one; None while it is closed."""
         return next(iter(self.ports.values()), None)
 
     def __enter__(self) -> ClockedLines:
@@ -370,7 +370,7 @@ class ClockedLines:
         return (self.now - BEGIN_NS) / S
 
     def run(self, seconds: float) -> list[Row]:
-        """Let this many seconds pass."""
+        """Advance simulated time by this many seconds; return the new rows."""
         with self._turn:
             self._limit += round(seconds * S)
             self._turn.notify_all()
@@ -380,7 +380,7 @@ class ClockedLines:
         return rows_of(self.poller)
 
     def beside(self, do: Callable[[], object]) -> threading.Thread:
-        """Call `do` on another thread, whose waits end as `run` advances time."""
+        """Call `do` on another thread, whose waits end as `run` advances time; return the thread."""
         thread = threading.Thread(target=do, daemon=True)
         self._beside.add(thread)
         thread.start()
@@ -404,7 +404,7 @@ class ClockedLines:
             time.sleep(0.0002)
 
     def command(self, drive: Drive, request: Message) -> None:
-        """Execute a request ahead of the polling if the port is open."""
+        """Queue a request ahead of the polling if the port is open."""
         ours = self.poller.bus("line")
         if self.port:
             self.port.begin_urgent(make_exchange(drive, request, ours.peer(drive), NO_ROWS))
@@ -424,7 +424,7 @@ class ClockedLines:
 
     def _pass_time(self, seconds: float) -> None:
         for thread in threading.enumerate():
-            if thread.name == "multidrop reopening":  # immediate on this clock
+            if thread.name == "multidrop reopening":  # reopening takes no time on this clock
                 thread.join()
         try:
             with self._turn:
@@ -455,11 +455,11 @@ class ClockedLines:
             if self._queue and self._queue.has_called:
                 return
             self.now = min(max(wake, self.now + 1), end_ns)
-        if wake <= end_ns:  # else no event is due before the end
+        if wake <= end_ns:  # otherwise no event is due before the end
             self._settle()
 
     def _settle(self) -> int:
-        """Process all events due now; return the time of the next."""
+        """Process all events that are due; return the time in ns of the next event."""
         wake = NEVER
         for name, wire in self.wires.items():
             received, port = wire.advance(self.now / S), self.ports.get(name)
@@ -473,7 +473,7 @@ class ClockedLines:
         return wake
 
     def send(self, name: str, request: bytes, baudrate: int) -> None:
-        """Send the client's bytes to the drives, unless the port is closed."""
+        """Send a request's bytes to the drives of a port, unless the port is closed."""
         wire, port = self.wires[name], self.ports.get(name)
         wire.receive(request, self.now / S, baudrate)
         if wire.port is None and port:

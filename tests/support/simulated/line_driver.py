@@ -1,4 +1,4 @@
-"""One line's state machine on a clock that the test sets, and exchanges on it."""
+"""Run one line's state machine from the core on a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LineDriver:
         lib.md_line_init(self._line, self.now)
         self._line.transactions = transactions
         self.found = new_completion()
-        self._exchanges: list[Exchange] = []  # the line holds references to them
+        self._exchanges: list[Exchange] = []  # keeps exchanges alive that the line refers to
 
     @property
     def want(self) -> str:
@@ -42,7 +42,7 @@ class LineDriver:
 
     @property
     def listens(self) -> bool:
-        """Return True while the line needs only time or bytes."""
+        """Return True while the line waits only for time or received bytes."""
         return self.want in ("wait", "read")
 
     @property
@@ -51,12 +51,12 @@ class LineDriver:
 
     @property
     def state(self) -> int:
-        """Return the present state (enum md_line_state)."""
+        """Return the line's present state (enum md_line_state)."""
         return int(self._line.state)
 
     @property
     def echo(self) -> int:
-        """Return the adapter's known echo (enum md_echo)."""
+        """Return whether the adapter is known to echo (enum md_echo)."""
         return int(self._line.echo)
 
     @echo.setter
@@ -64,12 +64,12 @@ class LineDriver:
         self._line.echo = known
 
     def set_echo(self, known: int) -> None:
-        """Set the echo, as a line's user does."""
+        """Set whether the adapter is known to echo, as the line's caller does."""
         self.echo, self._line.echo_is_configured = known, known == lib.MD_ECHO
 
     @property
     def is_out_of_step(self) -> bool:
-        """Return True after bytes that are not a Modbus TCP header: the engine then drops the port."""
+        """Return True after bytes that are no Modbus TCP header, after which the engine closes the port."""
         return bool(self._line.is_out_of_step)
 
     @property
@@ -86,7 +86,7 @@ class LineDriver:
         lib.md_line_begin(self._line, exchange.c, self.found, self.now)
 
     def take(self, most: int = 513, held_up: int = 0) -> bytes:
-        """Write up to `most` bytes of the line's request, and return from the port after `held_up`."""
+        """Take up to `most` bytes of the line's request, as a write that takes `held_up` ns; return them."""
         tx = bytes(ffi.buffer(self._line.tx, self._line.tx_len))[self._line.tx_at :][:most]
         begun = self.now
         self.now += held_up
@@ -104,7 +104,7 @@ class LineDriver:
         lib.md_line_abandon(self._line, result, error)
 
     def wait_until_write(self) -> bytes:
-        """Wait for the silence like the engine, and send the request."""
+        """Wait like the engine until the silence is over, and take the request; return its bytes."""
         for _ in range(8):
             if self.want == "write":
                 return self.take()
@@ -112,7 +112,7 @@ class LineDriver:
         raise AssertionError("the line never wants to write")
 
     def wait_for_look(self) -> None:
-        """Advance time until the line wants to read."""
+        """Advance time until the line's next read is due."""
         while self.want == "wait":
             self.now = self.wake
 
@@ -159,14 +159,14 @@ def reply(value: int = 0) -> bytes:
 
 
 def ask(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Send the request; return when its last bit has left."""
+    """Send the request to the drive; return the time in ns at which its last bit has left."""
     line.begin(exchange(request, drive))
     line.wait_until_write()
     return line.now + 8 * CHARACTER
 
 
 def answer(line: LineDriver, drive: Peer, delay: int) -> None:
-    """Run a whole exchange; its reply arrives by character, the first after `delay`."""
+    """Run a whole exchange; the reply arrives one character at a time, the first after `delay` ns."""
     left = ask(line, drive)
     for at, character in enumerate(reply()):
         line.now = left + delay + (at + 1) * CHARACTER

@@ -1,4 +1,4 @@
-"""Simulated lines in another process or on the test's clock; values that prove register and time."""
+"""Simulated lines in another process or on simulated time, and values that identify their register."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
-ANY_PORT = "socket://127.0.0.1:0"  # also works without pseudo-terminals
-PATIENCE = 120.0  # s, for events that are immediate on an idle machine
-# Delays that a busy machine may add, whatever the test is about.
+ANY_PORT = "socket://127.0.0.1:0"  # a free port; works without pseudo-terminals
+PATIENCE = 120.0  # s, longest wait for events that are immediate on an idle machine
+# Timeouts that a busy test machine could exceed, with longer values.
 HOST_LATE = {
     str(status)
     for status in (
@@ -35,20 +35,20 @@ HOST_LATE = {
         Status.POLL_ENDED,
     )
 }
-patient = pytest.mark.usefixtures("_patient")  # waits for drives as long as they need
+patient = pytest.mark.usefixtures("_patient")  # marks tests that wait for drives as long as needed
 
 
 def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:
-    """Wait for a condition; fail if it is not met in time."""
+    """Wait until `met()` is true; fail after `patience` seconds."""
     end, pause_s = monotonic() + patience, 0.002
     while not met():
         assert monotonic() < end, f"not met within {patience:g} s"
         sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.04)  # a check may be costly
+        pause_s = min(1.2 * pause_s, 0.04)  # check less often, because a check may be costly
 
 
 class Faulty(Wire):
-    """A wire that applies a given fault to each reply."""
+    """A wire that passes each reply through a function that may damage it."""
 
     def __init__(
         self, drives: Sequence[SimulatedDrive], fate: Callable[[bytes], bytes], **details: Any
@@ -64,15 +64,15 @@ class Faulty(Wire):
 
 
 class LateWire(Wire):
-    """A wire that delivers the replies delayed by `distort` at their time."""
+    """A wire whose `distort` may delay replies with `hold_up`."""
 
     def __init__(self, drives: Sequence[SimulatedDrive], **details: Any) -> None:
         super().__init__(drives, **details)
-        self._late: list[tuple[float, bytes]] = []  # a heap
+        self._late: list[tuple[float, bytes]] = []  # heap of (time, reply)
         self._now = 0.0
 
     def hold_up(self, reply: bytes, seconds: float) -> bytes:
-        """Queue the reply for later, and return no bytes for now."""
+        """Queue the reply to be sent `seconds` later; return no bytes."""
         heapq.heappush(self._late, (self._now + seconds, reply))
         return b""
 
@@ -95,7 +95,7 @@ class LateWire(Wire):
 
 @contextmanager
 def served(make: Callable[[], Sequence[Wire]]) -> Iterator[list[str]]:
-    """Give the paths of wires that another process runs; it must be able to import `make`."""
+    """Run the wires that `make` returns in another process, which imports `make`; yield their paths."""
     ours, theirs = multiprocessing.Pipe()
     context = multiprocessing.get_context("spawn")
     process = context.Process(target=_serve, args=(make, theirs), daemon=True)
@@ -134,7 +134,7 @@ def plant(*lines: PlantLine) -> Plant:
 
 
 def rows_of(poller: Poller) -> list[Row]:
-    """Return all rows that the poller has."""
+    """Return all rows that the poller has collected."""
     found: list[Row] = []
     while batch := poller.take():
         found += batch
@@ -145,7 +145,7 @@ def rows_of(poller: Poller) -> list[Row]:
 
 
 def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:
-    """Return the proofs of all polled registers, by drive and register name."""
+    """Return the value that an EncodedDrive has in each polled register, by drive and register name."""
     return {
         (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
         for drive in drives
@@ -162,7 +162,7 @@ class Own(Drive):
 
 
 def timeline(wire: Wire, until: float) -> list[tuple[float, bytes]]:
-    """Return every piece that the client receives, with its time."""
+    """Advance the wire to `until` s; return every piece that the client receives, with its time in s."""
     received = []
     for _ in range(10_000):
         wake = wire.wake

@@ -1,4 +1,4 @@
-"""Simulated drives with parameters that no class declares, and their factory reset."""
+"""Simulated drives with parameters that their class does not declare, and their factory reset."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from multidrop.sim import MotorDrive, simulated
 
 
 def with_parameters(drive: Drive, codes: Iterable[str] = ()) -> MotorDrive:
-    """Return the simulated drive, which also has these parameters of its family's space."""
+    """Return the drive's simulation, to which parameters with these codes of its family are added."""
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
     for code in codes:
@@ -32,7 +32,7 @@ def raw_of(sim: MotorDrive, one: Parameter) -> int:
 
 
 def factory_reset(sim: MotorDrive, parameters: Iterable[Parameter]) -> None:
-    """Set parameters to their factory values; those without a printed one to 0, or to their least value."""
+    """Set parameters to their factory values; if none is printed, to 0 or their least value."""
     for one in parameters:
         low = one.span[0] if one.span else 0
         sim.memory.set(one, one.default if one.default is not None else low)
@@ -40,7 +40,7 @@ def factory_reset(sim: MotorDrive, parameters: Iterable[Parameter]) -> None:
 
 
 def set_at_random(sim: MotorDrive, parameters: list[Parameter], random: Random) -> None:
-    """Set parameters to random values that respect their limits."""
+    """Set parameters to random values within their limits."""
     for one in parameters:
         if one.values is None and not (one.at_least or one.at_most):
             low, high = one.coding.raw_span if one.span is None else map(one.coding.count_of, one.span)

@@ -1,6 +1,6 @@
-"""Wait for every drive and every write on a busy machine; not for tests with silent drives.
+"""Lengthen the library's timeouts for busy test machines; not for tests with silent drives.
 
-`python patient.py PROGRAM ARGUMENTS` runs a program like this.
+`python patient.py PROGRAM ARGUMENTS` runs a Python program with the longer timeouts.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from multidrop import bus
 from multidrop.core import Peer
 from multidrop.transport import peers
 
-PATIENCE = 60.0  # s
+PATIENCE = 60.0  # s, the longer timeout
 
 
 def patient_peer(*, interval: float, **timeouts: float) -> Peer:
-    """Return the library's peer for a drive with longer timeouts."""
+    """Return a `Peer` for a drive as the library does, but with longer timeouts."""
     return Peer(interval=interval, **{name: max(one, PATIENCE) for name, one in timeouts.items()})
 
 
 def be_patient(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
-    """Lengthen the timeouts of drives and writes with these setter functions."""
+    """Lengthen the timeouts of drives and writes with these functions that set attributes and items."""
     set_attribute(peers, "Peer", patient_peer)
     await_turns(set_attribute, set_item)
 
 
 def await_turns(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
-    """Lengthen only the expiry of writes: for tests with silent drives."""
+    """Lengthen only the expiry of writes, for tests with silent drives."""
     defaults: dict[str, Any] = bus.Bus.__init__.__kwdefaults__
     set_attribute(bus, "EXPIRY", PATIENCE)
     set_item(defaults, "expiry", PATIENCE)

@@ -1,4 +1,4 @@
-"""Responders behind ports, run by one thread: ptys that may vanish, and sockets."""
+"""Responders behind ptys or sockets, run by one thread and independent of the library."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = ["ReceivedFrame", "Responder", "ResponderLine"]
 
 
 class Responder:
-    """Responders behind ports, run by one thread; `ports` are the names that a client opens.
+    """Runs responder lines behind ports in one thread; `ports` are the names that a client opens.
 
-    A pty is opened under a link in `directory`, so that it can vanish and come back. Alternatively each line
-    has a listening socket, with raw bytes or with Telnet's serial port option.
+    A client opens a pty through a link in `directory`, so that the pty can vanish and come back.
+    Alternatively each line has a listening socket, for raw bytes or for Telnet with the serial port option.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Responder:
         connection.close()
 
     def lose(self, line: ResponderLine) -> None:
-        """Remove the port, as when an adapter is unplugged."""
+        """Remove the line's port, as when an adapter is unplugged."""
 
         def unplug() -> None:
             self._links[self.lines.index(line)].unlink()
@@ -127,10 +127,10 @@ class Responder:
 
         self.do(plug_in)
 
-    # ---- the thread ----
+    # ---- the responder thread ----
 
     def do(self, job: Callable[[], Any]) -> None:
-        """Run the job in the responder thread, and wait until it is done."""
+        """Run `job` in the responder thread, and wait until it is done."""
         done = threading.Event()
 
         def run_and_notify() -> None:
@@ -139,10 +139,10 @@ class Responder:
 
         self._jobs.append(run_and_notify)
         os.write(self._waker, b"\0")
-        done.wait()  # a signal handler may interrupt this wait, and the job still completes
+        done.wait()  # if a signal handler interrupts this wait, the job still completes
 
     def release(self, line: ResponderLine) -> None:
-        """Send the replies that were held back."""
+        """Send the replies that `hold` has held back on this line."""
 
         def give() -> None:
             for said in line.release():
@@ -193,23 +193,23 @@ class Responder:
                 os.write(self._masters[line], said)
 
 
-# ---- Telnet with the serial port option (RFC 2217); any settings are accepted ----
+# ---- Telnet with the serial port option (RFC 2217); all settings are accepted ----
 
 IAC, DONT, DO, WONT, WILL, SB, SE = 255, 254, 253, 252, 251, 250, 240
 BINARY, SUPPRESS_GO_AHEAD, COM_PORT = 0, 3, 44
 ANSWERS = {WILL: DO, DO: WILL}
-SERVER = 100  # server's answer = client's command + 100
+SERVER = 100  # code of an answer = code of the client's command + 100
 
 
 class Telnet:
-    """A connection's state: agreed options, and an incomplete command."""
+    """State of a Telnet connection: agreed options, and an incomplete command."""
 
     def __init__(self) -> None:
         self._buffer = b""
         self._agreed: set[tuple[int, int]] = set()
 
     def decode(self, received: bytes) -> tuple[bytes, bytes]:
-        """Return the received data, and the answer to the commands between it."""
+        """Return the data in the received bytes, and the answer to the Telnet commands among them."""
         self._buffer += received
         data, answer = b"", b""
         while self._buffer:
@@ -233,7 +233,7 @@ class Telnet:
         return data.replace(bytes([IAC]), bytes([IAC, IAC]))
 
     def _length(self) -> int:
-        """Return the length of the first command, or 0 if it is incomplete."""
+        """Return the length of the buffered command, or 0 if it is incomplete."""
         if len(self._buffer) < 2:
             return 0
         if self._buffer[1] == SB:
@@ -261,10 +261,10 @@ LENGTHS = dict.fromkeys((*READS, 5, 6, 8), 8)
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """A received frame; `what` is moves, stops, writes, reads or damaged."""
+    """A received frame; `what` is "moves", "stops", "writes", "reads" or "damaged"."""
 
-    at: int  # ns, CLOCK_MONOTONIC, when it was read
-    connection: int  # increases each time the port comes back
+    at: int  # time of reading, CLOCK_MONOTONIC in ns
+    connection: int  # number of the connection; increases each time the port comes back
     frame: bytes
     what: str
     asked: DriveRequest | None
@@ -277,7 +277,7 @@ class ReceivedFrame:
 
 
 def split(buffer: bytes) -> tuple[bytes, DriveRequest | None, bytes]:
-    """Return the first frame (or b""), its request (None if its checksum is wrong), and the rest."""
+    """Return the first frame, b"" if incomplete, its request (None if the checksum is wrong), the rest."""
     if buffer[:1] == b":":
         end = buffer.find(b"\n") + 1
         frame, rest = buffer[:end], buffer[end:]
@@ -311,7 +311,7 @@ def _standard(body: bytes) -> DriveRequest:
 
 
 def reply(drive: ResponderDrive, asked: DriveRequest, frame: bytes, exception: int = 0) -> bytes:
-    """Execute a request; return the drive's reply."""
+    """Carry out a request; return the drive's reply, with `exception` if that is not 0."""
     if drive.kind.protocol == DELIXI:
         return _delixi_reply(drive, asked, frame, exception)
     head = f"{asked.address:02X}"
@@ -339,36 +339,36 @@ def _delixi_reply(drive: ResponderDrive, asked: DriveRequest, frame: bytes, exce
 
 
 class ResponderLine:
-    """The line of a port, with its faults.
+    """A line with its drives and its faults.
 
-    Each entry of `troubles` affects one of the next requests: "mute" executes without a reply,
-    "deaf" ignores, "late" replies after the following request, and a number replies with that exception.
-    `deaf_until` and `delay` (s) stay in effect.
+    Each entry of `troubles` affects one request, in order: "mute" carries it out without a reply, "deaf"
+    ignores it, "late" replies after the following request, and a number replies with that exception.
+    `deaf_until` and `delay` (s) affect all requests.
     """
 
     def __init__(self, drives: Sequence[ResponderDrive]) -> None:
         self.drives = {drive.address: drive for drive in drives}
         self.log: list[ReceivedFrame] = []
         self.troubles: list[str | int] = []
-        self.deaf_until = 0.0  # s, CLOCK_MONOTONIC
+        self.deaf_until = 0.0  # ignore requests until then, s of CLOCK_MONOTONIC
         self.delay = 0.0
         self.connection = 0
-        self.mangle: Callable[[bytes], bytes] = lambda said: said  # changes a reply on its way
-        self.held = threading.Event()  # set when `hold` has its request
-        self._hold_in = 0  # requests until then
+        self.mangle: Callable[[bytes], bytes] = lambda said: said  # applied to each reply
+        self.held = threading.Event()  # set once replies are held back
+        self._hold_in = 0  # requests until replies are held back
         self._is_holding = False
-        self._kept: list[bytes] = []  # held replies
+        self._kept: list[bytes] = []  # replies held back
         self._late = b""
         self._buffer = b""
-        self._last = 0.0  # s, time of the latest bytes
+        self._last = 0.0  # time of the latest bytes in s
 
     def hold(self, requests: int) -> None:
-        """Hold replies, after this many requests, until `release`."""
+        """Answer this many more requests, then hold back replies until `release`."""
         self.held.clear()
         self._hold_in, self._is_holding = requests + 1, False
 
     def release(self) -> list[bytes]:
-        """Return the replies that were held back."""
+        """Stop holding back replies; return those held so far."""
         self._hold_in, self._is_holding = 0, False
         kept, self._kept = self._kept, []
         return kept
@@ -379,7 +379,7 @@ class ResponderLine:
         self.connection += 1
 
     def hear(self, received: bytes) -> list[bytes]:
-        """Return the replies to these bytes."""
+        """Process received bytes; return the replies."""
         now = time.monotonic()
         if now - self._last > 0.05:  # the rest of a truncated frame will not come
             self._buffer = b""

@@ -1,4 +1,4 @@
-"""A bus whose line is simulated drives in the same thread, at simulated time."""
+"""A bus whose line is replaced by simulated drives, in the same thread and on simulated time."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from multidrop.drive import Drive
 from multidrop.sim import MotorDrive, SimulatedDrive, simulated
 from multidrop.transport import clock, peers
 
-EXCHANGE_TIME = 0.02  # s
+EXCHANGE_TIME = 0.02  # s that an exchange takes
 TIMEOUT = 0.3
 
 READING = {1, 2, 3, 4}
-QUERYING = {3, 7}  # functions of Delixi's own protocol that read
+QUERYING = {3, 7}  # functions of Delixi's own protocol that only read
 
 
 def text(frame: bytes) -> str:
-    """Return the frame in the documents' notation."""
+    """Return the frame as documents print it: RTU in hex, text without its line end."""
     return frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
 
 
 class SimulatedBus:
-    """Simulated drives and a bus to them; every sent frame is recorded.
+    """Simulated drives and a `Bus` to them; every sent frame is recorded.
 
-    `loses(request)` returns True to lose the reply, `deafens(request)` to lose the request.
+    If `loses(request)` is true, the reply is lost; if `deafens(request)` is true, the request is.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *sims: SimulatedDrive, **details: Any) -> None:
         self.sims = sims
         self.seconds = 1000.0
-        self.slept = 0.0  # s; suspend time, which CLOCK_MONOTONIC does not count
+        self.slept = 0.0  # s of system suspend, which CLOCK_MONOTONIC does not count
         self.frames: list[tuple[Message, str]] = []
         self.loses: Callable[[Message], bool] = lambda request: False
         self.deafens: Callable[[Message], bool] = lambda request: False
-        self.answers: Callable[[Message], bytes | None] = lambda request: None  # replaces the drives' replies
-        self.queue_time = 0.0  # s until an exchange's turn
-        self.queue = object()  # the open port
+        self.answers: Callable[[Message], bytes | None] = lambda request: None  # overrides drives' replies
+        self.queue_time = 0.0  # s that each exchange waits for its turn
+        self.queue = object()  # not None: the port is open
         self.has_echo = False
         self.port = self.identity = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
-        monkeypatch.setattr(peers, "_former", {})  # earlier peers belong to another clock
+        monkeypatch.setattr(peers, "_former", {})  # forget peers from another clock
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
         monkeypatch.setattr(clock, "boottime_ns", lambda: round((self.seconds + self.slept) * 1e9))
@@ -68,7 +68,7 @@ class SimulatedBus:
 
     is_lost = is_tcp = False
     why_closing = ""
-    may_send = True  # has no mastership
+    may_send = True  # no mastership is needed
 
     def open(self) -> SimulatedBus:
         return self
@@ -141,12 +141,12 @@ class SimulatedBus:
 
     @property
     def written(self) -> list[str]:
-        """Return the frames that are not reads."""
+        """Return the sent frames that are not reads."""
         return [frame for request, frame in self.frames if is_write(request)]
 
 
 def is_write(request: Message) -> bool:
-    if len(request.data) == 4:  # Delixi's own protocol
+    if len(request.data) == 4:  # a frame of Delixi's own protocol
         return request.function not in QUERYING
     return request.function not in READING
 
@@ -154,7 +154,7 @@ def is_write(request: Message) -> bool:
 def one(
     monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any
 ) -> tuple[SimulatedBus, Any, MotorDrive]:
-    """Return a simulated bus, and its only drive with its simulation."""
+    """Return a simulated bus with one drive, that drive, and its simulation."""
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
     bus = SimulatedBus(monkeypatch, sim, **details)

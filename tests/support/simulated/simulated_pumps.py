@@ -1,7 +1,7 @@
-"""A simulated plant of pumps on several lines in another process, which records each drive's stop.
+"""A plant of simulated pumps on several lines in another process, which records the stop of each drive.
 
-The pumps have Delta's words and ten adjacent readings at 115200 bit/s: one request reads all ten. Their lines
-are sockets, because a pty depends on a kernel thread, which a busy machine delays.
+The pumps have Delta's command words, and ten adjacent readings that one request reads, at 115200 bit/s. Their
+lines are sockets, because a pty depends on a kernel thread, which a busy machine delays.
 """
 
 from __future__ import annotations
@@ -70,20 +70,20 @@ POLLED = (
     "motor_speed",
     "heatsink_temperature",
 )
-FIRST_READING, UNPOLLED = 0x2100, 0x0900  # addresses
-RAMP_S = 0.2  # deceleration time, short because a stop's answer waits for it
-WAVE_S = 0.1  # between changes of load and speed
+FIRST_READING, UNPOLLED = 0x2100, 0x0900  # addresses: first polled reading, an unpolled register
+RAMP_S = 0.2  # deceleration time in s; short, because `stop` returns only when the motor is at rest
+WAVE_S = 0.1  # s between changes of load and speed
 
 
 def free_ports(count: int) -> list[int]:
-    """Return free TCP ports."""
+    """Return the numbers of `count` free TCP ports."""
     with ExitStack() as stack:
         found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
         return [one.getsockname()[1] for one in found]
 
 
 def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str = "100 ms") -> Path:
-    """Write a plant file with this many drives on each line and this table `[serve]`; return its path."""
+    """Write a plant file and return its path. `drives` has the number of drives on each line."""
     (folder / "pump.toml").write_text(FAMILY)
     tables, number = [], 0
     for line, (count, port) in enumerate(zip(drives, free_ports(len(drives)), strict=True), 1):
@@ -116,26 +116,26 @@ class SimulatedPumps:
         return json.loads(self._process.stdout.readline())
 
     def run(self) -> None:
-        """Start all motors and forget all stops."""
+        """Start all motors and clear the recorded stops."""
         self._ask("run")
 
     def late_s(self) -> float:
-        """Return the longest suspension (s) of the process since the last call."""
+        """Return the longest time (s) for which the process did not run since the last call."""
         return float(self._ask("late"))
 
     def stops(self) -> dict[str, tuple[float | None, bool]]:
-        """Return for each drive the time (CLOCK_MONOTONIC, s) of a stop's first frame.
+        """Return, by drive, the time (CLOCK_MONOTONIC, s) of a stop's first frame; None if there was none.
 
-        The second value is True if its motor turns or is commanded to.
+        The second value is True if the drive's motor turns or has a run command.
         """
         return {name: (at, turns) for name, (at, turns) in self._ask("stops").items()}
 
 
 @contextmanager
 def simulated_pumps(plant: Path, *before: str) -> Iterator[SimulatedPumps]:
-    """Simulate the drives of a plant file in another process until the context ends.
+    """Simulate the drives of a plant file in another process during the block.
 
-    `before` are words in front of the command, such as `nice`.
+    `before` are command-line words put before the command, such as `nice`.
     """
     words = [*before, sys.executable, __file__, str(plant)]
     with BoundProcess(
@@ -150,7 +150,7 @@ def simulated_pumps(plant: Path, *before: str) -> Iterator[SimulatedPumps]:
             process.terminate()
 
 
-# ---- the process ----
+# ---- the simulator process ----
 
 
 def _stop_of(sim: MotorDrive) -> tuple[float | None, bool]:
@@ -186,7 +186,7 @@ def _make_waves(sims: dict[str, MotorDrive], late: list[float]) -> None:
 
 
 def main(path: str) -> None:
-    """Simulate until terminated."""
+    """Simulate the plant at `path` until terminated."""
     wires, sims = [], {}
     for line in Plant.load(path).lines:
         here = [simulated(polled.drive) for polled in line.drives]
@@ -195,7 +195,7 @@ def main(path: str) -> None:
             sim.motor.deceleration_time = RAMP_S
             sims[sim.drive.name] = sim
         wires.append(Wire(here, name=line.name, port=str(line.port)))
-    late = [0.0]  # s
+    late = [0.0]  # s, longest time without running
     for work in (_serve_words, _make_waves):
         threading.Thread(target=work, args=(sims, late), daemon=True).start()
     serve(wires, lambda simulator: print("ready", flush=True))

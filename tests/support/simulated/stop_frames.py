@@ -1,4 +1,4 @@
-"""Stops among the frames of a simulated line, and threads that act in between."""
+"""Find stops among a simulated line's frames, and let threads act between frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from multidrop.errors import (
     BusError,
 )
 
-STOPS: dict[str, Callable[[Message], bool]] = {  # in the documents' words
+STOPS: dict[str, Callable[[Message], bool]] = {  # by family: whether a request is its documented stop
     "erman-er-g-220": lambda each: each.function == 5 and each.start == 1 and each.data != b"\0\0",
     "invt-che": lambda each: each.start == 0x1000 and each.data[-1] == 5,
     "innovert-ibd": lambda each: each.start == 0x2000 and each.data[-1] == 1,
@@ -30,7 +30,7 @@ STOPS: dict[str, Callable[[Message], bool]] = {  # in the documents' words
 
 
 class Own(Drive):
-    """A drive of a user's own, stopped by a setting that wears."""
+    """A user's drive whose stop is a setting that wears the EEPROM."""
 
     model = "own"
     title = "OWN 1"
@@ -61,25 +61,25 @@ def writes(line: SimulatedBus, begun: int = 0) -> list[Message]:
 
 
 def starts(line: SimulatedBus, model: str) -> list[str]:
-    """Return the sent frames that start a motor of this family."""
+    """Return the frames sent so far that start a motor of this family."""
     return [frame for request, frame in line.frames if is_write(request) and STARTS[model](request)]
 
 
 def all_stopped(line: SimulatedBus, sims: list[Any]) -> bool:
-    """Return True if no motor turns any more."""
+    """Return True if no motor turns."""
     for sim in sims:
         sim.pass_time(line.seconds)
     return not any(sim.motor.energised for sim in sims)
 
 
 def first(line: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
-    """Count the frames before the first write of this kind."""
+    """Return how many frames after `begun` precede the first write that `met` accepts; None if none."""
     wanted = (at for at, (each, _) in enumerate(line.frames[begun:]) if is_write(each) and met(each))
     return next(wanted, None)
 
 
 class Meanwhile:
-    """Has another thread do something when so many more frames were sent, and waits for that thread."""
+    """After a number of further frames, lets another thread act, and waits for that thread."""
 
     def __init__(self, line: SimulatedBus, frames: int, act: Callable[[], object]) -> None:
         self.failure: BaseException | None = None
@@ -120,7 +120,10 @@ def started_while(
     frames: int,
     act: Callable[[SimulatedBus, Any], object],
 ) -> tuple[SimulatedBus, Any, Meanwhile, int, BaseException | None]:
-    """A start, in which another thread acts after so many frames; and how the start ended."""
+    """Start a drive while another thread acts after `frames` frames.
+
+    Returns the bus, the drive, the action, the number of earlier frames, and the error of the start, if any.
+    """
     line, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
     drive.set_frequency(20)
     begun = len(line.frames)

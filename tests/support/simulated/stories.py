@@ -1,4 +1,4 @@
-"""Run a line before, during and after a fault, or behind a slow path, on a simulated clock."""
+"""Poll a line before, during and after a fault, or behind a slow network path, on a simulated clock."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, simulated
 from multidrop.transport import clock, peers
 
 S = 1_000_000_000
-REGISTERS = 5  # per drive
-EVERY = 0.5  # s, for the first register; the others as fast as possible
-HEALTHY, FAULTY = 4.0, 8.0  # s
-CYCLES = 10  # within which the rate must recover
+REGISTERS = 5  # polled registers per drive
+EVERY = 0.5  # s, period of the first register; the others are polled as fast as possible
+HEALTHY, FAULTY = 4.0, 8.0  # s before the fault, s of the fault
+CYCLES = 10  # poll cycles within which the rate must recover
 UNASKED = {str(each) for each in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
 
 
 class PieceWire(ClockedWire):
-    """A faulty wire whose bytes come in small pieces, as from a serial port."""
+    """A faulty wire whose bytes arrive in small pieces, as from a serial port."""
 
     chunk = 4e-3
 
@@ -67,21 +67,21 @@ class Story:
         return self.rows[first:]
 
     def run_motor(self, seconds: float) -> None:
-        """Run for this many seconds; the motor starts and stops in each second."""
+        """Run for `seconds`; the motor starts and stops once per second."""
         for _ in range(round(seconds)):
             for command in (START, STOP):
                 self.clocked.command(self.motor, command)
                 self.run(0.5)
 
     def run_with_fault(self, faults: Faults) -> None:
-        """Run before, during and after the fault; check that the rate recovers."""
+        """Run the line before, during and after the fault; check that the poll rate recovers."""
         with self.clocked:
             cycle = _longest_gap([row for row in self.run(HEALTHY) if row.value is not None])
             healthy = [row for row in self.run(CYCLES * cycle) if row.value is not None]
             self.wire.faults = faults
             self.run_motor(FAULTY)
             self.wire.faults = Faults()
-            self.run(2 * faults.late)  # let delayed replies arrive
+            self.run(2 * faults.late)  # until delayed replies have arrived
             begin = self.back_off_is_over() + round(cycle * S)
             end = begin + round(CYCLES * cycle * S)
             self.run((end - self.clocked.now) / S)
@@ -92,11 +92,11 @@ class Story:
         self.judge()
 
     def back_off_is_over(self) -> int:
-        """Run until every drive was polled again; return that time.
+        """Run until every drive was polled again after the fault; return that time in ns.
 
-        First the port must reopen and the rests of silent drives end.
+        Before that, the port must be reopened, and the pauses in polling silent drives must end.
         """
-        cost = sum(drive.response_timeout for drive in self.drives) / 2  # on average, and rarely more
+        cost = sum(drive.response_timeout for drive in self.drives) / 2  # s of timeouts per cycle, on average
         longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
         ended = self.clocked.now
@@ -140,24 +140,24 @@ def _polls(drive: Drive, every: float | None) -> PolledDrive:
 
 
 def _longest_gap(rows: Sequence[Row]) -> float:
-    """Return the bus cycle in s: the longest time between two values of one register."""
+    """Return the bus cycle in s, measured as the longest time between two values of one register."""
     times: dict[tuple[str, str], list[int]] = {}
     for row in rows:
         times.setdefault((row.drive, row.register), []).append(row.monotonic_ns)
     return max(b - a for time in times.values() for a, b in pairwise(time)) / S
 
 
-# ---- paths that delay everything and keep the order: a modem, a gateway, a stalled network ----
+# ---- paths that delay all bytes and keep their order, such as a modem, a gateway, a stalled network ----
 
-Delay = Callable[[float], float]  # delay in s by the time in s at which bytes enter the path
+Delay = Callable[[float], float]  # from the time in s at which bytes enter the path to their delay in s
 
-SECONDS = 150.0  # of a story: pending requests are kept for 120 s
-TAIL = 20.0  # every drive must answer in these last seconds plus TURNS times the delay
+SECONDS = 150.0  # s of a run; longer than 120 s, for which pending requests are remembered
+TAIL = 20.0  # s; every drive must reply during these last seconds plus TURNS times the delay
 TURNS = 20
 
 
 class PathWire(ClockedWire):
-    """A faulty wire at the end of a path that delays the drives' replies."""
+    """A faulty wire behind a path that delays the drives' replies."""
 
     delay: Delay
 
@@ -194,25 +194,25 @@ def jittering(seconds: float) -> Delay:
 
 
 def stalling(longest: float) -> Delay:
-    """Return twelve stalls of up to this many seconds, which delay all bytes to their end."""
+    """Return a delay function with twelve stalls of up to `longest` s; bytes in a stall leave at its end."""
     random = Random(2)
     begins = [random.uniform(2.0, SECONDS) for _ in range(12)]
     stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
 
     def delay(now: float) -> float:
-        now -= 1000.0  # the time at which clocked lines start
+        now -= 1000.0  # clocked lines start at 1000 s
         return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
 
     return delay
 
 
 class Path(Story):
-    """A line at the end of a delaying path."""
+    """A polled line behind a delaying path."""
 
     wires = PathWire
 
     def run_over(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
-        """Check every row; return the drives with values at the end."""
+        """Run the line and check every row; return the drives that have values in the last seconds."""
         self.wire.delay = delay
         with self.clocked:
             self.run(SECONDS)
@@ -222,7 +222,7 @@ class Path(Story):
 
 
 class PathLine:
-    """A line at the end of such a path, with the interface that `Bus` uses; only its waits let time pass."""
+    """A line behind such a path, with the interface that `Bus` uses; time passes only while it waits."""
 
     def __init__(self, wire: PathWire) -> None:
         self.port = self.identity = wire.where if speaks_tcp(wire.where) else "test line"
@@ -278,7 +278,7 @@ class PathLine:
 def bus_over(
     wire: PathWire, delay: Delay, sims: Sequence[SimulatedDrive], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Bus, PathLine]:
-    """Open a bus over such a path to these simulated drives."""
+    """Open a bus over such a path to these simulated drives; return the bus and its line."""
     wire.delay = delay
     wire.open()
     line = PathLine(wire)
