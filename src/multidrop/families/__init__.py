@@ -1,4 +1,4 @@
-"""The built-in families, by the names that a plant file and the command line use."""
+"""The built-in families, by the model names used in plant files and on the command line."""
 
 from multidrop.drive import Drive
 from multidrop.families.delixi_modbus import DelixiModbus

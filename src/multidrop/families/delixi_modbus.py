@@ -15,7 +15,7 @@ from multidrop.families.delixi_parameters import KEYPAD, DelixiBaudrate, DelixiP
 
 
 class DelixiModbusControl(IntEnum):
-    """The words that this library sends: run or jog always with a direction, and never the toggle."""
+    """The control words that this library sends: run and jog include a direction; the toggle is not used."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -26,7 +26,7 @@ class DelixiModbusControl(IntEnum):
 
 
 class DelixiModbusFormat(IntEnum):
-    """P04.29 in firmware that speaks standard Modbus."""
+    """Values of P04.29, the character format, in firmware for standard Modbus."""
 
     ASCII_7N2 = 0
     ASCII_7E1 = 1
@@ -39,24 +39,25 @@ class DelixiModbusFormat(IntEnum):
 class DelixiModbus(DelixiParameters, table=HOLDING):
     """Delixi 9200 (RTU firmware) and 9100-SC; RS-485 communication protocol, part 2, standard Modbus.
 
-    The 9200 speaks RTU or ASCII by P04.29, the 9100-SC ASCII only; all others see `delixi-native`.
+    P04.29 selects RTU or ASCII on a 9200; a 9100-SC has ASCII only. For other models use `delixi-native`.
     Where the document errs or is silent, the safest reading is taken:
 
-    - The address of a setpoint that is not stored is printed "xxH". The only one known is 0002H
-      (P00.02), which wears the EEPROM: it is written on change only, so do not ramp with it.
-    - Whether a run command without a direction keeps the old one is not stated: both are always
-      sent together. `start` without a direction goes forward from rest. It is refused while the motor turns,
-      because the direction cannot be read. The word that toggles the direction is never sent.
+    - The address of the setpoint in RAM is printed "xxH". The only known setpoint is 0002H (P00.02), which
+      wears the EEPROM. It is written on change only, so do not ramp with it.
+    - Whether a run command without a direction keeps the previous direction is not stated, so every run
+      command has a direction. `start` without a direction goes forward from rest. It is refused while the
+      motor turns, because the direction cannot be read. The word that toggles the direction is never sent.
     - Whether a start ends a jog, and a jog a run, is not stated: after a jog a stop is required before a
       start, and a turning motor must be stopped before a jog.
     - No fault reset is documented, and reserved bits are not tried.
-    - No state word is documented: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
-    - "3800" bit/s is 4800; the fault "0C-xx" is OC-2, and 04 is OU.
-    - How many registers may be read at once is not stated: one. Nor are exceptions: any is a refusal.
+    - No state word is documented: an output frequency of 0 may mean a stop, or a run at a setpoint of 0.
+    - "3800" bit/s is a misprint of 4800. The fault "0C-xx" is OC-2, and 04 is OU.
+    - How many registers one request may read is not stated, so one is read. Exception codes are not stated
+      either, so any exception counts as a refusal.
     - Timing is taken from part 3.
 
-    P00.00 = 2 takes commands from the line, P00.01 = 1 the setpoint from P00.02. Functions 03 and 06
-    only. Broadcasts may only be run commands.
+    With P00.00 = 2 the drive takes commands from the line, with P00.01 = 1 the setpoint from P00.02. Only
+    functions 03 and 06 are used. Only run commands may be broadcast.
     """
 
     model = "delixi-modbus"
@@ -68,7 +69,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         Framing.RTU: ("8N2", "8E1", "8O1"),
         Framing.ASCII: ("7N2", "7E1", "7O1"),
     }
-    most_registers = {HOLDING: 1}  # in none of its examples more
+    most_registers = {HOLDING: 1}  # no example reads more
     exceptions = {}
     broadcasts = True
     identify_recognises = True
@@ -91,17 +92,17 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     )
     format_setting = setting(parameter(4, 29), DelixiModbusFormat, never=KEYPAD, place="P04.29")
 
-    _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
+    _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return P04.30, its address, P04.28, its baud rate, and a bus voltage that no address reaches."""
+        """Return the ranges of P04.30 (address), P04.28 (baud rate) and a bus voltage that is no address."""
         known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
         code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
         return known if code == self.address else known | {self.baudrate_setting: (code, code)}
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that P04.30 is its address, P04.28 its baud rate, and P05.31 a fault code."""
+        """Check that P04.30 is the drive's address, P04.28 its baud rate, and P05.31 a fault code."""
         yield from self._shows_its_line()
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
@@ -112,7 +113,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force; without a direction forward, and only from rest."""
+        """Start at the setpoint in force. Without a direction: forward, and only from rest."""
         if self._jogged and not (yield from self._stands()):
             raise self._stop_first("may still jog, which a start may not end:")
         forward = yield from self._forward(direction)
@@ -127,7 +128,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly from rest until stopped; without a direction forward."""
+        """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._forward(direction)
         if not (yield from self._stands()):
             raise self._stop_first("turns, and may go on through a jog:")
@@ -151,12 +152,12 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the stored setpoint, on change only."""
+        """Write the setpoint, which is stored in EEPROM, if it changes."""
         yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
-        """Report the fault by name, or that the motor turns; at rest the state is unknown."""
+        """Return the fault by name, or that the motor turns; at 0 Hz the state is unknown."""
         fault = yield from read(self.fault)
         if fault:
             return State(Condition.FAULT, fault=self.fault.in_words(fault))

@@ -1,4 +1,4 @@
-"""Delixi's other inverters: the maker's own ASCII protocol."""
+"""Delixi inverters that use the maker's own ASCII protocol."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class DelixiNativeStatus(IntEnum):
 
 
 class DelixiNativeFormat(IntEnum):
-    """P04.29 in firmware that speaks Delixi's own protocol."""
+    """Values of P04.29, the character format, in firmware for Delixi's own protocol."""
 
     N81 = 0
     E81 = 1
@@ -45,22 +45,22 @@ class DelixiNativeFormat(IntEnum):
 class DelixiNative(DelixiParameters, table=PARAMETER):
     """Delixi inverters; RS-485 communication protocol, part 3, Modbus-like ASCII format.
 
-    A function code K has a table each: 02 run command, 03 run state, 04 run setpoint (not stored),
-    05 and 06 parameters not stored and stored, 07 parameters read. A user's own parameters are
-    declared in a subclass, `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`. The table says
-    which memory holds a value: 06 writes to EEPROM, and 02, 04 and 05 do not.
+    Each function code K has its own table: 02 run command, 03 run state, 04 run setpoint (RAM), 05 and 06
+    parameters (05 writes to RAM, 06 to EEPROM), 07 read parameters. Declare your own parameters in a
+    subclass, such as `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`. The table determines the memory:
+    06 writes to EEPROM, and 02, 04 and 05 do not.
 
     Where the document errs or is silent, the safest reading is taken:
 
-    - The replies 0002 and 0003 to K = 03 are printed as "forward (stopped)" and "reverse (stopped)":
-      they are running, and never reported as stopped.
-    - The faults 10 to 14 are printed as hex digits: 0AH-0EH and 10H-14H both mean them, and any
-      other code that is not 0 is a fault.
+    - The replies 0002 and 0003 to K = 03 are printed as "forward (stopped)" and "reverse (stopped)". They
+      count as running, and are never reported as stopped.
+    - The faults 10 to 14 are printed as if in hex: both 0AH-0EH and 10H-14H are accepted for them. Any other
+      code except 0 is a fault too.
     - "K = FOH" is F0H, "3800" bit/s is 4800, and "<80m" is 80 ms.
     - What P00.01 must be for K = 04 to be used is not stated.
     - K = 03 may report a fault or undervoltage while P05.31 is 0. What a run command does then is not stated
-      (it may wait for the mains): `start` is refused, as in any state that is not explained.
-    - The checksum does not detect swapped bytes: a reply is compared field by field.
+      (it may wait for the mains), so `start` is refused, as in any unexplained state.
+    - The checksum does not detect swapped bytes, so a reply is compared with its request field by field.
     - A drive rejects K = F0 to FF from another master, so none is sent.
 
     Less than 10 ms may pass between two characters. Only run commands (K = 02) may be broadcast.
@@ -106,17 +106,17 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @property
     def echo_probe(self) -> Register[Any]:
-        """The run state: none is 0, the value in a parameter's request (part 3, section 5: K = 03, 07)."""
+        """The run state, which is never 0, so that its reply differs from an echo (part 3, section 5)."""
         return self.status
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that P04.30 is its address and P04.28 its baud rate; drives of other protocols are silent."""
+        """Check that P04.30 is the drive's address and P04.28 its baud rate."""
         yield from self._shows_its_line()
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        """Start at the setpoint in force. Without a direction: as the motor turns, or forward from rest."""
         yield from self._may_start()
         status = yield from read(self.status)
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
@@ -132,7 +132,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop. The motor counts as stopped once neither state nor output frequency shows that it turns."""
+        """Stop. The motor counts as stopped when neither run state nor output frequency shows a run."""
         yield from insist(self.control, DelixiNativeControl.STOP)
         yield from self._stopped(self._stands, self._limit())
 
@@ -147,7 +147,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor. It is sent once, then verified."""
+        """Reset a fault; never starts the motor. The command is sent once, then verified."""
         if (yield from read(self.status)) in CONDITIONS and not (yield from self._stands()):
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, DelixiNativeControl.RESET_FAULT)
@@ -158,12 +158,12 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint that is not stored, which cannot be read back."""
+        """Write the setpoint in RAM, which cannot be read back."""
         yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
-        """Report the run state with its direction, and the fault by name."""
+        """Return the run state with its direction, and the fault by name."""
         status = yield from read(self.status)
         if status in CONDITIONS:
             condition, direction = CONDITIONS[status]

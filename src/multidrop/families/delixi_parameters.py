@@ -24,7 +24,7 @@ def parameter(group: int, index: int) -> int:
 
 
 class DelixiFault(Worded):
-    """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are accepted."""
+    """P05.31, the fault. The codes 10 to 14 may be decimal or hex digits: both are accepted."""
 
     NONE = 0
     OC_OVERCURRENT = 1, "overcurrent (OC)"
@@ -57,20 +57,19 @@ class DelixiRunSource(IntEnum):
 class DelixiBaudrate(IntEnum):
     B1200 = 0
     B2400 = 1
-    B4800 = 2  # printed "3800"
+    B4800 = 2  # misprinted as 3800
     B9600 = 3
     B19200 = 4
     B38400 = 5
 
 
 class DelixiParameters(Drive):
-    """The parameters of Delixi's inverters; a subclass declares the table of its protocol for them.
+    """The parameters of Delixi's inverters; a subclass for a protocol passes the table that holds them.
 
     P04.29, the format, has different codes in each protocol, so subclasses declare it.
 
-    Values have no decimal point, and the list of scales is lost. Only the scale of the output
-    frequency is known, from an example. The units of P05.01 to P05.10 are inferred from
-    the quantities' names.
+    Values have no decimal point, and the document's list of scales is missing. Only the scale of the output
+    frequency is known, from an example. The units of P05.01 to P05.10 are inferred from their names.
     """
 
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # P04.28
@@ -78,7 +77,7 @@ class DelixiParameters(Drive):
     addresses = range(1, 32)  # P04.30
     response_timeout = 0.15
     answers_every_read = True
-    answering_time = 0.08  # the drive needs less
+    answering_time = 0.08  # s; the drive replies within this time
     remote = "P00.00 must be 2 (RS-485)"
     line_parameters = (
         "P04.28 baud rate (0 to 5: 1200, 2400, 4800, 9600, 19200, 38400), P04.29 format (its codes are those "
@@ -164,7 +163,7 @@ class DelixiParameters(Drive):
         )
 
     def _may_start(self) -> Script[None]:
-        """Raise WriteForbidden in a fault, without a setpoint, and if the drive does not obey the line."""
+        """Raise WriteForbidden in a fault, without a setpoint, or if the line does not command the drive."""
         fault = yield from read(self.fault)
         if fault:
             raise WriteForbidden(

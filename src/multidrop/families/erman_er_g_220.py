@@ -34,7 +34,7 @@ class Coil(IntEnum):
 
 
 class ErmanStatus(IntEnum):
-    """Bits 0 and 1 are one number; bit 5 says that the motor is overloaded."""
+    """Bits 0 and 1 form one number; bit 5 means that the motor is overloaded."""
 
     STOPPED = 0
     RUNNING = 1
@@ -66,7 +66,7 @@ class ErmanFault(IntFlag):
 
 
 class Modes(IntFlag):
-    """Bits of 0001H; the meaning of 0 and 1 is not stated."""
+    """Bits of register 0001H; what their values 0 and 1 mean is not stated."""
 
     MODULATION_TYPE = 1 << 0
     CONTROL_TYPE = 1 << 4
@@ -92,7 +92,7 @@ def _state(number: int, what: Any, /, **details: Unpack[Details]) -> Register[An
 
 @declaration
 def _control(number: int, what: Any, /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a control register; its place is the menu's name for it."""
+    """Declare a control register; `place` is its parameter name in the drive's menu."""
     details["place"] = f"{details['place']}; section 10, control: {number}"
     return setting(number, what, **details)
 
@@ -108,27 +108,28 @@ class ErmanERG220(Drive):
       0002H; 0001H is never written.
     - The example of function 0F resets a fault and starts in one frame, and sets a reserved coil.
       Coils are written one at a time (05), and reset and start are two calls.
-    - The byte order of a reply to function 01 is doubtful: coils are read only if one byte holds them, and
-      polled only on request. They show the last command. Whether the
-      motor runs is read from 0400H, whose bits 0 and 1 are one number and not two flags.
-    - Of the diagnostics, function 08, only the example is described, subfunction 0, and its error reply
+    - The byte order of a reply to function 01 is doubtful, so coils are read only within one byte. They show
+      the last command, and are polled only if a plant names them. Whether the motor runs is read from 0400H,
+      whose bits 0 and 1 are one number and not two flags.
+    - Of diagnostics (function 08) only the example of subfunction 0 is described, and its error reply
       has the code 89H instead of 88H. `drive.send_raw(0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
-      a copy of the request, as an adapter's echo is: it does not prove that a drive is there.
+      a copy of the request, like an adapter's echo, so it does not prove that a drive is there.
     - The order of the two words at 0400H and 0402H is not stated, but one word is always 0.
-    - 0402H is the last fault. The document does not say whether a reset clears it, or whether it is still in
-      force. `start` is refused until that fault has been reset by this object's `reset_fault`, or
-      declared as dealt with by the option `acknowledged_fault`.
-    - Whether START and STOP are levels or pulses is not stated. `stop` writes STOP on and START off,
-      and EMERGENCY STOP if the motor still runs after the deceleration time, or after 30 s if that is
-      unreadable. Both stay on until `start` writes them off: writing them off earlier could let
-      a latched START through. START is written off even if STOP is not confirmed: either may arrive.
-    - Exception 03 is used for any bad address and 04 says "on write": neither is a device failure.
-    - The models -03 and -04 of the same make have another map: see `identify`.
+    - 0402H is the last fault. The document does not say whether a reset clears it, or whether it is still
+      active. `start` is refused until that fault has been reset with this object's `reset_fault`, or
+      acknowledged with the option `acknowledged_fault`.
+    - Whether START and STOP are levels or pulses is not stated. `stop` sets STOP and clears START. It also
+      sets EMERGENCY STOP if the motor still runs after the deceleration time, or after 30 s if that time is
+      unreadable. Both stop coils stay set until `start` clears them, because clearing them earlier could let
+      a latched START take effect. START is cleared even if STOP is not confirmed: either write may arrive.
+    - Exception 03 is used for any wrong address, and 04 is described as "on write": neither means a device
+      failure.
+    - The models -03 and -04 of this make have a different register map: see `identify`.
     - A setpoint is limited to the minimum and the maximum frequency, because the drive does not refuse
       others.
 
     No ranges, defaults or timing are stated, nor which registers are in EEPROM. Address 0 is called the
-    broadcast, but the document does not say whether drives answer it, so it is never sent. b.001 and b.002
+    broadcast, but the document does not say whether drives reply to it, so it is never sent. b.001 and b.002
     must select RS-485.
     """
 
@@ -209,8 +210,8 @@ class ErmanERG220(Drive):
     deceleration_time = _control(0x000D, "s", step=0.1, place="b.004")
     braking_threshold = _control(0x0015, "V", place="E.06", note="Of dynamic braking.")
 
-    # The coils of the commands as they are held (sections 6 and 10); no gap is read across, so that all
-    # that is read at once lies in one byte
+    # The command coils as read back: they show the last command (sections 6 and 10). Reads do not span gaps,
+    # so that all coils of a read lie in one byte.
     start_held = _held(0x0000, Coil)
     stop_held = _held(0x0001, Coil)
     emergency_stop_held = _held(0x0002, Coil)
@@ -220,12 +221,12 @@ class ErmanERG220(Drive):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """Return all readings except the coils, which show the last command."""
+        """Return all readings except the coils, which only show the last command."""
         return tuple(register for register in super().readings() if register.table is not COIL)
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that 0400H can be read; on the models -03 and -04 function 04 does not exist."""
+        """Check that 0400H can be read: the models -03 and -04 do not have function 04."""
         try:
             yield from read(self.status)
         except DriveException as refusal:
@@ -259,7 +260,7 @@ class ErmanERG220(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp. If the drive refuses, or the motor still runs afterwards, emergency stop."""
+        """Stop along the ramp; if refused, or if the motor still runs afterwards, use the emergency stop."""
         try:
             yield from self._hold_back(self.stop_coil)
         except DriveException:
@@ -274,12 +275,12 @@ class ErmanERG220(Drive):
 
     @verb
     def emergency_stop(self) -> Script[None]:
-        """Stop the motor as the drive's own emergency stop does."""
+        """Stop the motor with the drive's own emergency stop."""
         yield from self._hold_back(self.emergency_stop_coil)
         yield from self._stopped(self._stands, (yield from self._longest_ramp()))
 
     def _hold_back(self, stop: Register[Coil]) -> Script[None]:
-        """Write a stop coil on and START off; write START even if the stop is not confirmed."""
+        """Set this stop coil and clear START, even if setting the stop coil is not confirmed."""
         try:
             yield from insist(stop, Coil.ON)
         except Unconfirmed:
@@ -288,10 +289,10 @@ class ErmanERG220(Drive):
         yield from insist(self.start_coil, Coil.OFF)
 
     def _longest_ramp(self) -> Script[float]:
-        """Return after how many seconds a motor that still runs counts as not obeying a stop."""
+        """Return the seconds after which a motor that still runs counts as not stopping."""
         try:
             return (yield from read(self.deceleration_time)) + STOP_MARGIN
-        except BusError:  # a drive that answers to some requests alone is one that may not obey, either
+        except BusError:  # a drive that does not answer this read may not obey a stop either
             return UNKNOWN_RAMP
 
     def _stands(self) -> Script[bool]:
@@ -300,7 +301,7 @@ class ErmanERG220(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault. START is written off first, so that the reset cannot start the motor."""
+        """Reset a fault. START is cleared first, so that the reset cannot start the motor."""
         if (yield from read(self.status)) & PHASE:
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         fault = yield from read(self.last_fault)
@@ -315,12 +316,12 @@ class ErmanERG220(Drive):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint, which lies between the drive's minimum and maximum frequency."""
+        """Write the setpoint, which must lie between the drive's minimum and maximum frequency."""
         yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
-        """Report the phase of the ramp; the last fault is a note, because it may be past."""
+        """Return the phase of the ramp; the last fault becomes a note, because it may be over."""
         status = yield from read(self.status)
         fault = yield from read(self.last_fault)
         notes = ["motor overloaded"] if status & OVERLOAD else []

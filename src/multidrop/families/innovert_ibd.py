@@ -14,7 +14,7 @@ from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 
-SEEN_AS_1, NEVER_ELSE = 0x1800, 0xD800  # of PrA.22: bits 11 and 12, and with them 14 and 15
+SEEN_AS_1, NEVER_ELSE = 0x1800, 0xD800  # masks of PrA.22: bits 11 and 12; bits 11, 12, 14 and 15
 
 INFERRED = "the address is inferred: the table of letters is lost"
 OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 = 9600 bit/s"
@@ -23,14 +23,14 @@ OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 
 def parameter(name: str) -> int:
     """Return the address of a parameter: 3 for PrA.03, 107 for Prb.07 (appendix 2, table 2).
 
-    The digits of A and b are known from examples; the table is lost, and C to H are inferred to go on.
+    The digits for A and b are known from examples. The manual's table is missing; C to H are inferred.
     """
     letter, _, number = name.removeprefix("Pr").partition(".")
     return "ABCDEFGH".index(letter.upper()) * 100 + int(number)
 
 
 class IBDControl(IntEnum):
-    """The words that this library sends: at most one bit for the direction, and never the toggle."""
+    """The control words that this library sends: at most one direction bit, never the toggle."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -59,7 +59,7 @@ class Terminals(IntFlag):
 
 
 class Output(IntEnum):
-    """Functions of an output; only these codes are named."""
+    """Functions that an output can be programmed for; only these codes are named in the manual."""
 
     RUNNING = 1
     FAULT = 3
@@ -135,7 +135,7 @@ class InnovertIBD(Drive):
     line_terminals = "RS+ and RS-"
     addresses = range(1, 241)
     answers_every_read = True
-    silence = 10e-3  # before and after an RTU frame (table "message in RTU mode")
+    silence = 10e-3  # s before and after an RTU frame (table "message in RTU mode")
     most_registers = {HOLDING: 4}
     exceptions = {}
     broadcasts = True
@@ -144,7 +144,7 @@ class InnovertIBD(Drive):
         "PrH.00 baud rate (1 is 9600), PrH.01 format (0 to 2: ASCII, 3 to 5: RTU; each 8N1, 8E1, 8O1), "
         "PrH.02 address"
     )
-    parameter_space = ParameterSpace(  # the letters from C on are inferred
+    parameter_space = ParameterSpace(  # addresses of the letters from C on are inferred
         groups=tuple(
             ParameterGroup(f"Pr{letter}.", hundred * 100, range(100))
             for hundred, letter in enumerate("bCdEFGH", start=1)
@@ -221,7 +221,7 @@ class InnovertIBD(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that PrH.00 and PrH.02 are its own baud rate and address; these places are inferred.
+        """Check that PrH.00 and PrH.02 hold the drive's baud rate and address; their addresses are inferred.
 
         A drive with other values there may still be an IBD: its owner then declares confirmed = 1 in the
         plant file. A sibling with a state of its own may show that instead.
@@ -237,11 +237,11 @@ class InnovertIBD(Drive):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if the owner has confirmed the family, which no register shows."""
+        """True if the owner has confirmed the family, because no register shows it."""
         return bool(self.option.get("confirmed")) and not self.declared_in
 
     def _shows_its_state(self) -> Script[bool]:
-        """Return True if a sibling's state is one that it has, and it is commanded by the line."""
+        """Return True if a sibling shows a valid run state and takes commands from the line."""
         try:
             state = yield from read(self.register("run_state"))
             source = yield from read(self.frequency_source)
@@ -274,12 +274,12 @@ class InnovertIBD(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start from rest in the direction in force; in another only where `forward_bit` is declared."""
+        """Start from rest in the last direction; another needs the option `forward_bit`."""
         yield from self._command(IBDControl.RUN, direction)
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn from rest at PrE.00 until stopped, in the direction in force; for another see `start`."""
+        """Turn from rest at the jog frequency PrE.00 until stopped; for `direction` see `start`."""
         yield from self._command(IBDControl.JOG, direction)
 
     def _command(self, word: IBDControl, direction: Direction | None) -> Script[None]:
@@ -319,7 +319,7 @@ class InnovertIBD(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp: by the outputs, or else when neither current nor speed is shown."""
+        """Stop along the ramp, until the programmed outputs say so, or else current and speed are 0."""
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         look = self._stands
@@ -332,7 +332,7 @@ class InnovertIBD(Drive):
 
     @property
     def _has_state(self) -> bool:
-        """True for a sibling that shows its state, output frequency and fault."""
+        """True for a sibling with registers for run state, output frequency and fault."""
         return {"run_state", "output_frequency", "fault"} <= self.registers.keys()
 
     def _code(self) -> Script[int]:
@@ -346,7 +346,7 @@ class InnovertIBD(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault after a stop was commanded; never starts the motor. Sent once."""
+        """Reset a fault, after a stop; never starts the motor. The reset is sent once."""
         if not (yield from self._stands()):
             raise WriteForbidden(f"{self.name} turns: it has no fault to reset")
         yield from insist(self.control, IBDControl.STOP)
@@ -359,7 +359,7 @@ class InnovertIBD(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the state shown by `run_state`, or by the outputs if programmed for it; else unknown."""
+        """Return the state shown by `run_state`, or by suitably programmed outputs; else unknown."""
         if self._has_state:
             return (yield from self._shown_state())
         terminals = yield from read(self.terminals)
@@ -383,7 +383,7 @@ class InnovertIBD(Drive):
         return SHOWN_STATES.get(shown, State(Condition.UNKNOWN, note=f"run_state {shown} is not explained"))
 
     def _programmed(self) -> Script[bool]:
-        """Check that the outputs work as in the example; their addresses are inferred, but four match."""
+        """Return True if the outputs are programmed as in the example; their addresses are inferred."""
         try:
             for register, function in (
                 (self.output_m01, Output.RUNNING),
@@ -398,7 +398,7 @@ class InnovertIBD(Drive):
         return True
 
 
-OUTPUTS = {  # the gravest first
+OUTPUTS = {  # most serious condition first
     Terminals.VIRTUAL: Condition.FAULT,
     Terminals.YABC: Condition.DECELERATING,
     Terminals.M02: Condition.ACCELERATING,

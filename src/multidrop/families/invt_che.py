@@ -46,7 +46,7 @@ class CHEControl(IntEnum):
     REVERSE = 2
     JOG_FORWARD = 3
     JOG_REVERSE = 4
-    STOP = 5  # along the ramp; other makes have 5 and 6 the other way round
+    STOP = 5  # along the ramp; some other makes have 5 and 6 exchanged
     COAST = 6
     RESET_FAULT = 7
     STOP_JOG = 8
@@ -64,7 +64,7 @@ class Device(IntEnum):
     CHE_1500_HZ = 0x0102
 
 
-OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # what their manuals have at 3016H
+OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # values of 3016H in their manuals
 CHF = 0x02  # the high byte of 3016H in the CHF series (CHE100 manual v1.4, p. 119), whose words are the same
 
 
@@ -109,11 +109,11 @@ class CommunicationFault(IntEnum):
 
 @declaration
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a function code by its ordinal number in your model's manual (section 11.6.4).
+    """Declare a parameter by its ordinal number in your model's manual (section 11.6.4).
 
-    It is kept in EEPROM, and written to its RAM alias: bit 15 of the address set. The RAM value is lost at
-    power-off; use `stored_parameter` for a permanent one. Compare the read value with the keypad before the
-    first write: a wrong ordinal may restore the factory settings.
+    The parameter is in EEPROM, but writes go to its RAM alias, the address with bit 15 set, whose value is
+    lost at power-off. Use `stored_parameter` for permanent writes. Before the first write, compare the value
+    read with the keypad: with a wrong ordinal a write may restore the factory settings.
 
         class MyCHE(InvtCHE):
             acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
@@ -126,7 +126,7 @@ def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Re
 
 @declaration
 def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a function code that is written to EEPROM, and so survives a loss of power.
+    """Declare a parameter whose writes go to EEPROM, and so survive a loss of power.
 
     Every write wears the EEPROM (section 11.6.4), so writes are sent only on change, and are counted.
     """
@@ -178,10 +178,10 @@ class InvtCHE(Drive):
     formats = dict.fromkeys(Drive.framings, ("8N1", "8E1", "8O1", "8N2", "8E2", "8O2"))  # PC.02
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # PC.01
     addresses = range(1, 248)
-    response_timeout = 0.4  # PC.03 delays the reply by up to 200 ms, 5 ms from the factory
+    response_timeout = 0.4  # s; PC.03 delays the reply by up to 200 ms, by 5 ms from the factory
     answers_every_read = True
     most_registers = {HOLDING: 16}
-    readable_gaps = {HOLDING: range(0x3000, 0x3017)}  # the reserved ones are listed as readable
+    readable_gaps = {HOLDING: range(0x3000, 0x3017)}  # reserved registers are documented as readable
     exceptions = {
         0x01: "illegal command, or the drive has a fault",
         0x02: "illegal address",
@@ -274,11 +274,11 @@ class InvtCHE(Drive):
     )
     communication_fault = reading(0x5001, CommunicationFault, outside=CHE100_NEXT)
 
-    _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
+    _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that 3016H is 0101H or 0102H; a stop is withheld only from another series of INVT's."""
+        """Check that 3016H is 0101H or 0102H; a stop is withheld only if it shows another INVT series."""
         device = yield from read(self.device)
         if isinstance(device, Device):
             return
@@ -293,7 +293,7 @@ class InvtCHE(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        """Start at the setpoint in force. Without a direction: as the motor turns, or forward from rest."""
         if self._jogged and not (yield from self._stands()):
             raise self._stop_first("may still jog, which a start may not end:")
         forward = yield from self._forward(direction)
@@ -325,14 +325,14 @@ class InvtCHE(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; if the motor still turns, also stop a jog, which cannot be read."""
+        """Stop along the ramp; if the motor still turns, also send STOP_JOG, because a jog is not shown."""
         refusals: list[DriveException] = []
         try:
             if (yield from self._stands_by(CHEControl.STOP, refusals)):
                 return
-        except WriteForbidden:  # another drive is there
+        except WriteForbidden:  # the drive is of another family
             raise
-        except BusError:  # a silent drive may still hear, and jog
+        except BusError:  # a drive that does not reply may still receive, and jog
             with suppress(BusError):
                 yield from insist(self.control, CHEControl.STOP_JOG, attempts=1)
             raise
@@ -343,10 +343,10 @@ class InvtCHE(Drive):
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands_by(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
-        """Write a stop; return True if the motor is then at rest. An exception of the drive is collected."""
+        """Write a stop word; return True if the motor is then at rest. A refusal is added to `refusals`."""
         try:
             yield from insist(self.control, word)
-        except DriveException as refusal:  # as in a fault, or without a jog
+        except DriveException as refusal:  # some drives refuse it in a fault, or without a jog
             refusals.append(refusal)
         return (yield from self._stands())
 
@@ -357,12 +357,12 @@ class InvtCHE(Drive):
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands(self) -> Script[bool]:
-        """Return True if the drive applies no voltage, as in a fault."""
+        """Return True if the status shows that the motor has no voltage, as in standby or a fault."""
         return (yield from read(self.status)) in (CHEStatus.STANDBY, CHEStatus.FAULT)
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor. It is sent once, then verified."""
+        """Reset a fault; never starts the motor. The command is sent once, then verified."""
         if (yield from read(self.status)) in (CHEStatus.FORWARD, CHEStatus.REVERSE):
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, CHEControl.RESET_FAULT)
@@ -385,7 +385,7 @@ class InvtCHE(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Report the state word, and the fault by name."""
+        """Return the state shown by the state word, and the fault by name."""
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = yield from read(self.fault)

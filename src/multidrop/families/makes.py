@@ -1,8 +1,9 @@
-"""Makes that prove themselves by their registers, and the words that run their motors.
+"""Makes that can be recognised by their registers, and the words that run their motors.
 
-Two families may have their control word at the same address, with other meanings: the stop of one runs the
-motor of the other. A stop is withheld only if a drive shows that it is such another make. This table has, for
-each make, the registers that show it. A drive of the declared family refuses or holds other values there.
+Two families may have their control words at the same address with different meanings, so that one family's
+stop runs another make's motor. A stop is withheld only if the drive's registers show that it is such another
+make. The table lists these registers for each make. A drive of the declared family refuses or holds other
+values there.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from multidrop.families.innovert_ibd import IBDBaudrate
 
 
 class Evidence(Drive):
-    """The registers that show a make, each at its manual's address."""
+    """The registers by which makes are recognised, each at the address of its manual."""
 
     goodrive_state = reading(0x2100, place="Goodrive200A manual p. 140")
     goodrive_device = reading(0x2103, place="Goodrive200A manual p. 140 to 142")
@@ -41,18 +42,18 @@ Test = Callable[[int, Drive], bool]
 
 @dataclass(frozen=True)
 class Make:
-    """A make: the model to declare, its control register, the words that run it, and what shows it."""
+    """A make: the model to declare, its control register, the words that run it, and how to recognise it."""
 
     model: str
     title: str
-    control: int  # address of the holding register
-    runs: Callable[[float], bool]  # whether a word there runs the motor
+    control: int  # address of its control word, a holding register
+    runs: Callable[[float], bool]  # returns True for a word that runs the motor
     evidence: tuple[tuple[Register[Any], Test], ...]
-    may_be_silent: bool = False  # whether it may not reply to requests for registers that it does not have
-    copies: tuple[str, ...] = ()  # models whose registers do not distinguish them from this make
+    may_be_silent: bool = False  # True if it may not reply to reads of registers that it lacks
+    copies: tuple[str, ...] = ()  # models that these registers do not distinguish from this make
 
     def shows(self, drive: Drive) -> Script[bool]:
-        """Return True if all its registers have the values of this make. Reads only."""
+        """Return True if all the make's registers have its values in this drive. Only reads."""
         for register, test in self.evidence:
             if not test(int((yield from read(register))), drive):
                 return False
@@ -76,7 +77,7 @@ def _one_to_four(word: float) -> bool:
 
 
 def _bit_1(word: float) -> bool:
-    """Bits 1 and 0 are 10 for run and 11 for jog; reserved bits may be ignored."""
+    """Return True if bit 1 is set: bits 1 and 0 are 10 for run, 11 for jog."""
     return bool(int(word) & 0x02)
 
 
@@ -145,16 +146,16 @@ MAKES = (
 
 
 def run_by(register: Register[Any], count: float) -> list[Make]:
-    """Return the makes whose motors this count, written to this register, would run."""
+    """Return the makes whose motors would run if this count were written to this register."""
     if register.table.read_space != HOLDING.read_space:
         return []
     return [make for make in MAKES if make.control == register.address and make.runs(count)]
 
 
 def easily_mistaken_for(drive: Drive) -> list[Make]:
-    """Return the makes to exclude before a write to a drive whose identity is weak.
+    """Return the makes to exclude before writing to a drive whose identity is weak.
 
-    These are the makes that one of its harmless words would run, and those whose registers its own copy.
+    These are the makes whose motors one of its harmless words would run, and those whose registers it copies.
     """
     control = drive.registers.get("control")
     harmless = control.harmless or () if control is not None else ()

@@ -28,16 +28,16 @@ from multidrop.families import MODELS
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-GROUP = "multidrop.families"  # of entry points of other packages; a built-in name goes before theirs
+GROUP = "multidrop.families"  # entry point group of other packages; built-in names take precedence
 _SHIPPED = Path(__file__).parent / "shipped"
-SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read on demand
+SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # names; each file is read on demand
 
-# Shipped families that a drive proves by more than its status, so that a scan may look for them.
+# Shipped families for which a scan may look, because more than the status identifies their drives.
 RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
 
 
 def shipped_family(name: str) -> type[Drive]:
-    """Return the shipped family of this name; its `model` is the name, not the file."""
+    """Return the shipped family of this name; its `model` is this name instead of the file's."""
     family = _family_of(_SHIPPED / f"{name}.toml")
     family.model = family.declared_in = name
     return family
@@ -69,15 +69,15 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
 
 
 def installed_models() -> list[str]:
-    """Return the names of families in other installed packages, but those of a built-in or shipped family."""
+    """Return the names of families in other installed packages, except names of built-in or shipped ones."""
     names = {point.name for point in _entry_points()}
     return sorted(names - {*MODELS, *SHIPPED})
 
 
 def installed_family(name: str) -> type[Drive] | None:
-    """Return the family of this name in another installed package, by its entry point in GROUP; None: none.
+    """Return the family with this entry point name in another installed package; None if there is none.
 
-    Raises ValueError if two packages have it, or if it cannot be loaded.
+    Raises ValueError if two packages have the name, or if the family cannot be loaded.
     """
     points = [point for point in _entry_points() if point.name == name]
     if not points:
@@ -89,7 +89,7 @@ def installed_family(name: str) -> type[Drive] | None:
         )
     try:
         found = points[0].load()
-    except Exception as failure:  # it is another package's code, and may raise anything
+    except Exception as failure:  # another package's code may raise anything
         why = f"{type(failure).__name__}: {failure}"
         raise ValueError(f"model {name!r} of package {packages[0]} cannot be loaded: {why}") from failure
     if not (isinstance(found, type) and issubclass(found, Drive) and found.registers):
@@ -104,18 +104,18 @@ def installed_family(name: str) -> type[Drive] | None:
 
 
 def _entry_points() -> Iterable[EntryPoint]:
-    from importlib.metadata import entry_points  # takes 2 MB, and few plants need it
+    from importlib.metadata import entry_points  # imported here: it takes 2 MB, and few plants need it
 
     return entry_points(group=GROUP)
 
 
 def is_users_own(family: type[Drive]) -> bool:
-    """Return True for a user's family that does not derive from one of this package."""
+    """Return True if the family is a user's and does not derive from one of this package."""
     return family.model not in SHIPPED and not any(base in MODELS.values() for base in family.__mro__)
 
 
 def _family_of(path: Path) -> type[Drive]:
-    from multidrop.families.files.loader import load_family  # a tenth of a command's imports
+    from multidrop.families.files.loader import load_family  # slow to import
 
     return load_family(path)
 
@@ -147,16 +147,16 @@ def _load(path: Path) -> ModuleType:
     return load_model_file(path)
 
 
-_KEPT = {*sys.stdlib_module_names, "multidrop"}  # names that a file beside a model cannot have
-_running = RLock()  # one thread at a time runs files
+_KEPT = {*sys.stdlib_module_names, "multidrop"}  # never imported from a model's folder
+_running = RLock()  # held while a model file runs
 
 _log = logging.getLogger("multidrop.families.registry")
 
 
 def load_model_file(path: Path) -> ModuleType:
-    """Return the file's module; it is run once a process, so that its classes stay the same.
+    """Return the module of a Python file, which runs once per process, so that its classes stay the same.
 
-    Raises ValueError, with file and line, for any error in it.
+    Raises ValueError with file and line for any error in the file.
     """
     path = path.resolve()
     try:
@@ -168,13 +168,13 @@ def load_model_file(path: Path) -> ModuleType:
 
 
 class _NotPython(Exception):
-    """The file's name does not end like that of a Python file."""
+    """Raised if the name does not end in a Python file's suffix."""
 
 
 def _module(path: Path) -> ModuleType:
     name = f"multidrop_models.{path.stem}_{abs(hash(path)):x}"
     with _running:
-        if name in sys.modules:  # complete, or being loaded if two files import each other
+        if name in sys.modules:  # loaded, or being loaded if two files import each other
             return sys.modules[name]
         spec = importlib.util.spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
@@ -182,7 +182,7 @@ def _module(path: Path) -> ModuleType:
         _log.info("%s is run as Python: a user's model is a program", path)
         module = importlib.util.module_from_spec(spec)
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import_beside(path.parent)}
-        sys.modules[name] = module  # dataclasses look their module up
+        sys.modules[name] = module  # required by dataclasses, which look up their module
         try:
             spec.loader.exec_module(module)
         except BaseException:
@@ -192,7 +192,7 @@ def _module(path: Path) -> ModuleType:
 
 
 def _import_beside(directory: Path) -> Callable[..., object]:
-    """Return an `__import__` that finds the modules of this directory first."""
+    """Return a replacement for `__import__` that first finds the modules in this directory."""
 
     def import_module(
         name: str,
@@ -210,16 +210,16 @@ def _import_beside(directory: Path) -> Callable[..., object]:
 
 
 def _imported(name: str, path: Path) -> ModuleType | None:
-    """Return the module of this name if the program imported it from the same file."""
+    """Return the module of this name if the program has already imported it from this file; else None."""
     module = sys.modules.get(name)
     file = getattr(module, "__file__", None)
     return module if file and Path(file).exists() and path.samefile(file) else None
 
 
 def _place(mistake: BaseException, path: Path) -> str:
-    """Return the file and, if known, the line of an error: in the file, or in one beside it."""
+    """Return the file and, if known, the line of an error, which may be in a file of the same directory."""
     if isinstance(mistake, SyntaxError):
-        return str(path)  # its message has file and line
+        return str(path)  # the message already has file and line
     frames = [
         frame
         for frame in traceback.extract_tb(mistake.__traceback__)

@@ -17,24 +17,24 @@ from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
-SELECTION_TIME = 1.0  # s in which a preset speed becomes the frequency command
-RELEASE_TIME = 2.0  # s within which a motor started by panel or terminals is seen to turn
-RESET_TIME = 3.0  # s in which the drive restarts and may not answer
+SELECTION_TIME = 1.0  # s within which 1202H shows a newly selected preset speed
+RELEASE_TIME = 2.0  # s within which a motor started by panel or terminals shows that it turns
+RESET_TIME = 3.0  # s for which the restarting drive may not reply
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
 COMMAND = "it belongs to the command over the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
-RUN_FUNCTIONS = (2, 3)  # of an input: those that F and R have from the factory
+RUN_FUNCTIONS = (2, 3)  # input functions that run the motor: those of F and R in the factory settings
 AT_ONCE = "Takes effect at once."
 AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
 
 class YD1000Control(IntFlag):
-    """1000H. Bits 15 and 14 latch until 0 is written to them or the power fails."""
+    """The control word 1000H. Bits 15 and 14 latch until 0 is written to them or the power fails."""
 
-    COMMAND_VALID = 1 << 15  # this word, not CNOD, commands the motor
-    FREQUENCY_VALID = 1 << 14  # 1001H, not FNOD, is the setpoint
+    COMMAND_VALID = 1 << 15  # this word commands the motor, instead of the source in CNOD
+    FREQUENCY_VALID = 1 << 14  # 1001H is the setpoint, instead of the source in FNOD
     RESET = 1 << 13
     EMERGENCY_STOP = 1 << 12
     COAST = 1 << 11
@@ -59,7 +59,7 @@ PRESET_SPEEDS = (
 
 
 class YD1000Status(IntFlag):
-    RUN = 1 << 10  # also while braking by direct current
+    RUN = 1 << 10  # also set while braking with direct current
     REVERSE = 1 << 9
     JOG = 1 << 8
     DC_BRAKE = 1 << 7
@@ -93,28 +93,28 @@ class Parity(IntEnum):
 
 
 def choice(number: int, place: str, most: int | None = None, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a parameter from 0 to `most`, or of unknown range."""
+    """Declare a parameter with values from 0 to `most`; None: of unknown range."""
     if most is not None:
         more["span"] = (0, most)
     return setting(number, **_parameter(place, more))
 
 
 def seconds(number: int, place: str, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a time; its unit is from outside the document."""
+    """Declare a time in s; the document does not state the unit."""
     more["step"], more["span"] = 0.1, (0.1, 3600)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 34"
     return setting(number, "s", **_parameter(place, more))
 
 
 def hertz(number: int, place: str, least: float = 0, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a frequency up to the highest FH; its unit is from outside the document."""
+    """Declare a frequency in Hz, at most the highest FH; the document does not state the unit."""
     more["step"], more["span"] = 0.01, (least, 320)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 35"
     return setting(number, "Hz", **_parameter(place, more))
 
 
 def preset(number: int, place: str, /) -> Register[float]:
-    """Declare a preset speed, from LL to UL."""
+    """Declare a preset speed, whose limits are LL and UL."""
     return hertz(number, place, at_least="minimum_frequency", at_most="upper_limit_frequency", default=0.0)
 
 
@@ -374,7 +374,7 @@ class YD1000(Drive):
     _record: float | None = None  # the newest entry of the fault record at the last check
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return 0802H, the drive's own address, and 0011H, a maximum frequency of 30 to 320 Hz."""
+        """Return the ranges of 0802H, the drive's own address, and 0011H, a maximum of 30 to 320 Hz."""
         return {self.address_setting: (self.address, self.address), self.maximum_frequency: (3000, 32000)}
 
     @verb
@@ -395,10 +395,10 @@ class YD1000(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at 1001H; without a direction, in the one it turns in, or forward.
+        """Start at the setpoint 1001H. Without a direction: as the motor turns, or forward from rest.
 
-        The options `preset_speed` and `setpoint_by_fnod` give it another setpoint, `second_ramp` the
-        other ramp; a stop is along the first one.
+        The options `preset_speed` and `setpoint_by_fnod` select another setpoint, `second_ramp` the second
+        ramp. A stop always uses the first ramp.
         """
         how = YD1000Control.RUN
         if self.option.get("second_ramp"):
@@ -413,7 +413,7 @@ class YD1000(Drive):
         return bool(self.option.get("setpoint_by_fnod"))
 
     def _preset(self) -> Script[YD1000Control]:
-        """Return the bits of the preset speed once 1202H has shown, at rest, that they select it."""
+        """Select the preset speed at rest; return its bits once 1202H shows that speed."""
         number = int(self.option["preset_speed"])
         hz = yield from read(self.registers[f"preset_speed_{number}"])
         if hz == 0:
@@ -446,7 +446,7 @@ class YD1000(Drive):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
+        """Turn slowly until stopped. Without a direction: as the motor turns, or forward from rest."""
         yield from self._turn(YD1000Control.JOG, direction)
 
     def _turn(self, how: YD1000Control, direction: Direction | None) -> Script[None]:
@@ -514,24 +514,24 @@ class YD1000(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Restart the drive once, which resets its fault, and then command the stop again.
+        """Restart the drive once, which resets its fault, then send the stop again.
 
-        Its setpoint is lost with it: call set_frequency before the next start.
+        The restart loses the setpoint: call set_frequency before the next start.
         """
         if (yield from read(self.output_frequency)) > 0:
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from self._no_terminal_runs("once a reset has restarted the drive")
-        with suppress(Unconfirmed):  # the restart cuts the reply off
+        with suppress(Unconfirmed):  # the restart may cut off the reply
             yield from write(self.control, STOP | YD1000Control.RESET)
         yield from wait(RESET_TIME)
         yield from insist(self.control, STOP)
         self._record = yield from read(self.fault_record_1)
 
     def _no_terminal_runs(self, when: str) -> Script[None]:
-        """Raise WriteForbidden if a terminal could start the motor once bit 15 is off (after a restart)."""
+        """Raise WriteForbidden if a terminal would start the motor once bit 15 is off, as after a restart."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
-        for number, terminal in enumerate(Inputs, 1):  # F111 is the function of F, and so on
+        for number, terminal in enumerate(Inputs, 1):  # F111 has the function of F, F112 that of R, and so on
             if closed & terminal:
                 functions[f"terminal {terminal.name}"] = self.registers[f"input_{number}_function"]
         for what, function in functions.items():
@@ -551,7 +551,7 @@ class YD1000(Drive):
         yield from self._no_terminal_runs("once the line no longer commands it")
         try:
             yield from write(self.control, YD1000Control(0))
-        except Unconfirmed:  # it may have happened
+        except Unconfirmed:  # the write may have taken effect
             yield from insist(self.control, STOP)
             raise
         try:
@@ -569,7 +569,7 @@ class YD1000(Drive):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint, which is at most FH."""
+        """Write the setpoint, at most FH, the maximum frequency."""
         for name in ("preset_speed", "setpoint_by_fnod"):
             if self.option.get(name):
                 raise WriteForbidden(
@@ -579,7 +579,7 @@ class YD1000(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Report whether the motor turns, or a fault: one that freezes 1200H, or is new in the record."""
+        """Return whether the motor turns, or a fault: 1200H is frozen, or the fault record changed."""
         if not (yield from self._stands()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)

@@ -1,4 +1,4 @@
-"""Load a family from its file, after checking the whole file. No code is executed."""
+"""Load a family from a TOML file after checking the whole file. No code is run."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ MOST_CSV_FILES = 20
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A family, and the contents of the files from which it was made."""
+    """A loaded family, and the contents of its files, by which a change is detected."""
 
     files: Mapping[Path, bytes]
     family: type[Drive]
@@ -62,8 +62,8 @@ _loaded: dict[Path, _Loaded] = {}
 def load_family(path: Path | str) -> type[Drive]:
     """Return the family that a TOML file declares: a subclass of `Drive`.
 
-    The same file gives the same class until its contents change. The class's `model` is the file's name.
-    Raises FamilyError with all mistakes in the file and in the CSV files that it names.
+    Loading a file again returns the same class until its contents change. The `model` is the file's name.
+    Raises FamilyError that lists all mistakes in the file and in the CSV files that it names.
     """
     path = Path(path)
     place = TomlPlace(path)
@@ -92,7 +92,7 @@ def _same(file: Path, data: bytes) -> bool:
 
 
 def _bytes(path: Path, what: str) -> bytes:
-    """Return a file's bytes. Raises ValueError, without the path, if it is missing or too long."""
+    """Return a file's bytes. Raises ValueError, whose text lacks the path, if it is missing or too long."""
     try:
         if not path.is_file():
             other = "is no file, but a directory or a device; name a file" if path.exists() else ""
@@ -120,7 +120,7 @@ def _at_most(place: TomlPlace) -> tuple[str, ...]:
 def _family(
     document: Mapping[str, Any], path: Path, place: TomlPlace, files: dict[Path, bytes]
 ) -> type[Drive] | None:
-    """Return the class; None if the file has an error."""
+    """Return the class that the document declares; None if it has a mistake."""
     if "line" in document:
         place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE")
         return None
@@ -170,7 +170,7 @@ def _family(
 
 
 def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
-    """Return the class whose verbs the family inherits: a profile, a built-in family, or Drive."""
+    """Return the base class whose verbs the family inherits: a profile, a built-in family, or Drive."""
     if "profile" in given and "extends" in given:
         place.wrong("has profile and extends; name one of them")
     for key in ("profile", "extends"):
@@ -187,7 +187,7 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
 def _bases(key: str) -> Mapping[str, type[Drive]]:
     if key == "extends":
         return MODELS
-    from multidrop.families.profiles import PROFILES  # few files name one
+    from multidrop.families.profiles import PROFILES  # imported here, because few files use a profile
 
     return PROFILES
 
@@ -238,7 +238,7 @@ def _named_bytes(table: Path) -> bytes:
 def _made(
     base: type[Drive], namespace: dict[str, Any], declared: Declared, place: TomlPlace
 ) -> type[Drive] | None:
-    """Return the class of this namespace; None if the file has an error."""
+    """Create the class with this namespace and return it; None if a declaration is wrong."""
     broken = declared.places.keys() - declared.registers.keys()
     if place.config_errors:
         bounds = {*namespace["options"], *broken}
@@ -255,7 +255,7 @@ def _made(
 
 
 def _report(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
-    """Report mistakes of declarations at the places of their registers."""
+    """Add mistakes in declarations to `place`, each at the place of its register in the file."""
     for mistake in mistakes:
         name, _, sentence = mistake.partition(": ")
         if name in declared.places:

@@ -1,4 +1,4 @@
-"""Addresses and CSV cells as manuals write them: 0x2000, 8192, "2000H", "40001", 0.1 and off=0 | on=1."""
+"""Parse addresses and CSV cells as manuals write them: 0x2000, 8192, "2000H", "40001", 0.1, off=0 | on=1."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ LAST_ADDRESS = 0xFFFF
 _HEX = re.compile(r"0[xX]([0-9a-fA-F]{1,8})|([0-9a-fA-F]{1,8})[hH]")
 _NUMBERED = re.compile(
     r"[0134](\d{4}|\d{5})", re.ASCII
-)  # 40001 or 400001: a table's digit, and a number from 1
+)  # as 40001 or 400001: the table's digit, then a number from 1
 _EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Counting:
-    """The manual's number for address 0 on the wire; None if the file does not state it.
+    """Converts a manual's addresses, given its number for the wire's address 0 (None: not stated).
 
-    `assumed` lists the numbers for which 0 was assumed, so that their other errors are found.
+    `assumed` lists the addresses for which 0 was assumed, so that other mistakes can still be found.
     """
 
     counts_from: int | None
     assumed: list[int | str] = field(default_factory=list)
 
     def address(self, given: Any, table: str | None, default: str) -> tuple[int, str]:
-        """Return the address on the wire, and the table's name, for a TOML value.
+        """Return the address as sent, and the table's name, for a TOML value.
 
-        `table` is the register's own table, `default` the table without one. Raises ValueError with a valid
-        example.
+        `table` is the table that the register states, `default` the table if it states none. Raises
+        ValueError whose text has a valid example.
         """
         if isinstance(given, bool) or not isinstance(given, (int, str)):
             raise ValueError(f'{given!r} is not an address; write 0x2000, 8192, "2000H" or "40001"')
@@ -51,9 +51,10 @@ class Counting:
         raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Return the same for a cell of a CSV file, in which a number such as 40001 has no quotes.
+        """Return the same for a CSV cell, where a number such as 40001 has no quotes.
 
-        If the file states `counts_from`, it is a plain number, unless its first digit is its table's.
+        If the file states `counts_from`, such a number is a plain address, unless its first digit is that
+        of its table.
         """
         text = text.strip()
         if text.isascii() and text.isdecimal():
@@ -85,7 +86,7 @@ class Counting:
 
 
 def sent_as(address: int, table: str) -> str:
-    """Return the TOML for an address on the wire, with `counts_from = 0`."""
+    """Return the TOML text of an address as sent, for a file with `counts_from = 0`."""
     is_plain = not _NUMBERED.fullmatch(str(address)) or _TABLE_OF_DIGIT[str(address)[0]] != table
     return f"0x{address:04X}" if is_plain else f'"{address:X}H"'
 
@@ -123,7 +124,7 @@ def text(cell: str) -> str:
 
 
 def number(cell: str) -> int | float:
-    """Return a number with a point, or in hex. Raises ValueError with a valid example."""
+    """Parse a decimal or hex number. Raises ValueError whose text has a valid example."""
     if match := _HEX_COUNT.fullmatch(cell):
         return int(match[1] or match[2], 16)
     if _WHOLE.fullmatch(cell) and len(cell) <= 20:
@@ -136,17 +137,17 @@ def number(cell: str) -> int | float:
 
 
 def number_or_word(cell: str) -> int | float | str:
-    """Return a number, or a word such as unknown or NaN as it is."""
+    """Parse a number; return a word such as unknown or NaN unchanged."""
     return cell if cell.isalpha() else number(cell)
 
 
 def numbers(cell: str) -> list[int | float | str]:
-    """Return the numbers between bars: "0 | 50"."""
+    """Parse numbers separated by bars: "0 | 50"."""
     return [number_or_word(part.strip()) for part in cell.split("|")]
 
 
 def whole(cell: str) -> int:
-    """Return a whole number; refuse 1E10, which may have been hex before a spreadsheet changed it."""
+    """Parse a whole number; 1E10 is refused, because a spreadsheet may have made it of a hex number."""
     if _NUMBER.fullmatch(cell) and not _WHOLE.fullmatch(cell):
         right = f"0x{cell}" if cell.isalnum() else "it as 10 or 0x7FFF"
         raise ValueError(f"{cell!r} is not a whole number; write {right}")
@@ -157,12 +158,12 @@ def whole(cell: str) -> int:
 
 
 def counts(cell: str) -> list[int]:
-    """Return the raw counts between bars: "0x0476 | 0x0474"."""
+    """Parse raw counts separated by bars: "0x0476 | 0x0474"."""
     return [whole(part.strip()) for part in cell.split("|")]
 
 
 def named(cell: str) -> dict[str, Any]:
-    """Return the numbers by name in "off=0 | on=1". Raises ValueError with a valid example."""
+    """Parse "off=0 | on=1" into numbers by name. Raises ValueError whose text has a valid example."""
     found: dict[str, Any] = {}
     for part in cell.split("|"):
         name, equals, given = (piece.strip() for piece in part.partition("="))

@@ -1,4 +1,4 @@
-"""Registers of a family file: their keys in TOML and CSV, and the declarations made from them."""
+"""Parse the registers of a family file, in TOML and CSV, and declare them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "na
 
 
 def unusable(name: str) -> str:
-    """Return why a name cannot be a Python attribute, and suggest a valid name; "" if it can."""
+    """Return why a name cannot be a Python attribute, with a valid suggestion; "" if it can."""
     if len(name) > LONGEST_NAME:
         return f"it has more than {LONGEST_NAME} characters; give it a shorter one"
     if keyword.iskeyword(name):
@@ -51,14 +51,14 @@ def unusable(name: str) -> str:
 
 
 def enumeration(owner: str, given: Mapping[str, Any]) -> type[IntEnum]:
-    """Return the enumeration of a register's values. Raises ValueError with all that is wrong with it."""
+    """Return the enumeration of a register's values. Raises ValueError that lists all mistakes."""
     _check("values", given, MOST_VALUES, range(-(1 << 63), 1 << 64), "a whole number")
     make: Any = IntEnum
     return cast(type[IntEnum], make(owner, given))
 
 
 def flags(owner: str, given: Mapping[str, Any]) -> type[IntFlag]:
-    """Return the flags of a register from its bit numbers. Raises ValueError with all mistakes in them."""
+    """Return a register's flags, given as bit numbers by name. Raises ValueError that lists all mistakes."""
     _check("bits", given, MOST_BITS, range(MOST_BITS), f"a bit's number, 0 to {MOST_BITS - 1}")
     make: Any = IntFlag
     return cast(type[IntFlag], make(owner, {name: 1 << bit for name, bit in given.items()}))
@@ -94,7 +94,7 @@ def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, rig
 
 
 LONGEST_TEXT = 1000
-MOST_LISTED = 100  # raw counts of one key
+MOST_LISTED = 100  # limit of raw counts listed in one key
 NOT_STATED = "unknown"
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA", "AB", "BA")
 WRITES = ("single", "multiple")
@@ -104,7 +104,7 @@ _KEPT = {"ram": Kept.RAM, "eeprom": Kept.EEPROM, NOT_STATED: Kept.UNKNOWN}
 
 @dataclass(frozen=True)
 class RegisterKey:
-    """One key: `convert` raises ValueError for an invalid value; `example` is a valid one."""
+    """One key of a register: `convert` raises ValueError for an invalid value; `example` is a valid one."""
 
     convert: Callable[[Any], Any]
     example: str
@@ -235,7 +235,7 @@ DEFAULT_KEYS = ("table", "unit", "step", "number_format", "order", "invalid", "w
 
 
 def converted(key: str, value: Any) -> Any:
-    """Return the converted value of a key. Raises ValueError with the error and a valid example."""
+    """Convert the value of a key. Raises ValueError whose text has the mistake and a valid example."""
     try:
         return REGISTER_KEYS[key].convert(value)
     except ValueError as mistake:
@@ -243,7 +243,7 @@ def converted(key: str, value: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """Return a value for an error sentence."""
+    """Return a value as text for an error sentence."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -255,14 +255,14 @@ _DECLARE: Mapping[Access, Callable[..., Register[Any]]] = {
     Access.SETTING: setting,
     Access.COMMAND: command,
 }
-_WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")  # defaults that a bit does not take
+_WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")  # defaults that do not apply to a bit
 
 ReadAddress = Callable[[Any, str | None, str], tuple[int, str]]
 
 
 @dataclass
 class Declared:
-    """The registers of a file declared so far, and the place of each name."""
+    """The registers declared so far, and each name's place in the file."""
 
     counting: Counting
     defaults: Mapping[str, Any]
@@ -271,7 +271,7 @@ class Declared:
     places: dict[str, TomlPlace] = field(default_factory=dict)
 
     def section(self, access: Access, table: Any, place: TomlPlace) -> None:
-        """Declare the registers of [reading], [setting] or [command]."""
+        """Declare the registers in a [reading], [setting] or [command] section."""
         if not isinstance(table, dict):
             place.wrong(f"[{access.value}] is no table; write [{access.value}] and NAME = {{ at = 0x0010 }}")
             return
@@ -286,7 +286,7 @@ class Declared:
     def add(
         self, name: str, access: Access, given: Mapping[str, Any], place: TomlPlace, read: ReadAddress
     ) -> None:
-        """Declare one register; `read` parses its addresses."""
+        """Declare one register; `read` is the function that parses its addresses."""
         known = self._reserve(name, place)
         good = self._converted(given, place)
         address = self._addresses(given, good, place, read)
@@ -302,11 +302,11 @@ class Declared:
             self.registers[name] = register
 
     def _reserve(self, name: str, place: TomlPlace) -> bool:
-        """Record the name's place; return False if it cannot be used."""
+        """Record the place of a name; return False if the name is invalid or taken."""
         if why := unusable(name):
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
             return False
-        if name in TAKEN_NAMES:  # a verb of the file would take its place without a word
+        if name in TAKEN_NAMES:  # a verb of the file would silently replace it
             place.wrong("reserved name; every drive has it for something else; rename the register")
             return False
         if name in self.places:
@@ -335,7 +335,7 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the address on the wire and the table; `good` gets its ram_address."""
+        """Return the address as sent and the table, or None after a mistake; add ram_address to `good`."""
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None
@@ -377,7 +377,7 @@ class Declared:
         space = TABLES[table]
         defaults = {key: value for key, value in self.defaults.items() if key not in NOT_DETAILS}
         if "number_format" in good:
-            defaults.pop("invalid", None)  # which are counts of the default format
+            defaults.pop("invalid", None)  # these counts are in the default number format
         if space.carrier is Carrier.BIT:
             defaults = {key: value for key, value in defaults.items() if key not in _WITHOUT_BITS}
         if access is Access.READING:
@@ -393,7 +393,7 @@ def _made(access: Access, address: int, what: Any, details: dict[str, Any]) -> R
 
 
 def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
-    """Return the defaults of registers."""
+    """Return the valid keys of a [default] section."""
     if not isinstance(table, dict):
         place.wrong('is no table; write [default] and table = "input"')
         return {}
@@ -411,13 +411,13 @@ def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
 
 MOST_BYTES = 2_000_000
 _DELIMITERS = (",", ";", "\t")
-_OWN_COLUMNS = ("name", "access")  # of a CSV file, besides the keys of a register
+_OWN_COLUMNS = ("name", "access")  # columns of a CSV file besides the keys of a register
 COLUMNS = dict.fromkeys((*_OWN_COLUMNS, *REGISTER_KEYS))
 NEEDED = ("name", "at")
 
 
 def declare_rows(data: bytes, declared: Declared, place: TomlPlace) -> None:
-    """Declare the registers of a CSV file's bytes; every mistake has its line and column."""
+    """Declare the registers in a CSV file's contents; mistakes are reported with line and column."""
     text = _decoded(data, place)
     if text is None:
         return
@@ -452,7 +452,7 @@ def _decoded(data: bytes, place: TomlPlace) -> str | None:
 
 
 def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
-    """Yield each non-empty line with its number."""
+    """Yield number and cells of each non-empty line."""
     first = text.lstrip("\r\n").splitlines()[:1]
     delimiter = max(_DELIMITERS, key=first[0].count) if first else ","
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
@@ -466,9 +466,9 @@ def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
-    """Return the columns' names; None if any is wrong."""
+    """Return the names of the columns; None if one is invalid."""
     columns = [name.lower().replace(" ", "_") for name in header]
-    while columns and not columns[-1]:  # of a spreadsheet with an empty column
+    while columns and not columns[-1]:  # trailing empty columns, as spreadsheets write them
         columns.pop()
     before = len(place.config_errors)
     meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
@@ -508,12 +508,12 @@ def _declare(columns: list[str], row: list[str], declared: Declared, place: Toml
 
 
 def beside(path: Path, name: Any) -> Path:
-    """Return the path of a CSV file beside the family's. Raises ValueError for any other place."""
+    """Return the path of a CSV file in the family file's folder. Raises ValueError if it is elsewhere."""
     if not isinstance(name, str) or not name.lower().endswith((".csv", ".tsv")):
         raise ValueError(
             f'registers has {shown(name)}, which is no CSV file; write registers = ["meter.csv"]'
         )
-    place = PureWindowsPath(name)  # which knows the roots of all systems, and both separators
+    place = PureWindowsPath(name)  # recognises drive letters, roots and both separators on every system
     if place.anchor or ".." in place.parts or not name.isprintable():
         raise ValueError(f"registers has {shown(name)}; a CSV file is beside the family's, or below it")
     return path.parent / name

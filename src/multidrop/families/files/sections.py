@@ -1,4 +1,4 @@
-"""Sections of a family file besides its registers: [family], [option], [text], [parameters], [[identify]]."""
+"""Parse the other sections of a family file: [family], [option], [text], [parameters], [[identify]]."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": 
 _TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
 MOST_TOGETHER = {name: STANDARD_LIMITS[table.carrier] for name, table in TABLES.items()}
-LONGEST_WAIT = 10.0  # s; a stop of any drive on the line may have to wait for it
+LONGEST_WAIT = 10.0  # s; limit of waits, because a stop of another drive may have to wait as long
 _LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
 
 
 def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return the attributes of the class; add an error for each wrong value."""
+    """Return class attributes from the [family] section; report each wrong value at `place`."""
     facts: dict[str, Any] = {_TEXTS[key]: given[key] for key in _TEXTS if key in given}
     for key in _DURATIONS:
         seconds = duration_of(given, key, place)
@@ -119,7 +119,7 @@ def _formats(value: Any) -> Any:
 
 
 def _by_framing(formats: Any, framings: tuple[Framing, ...], place: TomlPlace) -> dict[Framing, Any]:
-    """Return the formats of each framing; an RTU frame has characters of 8 bits."""
+    """Return the character formats of each framing; RTU needs 8 data bits."""
     found = dict.fromkeys(framings, formats)
     if isinstance(formats, dict):
         named = {str(framing): framing for framing in framings}
@@ -174,7 +174,7 @@ _MAKERS: Mapping[str, Callable[[Any], Any]] = {
 
 
 def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return, for each table, how many registers one read may have, and which gaps it may include."""
+    """Return by table how many registers one read may have, and which gaps a read may span."""
     most: dict[Table, int] = {}
     gaps: dict[Table, range] = {}
     for key in ("together", "gaps"):
@@ -218,7 +218,7 @@ _NOT_OPTIONS = frozenset(
 
 
 def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict[str, Option]:
-    """Return the options of this table; its mistakes are reported at `place`."""
+    """Return the options declared in the [option] section; report mistakes at `place`."""
     if not isinstance(table, dict):
         place.wrong("[option] is no table; write [option] and NAME = { unit, span, meaning }")
         return {}
@@ -257,7 +257,7 @@ TEXT_KEYS = {
 def texts_of(
     section: Any, counting: Counting, registers: Mapping[str, TomlPlace], place: TomlPlace
 ) -> dict[str, Text]:
-    """Return the texts of [text] by name; each mistake is a sentence."""
+    """Return the texts declared in the [text] section, by name; report mistakes at `place`."""
     if not isinstance(section, dict):
         place.wrong("[text] is no table; write [text] and NAME = { at = 0xFC00, length = 8 }")
         return {}
@@ -315,7 +315,7 @@ GROUP_KEYS = {
 def parameter_space_of(
     section: Any, counting: Counting, registers: Collection[str], place: TomlPlace
 ) -> ParameterSpace | None:
-    """Return the rule for parameters' addresses that [parameters] declares; None if it has a mistake."""
+    """Return the address rule declared in the [parameters] section; None if it has a mistake."""
     at = place.within("[parameters]")
     good = at.check(section, PARAMETER_KEYS)
     groups = [_group(table, counting, within) for table, within in at.inside("group", good.get("groups", []))]
@@ -365,16 +365,16 @@ PROOF_KEYS = {
 
 @dataclass(frozen=True)
 class Proof:
-    """A register, and the values (numbers or a range) that it has in every drive of the family."""
+    """A register whose value identifies the family: it has one of these values, or lies in this range."""
 
     register: str
-    values: tuple[float, ...]  # empty: any value in the range
+    values: tuple[float, ...]  # accepted values; empty: any value in the range
     above: float
     below: float
 
     @property
     def example(self) -> float:
-        """One of the values that prove the family, for use by a simulated drive."""
+        """One of the accepted values, used by simulated drives."""
         if self.values:
             return self.values[0]
         ends = [end for end in (self.above, self.below) if abs(end) < inf]
@@ -385,7 +385,7 @@ class Proof:
 
 
 def proofs_of(section: Any, registers: Mapping[str, Register[Any]], place: TomlPlace) -> tuple[Proof, ...]:
-    """Return the proofs that [[identify]] declares, without those that have a mistake."""
+    """Return the proofs declared in [[identify]] tables, except those with a mistake."""
     tables = section if isinstance(section, list) else [section]
     if len(tables) > MOST_PROOFS:
         place.wrong(f"[[identify]] has {len(tables)} tables, at most {MOST_PROOFS} are allowed")
@@ -412,11 +412,11 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
 
 
 def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
-    """Return the method `identify` of a drive that has these proofs."""
+    """Return an `identify` method that checks these proofs."""
 
     @verb
     def identify(self: Drive) -> Script[None]:
-        """Check that the registers of [[identify]] have their values; raise WriteForbidden if one has not."""
+        """Check the values of the registers in [[identify]]; raise WriteForbidden if one differs."""
         for proof in proofs:
             register = self.register(proof.register)
             value = yield from read(register)

@@ -1,4 +1,4 @@
-"""CiA 402 (IEC 61800-7-201): the control word of Schneider's Altivar, Lenze's i500 and others."""
+"""The CiA 402 profile (IEC 61800-7-201), used by Schneider's Altivar, Lenze's i500 and others."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from multidrop.drive.script import Script, insist, until
 from multidrop.drive.state import Condition, Direction
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
-READY_TIME = 1.0  # s, for each step up to "switched on"
+READY_TIME = 1.0  # s allowed for each step up to "switched on"
 
 
 class CiA402Control(IntFlag):
-    """6040H: bits 0 to 3 and 7 are the standard's; all others are each make's own."""
+    """The control word, 6040H. Bits 0 to 3 and 7 are those of the standard; each make defines the others."""
 
     SWITCH_ON = 1 << 0
     ENABLE_VOLTAGE = 1 << 1
     NO_QUICK_STOP = 1 << 2
     ENABLE_OPERATION = 1 << 3
-    RESET = 1 << 7  # from 0 to 1
+    RESET = 1 << 7  # acts on a change from 0 to 1
 
 
 class CiA402Status(IntFlag):
-    """6041H: bits 0 to 7, 9 and 10 are the standard's."""
+    """The status word, 6041H. Bits 0 to 7, 9 and 10 are those of the standard."""
 
     READY_TO_SWITCH_ON = 1 << 0
     SWITCHED_ON = 1 << 1
@@ -47,22 +47,22 @@ class CiA402Status(IntFlag):
 
 
 DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE, RESET = 0x0000, 0x0006, 0x0007, 0x000F, 0x0087
-MASK, SHORT_MASK = 0x6F, 0x4F  # the bits of the state; without the quick stop's
-NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08  # under the short mask
-READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07  # under the mask
+MASK, SHORT_MASK = 0x6F, 0x4F  # masks of the state bits: with and without the quick stop bit
+NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08  # states, with SHORT_MASK
+READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07  # states, with MASK
 _UP = ((SHUTDOWN, READY, "ready to be switched on"), (SWITCH_ON, SWITCHED_ON, "switched on"))
 
 
 class CiA402(Profile):
-    """The state machine of CiA 402: 6, 7, 15 start; 7 stops along the ramp; 0 coasts; bit 7 resets.
+    """CiA 402: the words 6, 7, 15 start the motor, 7 stops it along the ramp, 0 lets it coast; bit 7 resets.
 
-    - The stop is "disable operation", 0007H, whose factory setting is the ramp, and which never starts: a
-      drive that is ready to be switched on is switched on by it and stands. "Shutdown", 0006H, coasts or
-      ramps by each drive's setting.
-    - The reset is 0080H with 0007H; without bit 3 it does not enable operation.
+    - The stop is "disable operation", 0007H. With factory settings it ramps down. It never starts the motor:
+      a drive that is ready to be switched on is only switched on by it. "Shutdown", 0006H, coasts or ramps,
+      depending on a setting.
+    - The reset is 0087H: bit 7 and the stop word. Without bit 3 it does not enable operation.
     - The standard has no direction for frequency drives. A family may declare a bit of its own,
       `bits = { reverse = 11 }`; without it a direction is refused.
-    - The remote bit 9 must be set, which says that the drive takes the word from the line.
+    - The remote bit 9 of the status must be set: it means that the drive obeys the line.
     """
 
     stop_word: ClassVar[int] = SWITCH_ON

@@ -12,9 +12,9 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class DanfossControl(IntFlag):
-    """CTW: FC 300 design guide MG.33.B6, p. 277; FC 51 operating instructions p. 29, coils 1 to 16."""
+    """The control word CTW (FC 300 design guide MG.33.B6, p. 277; FC 51 manual p. 29, coils 1 to 16)."""
 
-    RAMP = 1 << 2  # 0 brakes by direct current
+    RAMP = 1 << 2  # 0 brakes with direct current
     NO_COAST = 1 << 3
     NO_QUICK_STOP = 1 << 4
     NO_FREEZE = 1 << 5
@@ -25,18 +25,18 @@ class DanfossControl(IntFlag):
 
 
 class DanfossStatus(IntFlag):
-    """STW: FC profile of the MCA 121 instructions, p. 24; FC 51 p. 29, FC 101 guide table 7.16."""
+    """The status word STW (MCA 121 instructions, FC profile, p. 24; FC 51 p. 29; FC 101 guide table 7.16)."""
 
     CONTROL_READY = 1 << 0
     DRIVE_READY = 1 << 1
-    NOT_COASTING = 1 << 2  # "safety closed" on an FC 101
+    NOT_COASTING = 1 << 2  # means "safety closed" on an FC 101
     TRIPPED = 1 << 3
     ERROR = 1 << 4
     BIT_5 = 1 << 5
     TRIP_LOCKED = 1 << 6  # not used on an FC 101
     WARNING = 1 << 7
     AT_REFERENCE = 1 << 8
-    BY_LINE = 1 << 9  # auto, and not hand
+    BY_LINE = 1 << 9  # 1 in auto mode, 0 in hand mode
     IN_RANGE = 1 << 10
     RUNNING = 1 << 11
     BIT_12 = 1 << 12
@@ -49,10 +49,10 @@ STOP, COAST, RESET, START = 0x043C, 0x0434, 0x04BC, 0x047C
 
 
 class DanfossFC(Profile):
-    """Danfoss FC profile: bit 6 runs while it is 1, bit 15 is the direction, bit 7 resets on its rising edge.
+    """Danfoss FC profile: the motor runs while bit 6 is 1; bit 15 reverses; a rising bit 7 resets.
 
-    - Bit 6 acts by its level: a drive that is reset while it holds the bit starts at once. So a stop is
-      confirmed before a reset, and no word has both.
+    - Bit 6 acts by its level: a drive that is reset while bit 6 is set starts immediately. So a stop is
+      confirmed before a reset, and no word has both bits.
     - A locked trip ends only when the mains are switched off (VT2800 guide, p. 115): the reset is refused.
     - The status shows no direction. A start without one goes forward from rest, and is refused while the
       motor turns. Bit 15 counts only if 8-54 lets the line reverse.

@@ -1,4 +1,4 @@
-"""Delta's words at 2000H, 2002H, 2100H and 2101H, which several makes have copied."""
+"""Delta's control and status words at 2000H, 2002H, 2100H and 2101H, which several makes have copied."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import verb
 from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
-STOPPED, STOPPING, STANDBY, RUNNING = range(4)  # bits 1 and 0 of the status
-FORWARD, TO_FORWARD, TO_REVERSE, REVERSE = range(4)  # bits 4 and 3
+STOPPED, STOPPING, STANDBY, RUNNING = range(4)  # values of bits 1 and 0 of the status
+FORWARD, TO_FORWARD, TO_REVERSE, REVERSE = range(4)  # values of bits 4 and 3 of the status
 
 
 class DeltaControl(IntEnum):
-    """2000H: CP2000 manual p. 12.1-09-8, MS300 p. 788. Run and jog have a direction, never the toggle."""
+    """Control words at 2000H (CP2000 manual p. 12.1-09-8, MS300 p. 788); the direction toggle is not used."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -27,14 +27,14 @@ class DeltaControl(IntEnum):
 
 
 class DeltaReset(IntEnum):
-    """2002H: bit 1 clears a fault (MS300 manual p. 789). Bits 0 and 2, a fault and a block, are never set."""
+    """2002H: bit 1 resets a fault (MS300 manual p. 789). Bits 0 (fault) and 2 (base block) are never set."""
 
     NOTHING = 0
     RESET = 2
 
 
 class DeltaStatus(IntFlag):
-    """2101H: MS300 manual p. 790, VFD-EL-W p. 4-83 and 4-84."""
+    """The status word at 2101H (MS300 manual p. 790, VFD-EL-W p. 4-83 and 4-84)."""
 
     RUN_LAMP_0 = 1 << 0
     RUN_LAMP_1 = 1 << 1
@@ -58,14 +58,14 @@ MODES = range(5)  # bits 15 to 13: reserved, or a C2000 Plus's HOA and LOC/REM m
 
 
 class Delta(Profile):
-    """Delta's words: 1 stops, 12H and 22H run forward and in reverse, and a register of its own resets.
+    """Delta's words: 1 stops, 12H runs forward, 22H in reverse; a separate register resets faults.
 
-    - `fault` is needed: the status shows no fault. Its low byte counts; the high byte of newer drives is a
-      warning.
+    - The role `fault` is required, because the status shows no fault. Only its low byte is used; the high
+      byte of newer drives is a warning.
     - The direction is sent with every run. The word that toggles it is never sent.
-    - 2002H holds its bits. It is written 2 once and 0 again, or a later fault would reset itself. Bit 2, the
-      base block, lets the motor continue when it is cleared: a stop comes before.
-    - Bit 10 of the status says that the drive takes its commands from the line; a start needs it.
+    - 2002H keeps its bits. It is written 2 once and then 0, or else a later fault would be reset immediately.
+      Clearing bit 2, the base block, lets the motor continue, so a stop is sent before.
+    - Bit 10 of the status says that the drive takes its commands from the line; a start requires it.
     - No word coasts.
     """
 
@@ -108,7 +108,7 @@ class Delta(Profile):
         return Direction.REVERSE if shown in (TO_REVERSE, REVERSE) else Direction.FORWARD
 
     def _turns_in(self, direction: Direction) -> Script[bool]:
-        """Return True if the motor turns in this direction and is not still changing to it."""
+        """Return True if the motor turns in this direction, and the change to it is complete."""
         shown = (yield from self._status()) >> 3 & 3
         return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
 

@@ -1,4 +1,4 @@
-"""INVT's words 1, 2, 5, 7, which several makes have copied; Inovance and others have 5 and 6 exchanged."""
+"""INVT's control words 1 to 8, which several makes have copied, some with 5 and 6 exchanged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 
 class InvtControl(IntEnum):
-    """Goodrive100 manual p. 167, Goodrive350 p. 326: 2000H. The CHE has it at 1000H."""
+    """Control words at 2000H (Goodrive100 manual p. 167, Goodrive350 p. 326); a CHE has them at 1000H."""
 
     FORWARD = 1
     REVERSE = 2
@@ -29,7 +29,7 @@ class InvtControl(IntEnum):
 
 
 class InvtStatus(IntEnum):
-    """Goodrive300 manual: 2100H."""
+    """Values of the status at 2100H (Goodrive300 manual)."""
 
     FORWARD = 1
     REVERSE = 2
@@ -45,7 +45,7 @@ _DIRECTIONS: Mapping[int, Direction] = {
 
 
 class Invt(Profile):
-    """INVT's words: one number each for forward, reverse, jog, stop, coast and reset.
+    """INVT's words: a number for each of forward, reverse, jog, stop, coast and reset.
 
     - Other makes have copied the words with 5 and 6 exchanged (both stop), and some with 5 for reverse. Such
       a family names its own numbers in `control`: `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A
@@ -68,7 +68,7 @@ class Invt(Profile):
         "status": Role((Access.READING,), values=InvtStatus),
     }
 
-    _jogged = False  # whether this object has sent a jog since the motor was last seen to stand
+    _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
 
     def _impossible(self, status: int) -> str:
         return "" if status in tuple(cast(Any, self.status.values)) else "the profile has no such number"
@@ -124,25 +124,25 @@ class Invt(Profile):
         try:
             yield from self._send_stop(word)
             may_jog = self._turns((yield from self._status()))
-        except WriteForbidden:  # another drive is there
+        except WriteForbidden:  # the drive is of another family
             raise
-        except BusError:  # a silent drive may still hear, and jog
+        except BusError:  # a drive that does not reply may still receive, and jog
             if self._has(InvtControl.STOP_JOG):
                 with suppress(BusError):
                     yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
             raise
         if may_jog and self._has(InvtControl.STOP_JOG):
-            with suppress(DriveException):  # as without a jog
+            with suppress(DriveException):  # some drives refuse it without a jog
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG))
         yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
-        """Leave the reset in the control register: the drive acts on a word once."""
+        """Do nothing: the drive acts on a word only once, so the reset may stay in the register."""
         yield from ()
 
 
 class InovanceControl(IntEnum):
-    """2000H: Powtran PI130 manual p. 122 and Inovance MD500 manual p. 703. 5 and 6 are not INVT's."""
+    """Control words at 2000H (Powtran PI130 manual p. 122, Inovance MD500 p. 703): 5 coasts, 6 stops."""
 
     FORWARD = 1
     REVERSE = 2
@@ -155,7 +155,7 @@ class InovanceControl(IntEnum):
 
 
 class InovanceStatus(IntEnum):
-    """3000H: Powtran PI130 manual p. 122. A Delixi E also has 0, "none" (B000H), which is not accepted."""
+    """The status at 3000H (PI130 manual p. 122). The 0, "none", of a Delixi E (at B000H) is refused."""
 
     FORWARD = 1
     REVERSE = 2
@@ -165,7 +165,7 @@ class InovanceStatus(IntEnum):
 class Inovance(Invt):
     """The words of Inovance MD, Powtran PI and their copies: 5 coasts, 6 stops along the ramp.
 
-    - `fault` is needed: the status does not show a fault. Any value except 0 is a fault.
+    - The role `fault` is required, because the status shows no fault. Any value except 0 is a fault.
     - The status is 1 forward, 2 reverse or 3 stopped. With any other number the state is unknown.
     - A family may give its own numbers in `control`, as in the profile `invt`. A word that it leaves out is
       never sent.
@@ -187,12 +187,12 @@ class Inovance(Invt):
         return bool((yield from read(self.register("fault"))) != 0)
 
     def _is_tripped(self, status: int) -> bool:
-        return False  # the status does not show it
+        return False  # the status shows no fault
 
     def _turns(self, status: int) -> bool:
         return status != InovanceStatus.STOPPED
 
     @property
     def identity_is_weak(self) -> bool:
-        """True: its stop runs makes with Delta's words, which may not answer to its registers."""
+        """True, because its stop word runs makes with Delta's words, which may not reply to its reads."""
         return True

@@ -1,4 +1,4 @@
-"""Invertek Optidrive E3: a control word whose bits act one by one, sold under other names too."""
+"""The control word of Invertek's Optidrive E3, which is also sold under other names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class OptidriveControl(IntFlag):
-    """Register 1: ODE-3 user guide 1.00, p. 33. The Optidrive Plus has bits 1 and 2 exchanged."""
+    """The control word, register 1 (ODE-3 user guide 1.00, p. 33). An Optidrive Plus swaps bits 1 and 2."""
 
     RUN = 1 << 0
     RESET = 1 << 2
@@ -21,7 +21,7 @@ class OptidriveControl(IntFlag):
 
 
 class OptidriveStatus(IntFlag):
-    """Register 6, low byte: E3 advanced technical manual, issue 05, p. 35; E3 IP66 guide 1.25, p. 48."""
+    """The status, low byte of register 6 (E3 advanced manual, issue 05, p. 35; E3 IP66 guide 1.25, p. 48)."""
 
     RUNNING = 1 << 0
     TRIPPED = 1 << 1
@@ -46,13 +46,13 @@ STOP, COAST, RESET, START = 0x0000, 0x0008, 0x0004, 0x0001
 
 
 class Optidrive(Profile):
-    """Invertek's control word of the Optidrive E3: bit 0 runs while it is 1, bit 2 resets, bit 3 coasts.
+    """Optidrive E3: the motor runs while bit 0 of the control word is 1; bit 2 resets, bit 3 coasts.
 
     - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp. Bit 1 is never sent.
     - The first guide (1.00) prints the two bytes of register 6 in the opposite order to later guides. A start
       needs bit 6, ready, which such a drive never shows. A drive counts as stopped only if its output
       frequency is 0.
-    - No guide says whether the reset acts by its edge. So a stop is sent before it, and the bit is cleared.
+    - No guide says whether the reset bit acts on its edge, so a stop is sent first; the bit is cleared after.
     - The direction is the sign of the setpoint. No negative setpoint is written.
     """
 
@@ -77,7 +77,7 @@ class Optidrive(Profile):
         return bool(status & OptidriveStatus.TRIPPED)
 
     def _fault(self) -> Script[str]:
-        """Return the trip's code, of the high byte, which the family may name in a register `fault`."""
+        """Return the trip code in the status's high byte, named if the family has a register `fault`."""
         named = yield from super()._fault()
         return named or f"code {(yield from self._status()) >> 8}"
 

@@ -1,4 +1,4 @@
-"""PROFIdrive: the control word and the state machine of ABB's "ABB Drives" and of Siemens' SINAMICS."""
+"""The PROFIdrive profile, used by ABB (as "ABB Drives") and Siemens' SINAMICS."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from multidrop.drive.script import Script, insist, until, wait, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
-READY_TIME = 1.0  # s, in which it must be ready to be switched on
-BETWEEN = 0.1  # s, at least, between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
+READY_TIME = 1.0  # s within which the drive must become ready to switch on
+BETWEEN = 0.1  # least s between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
 
 
 class ProfidriveControl(IntFlag):
-    """STW1: ACS550 manual p. 209 and 240, ACS355 p. 319, SINAMICS G120C p. 195. The remote bit is 10."""
+    """The control word STW1 (ACS550 manual p. 209, 240; ACS355 p. 319; SINAMICS G120C p. 195)."""
 
-    ON = 1 << 0  # 0 is OFF1, a stop along the ramp
-    NO_OFF2 = 1 << 1  # 0 coasts
-    NO_OFF3 = 1 << 2  # 0 stops by the quick ramp
+    ON = 1 << 0  # 0 means OFF1, a stop along the ramp
+    NO_OFF2 = 1 << 1  # 0 means OFF2, coasting
+    NO_OFF3 = 1 << 2  # 0 means OFF3, a stop along the quick ramp
     ENABLE_OPERATION = 1 << 3
     ENABLE_RAMP = 1 << 4
     CONTINUE_RAMP = 1 << 5
@@ -30,7 +30,7 @@ class ProfidriveControl(IntFlag):
 
 
 class ProfidriveStatus(IntFlag):
-    """ZSW1: ACS355 manual p. 319, ACQ550 p. 242, SINAMICS G120C p. 235. Bits 10 to 15 are each make's own."""
+    """The status word ZSW1 (ACS355 p. 319, ACQ550 p. 242, G120C p. 235); each make defines bits 10 to 15."""
 
     READY_TO_SWITCH_ON = 1 << 0
     READY_TO_OPERATE = 1 << 1
@@ -51,11 +51,11 @@ class ProfidriveStatus(IntFlag):
 
 
 STOP, COAST, RESET, START = 0x047E, 0x047C, 0x04FE, 0x047F
-SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # neither enables operation: no motor turns at them
+SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # with neither does the motor turn: operation is not enabled
 
 
 class Profidrive(Profile):
-    """PROFIdrive's state machine: OFF1 is the stop, OFF2 coasts, bit 7 resets on its rising edge.
+    """PROFIdrive: OFF1 stops along the ramp, OFF2 coasts, a rising bit 7 resets.
 
     A start follows the ACS550's manual (p. 246): 0476H until the drive is ready to be switched on, 100 ms,
     0477H until it is ready to operate, 047FH. The last two are sent once each. A start is refused in local
@@ -98,7 +98,7 @@ class Profidrive(Profile):
 
     def _condition(self, status: int) -> Condition:
         if self._turns(status) and not status & ProfidriveStatus.READY_TO_OPERATE:
-            return Condition.DECELERATING  # OFF1
+            return Condition.DECELERATING  # OFF1 is in progress
         return super()._condition(status)
 
     def _not_ready(self, status: int) -> str:
@@ -134,7 +134,7 @@ class Profidrive(Profile):
         return bool((yield from self._status()) & ProfidriveStatus.READY_TO_OPERATE)
 
     def _hindrance(self, status: int) -> str:
-        """Return a text for the most serious reason why the drive cannot be switched on."""
+        """Return the most serious reason why the drive cannot be switched on, as text."""
         if not status & ProfidriveStatus.NO_OFF2:
             return "is not started: OFF2, which coasts, is active from elsewhere"
         if not status & ProfidriveStatus.NO_OFF3:

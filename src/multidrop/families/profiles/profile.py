@@ -1,4 +1,4 @@
-"""Profile: a state machine that many makes share; each family declares the registers for its roles."""
+"""Profile: a drive state machine that many makes share; a family declares the registers for its roles."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _CODED = "what the profile itself says; leave it out"
 
 @dataclass(frozen=True)
 class Role:
-    """One register of a state machine; `values` and `harmless` are the profile's, and no family's.
+    """One register of a profile's state machine; the profile, not the family, sets `values` and `harmless`.
 
-    `needed` is False for an optional register, without which the state machine does less. `extra` names bits
-    that a family may add to `values`, because makes differ in them.
+    `needed` is False if a family may omit the register. `extra` names bits that a family may add to `values`,
+    because makes differ in them.
     """
 
     access: tuple[Access, ...]
@@ -41,21 +41,21 @@ class Role:
     harmless: tuple[int, ...] | None = None
     never_together: tuple[int, ...] = ()
     moves: bool | None = None
-    units: tuple[str, ...] = ()  # empty: any
+    units: tuple[str, ...] = ()  # allowed units; empty: any
     extra: tuple[str, ...] = ()  # names of bits that a family may add
-    renumbered: tuple[str, ...] = ()  # the words that a family with numbers of its own needs
+    renumbered: tuple[str, ...] = ()  # words that a family with its own numbers must define
     needed: bool = True
 
     @property
     def is_word(self) -> bool:
-        """True if the register holds bits or words, not a quantity."""
+        """True if the register holds flags or named words, not a quantity."""
         return self.values is not None
 
 
 READING = Role((Access.READING,))
 OPTIONAL = Role((Access.READING,), needed=False)
-PROOFS = ("station", "signature")  # roles that only identify the family
-COMMON: Mapping[str, Role] = {  # of all profiles, besides `control` and `status`
+PROOFS = ("station", "signature")  # roles that serve only to identify the family
+COMMON: Mapping[str, Role] = {  # roles of all profiles, besides `control` and `status`
     "reference": Role((Access.SETTING, Access.COMMAND), moves=False, units=("Hz", "%")),
     "output_frequency": READING,
     "fault": OPTIONAL,
@@ -67,7 +67,7 @@ COMMON: Mapping[str, Role] = {  # of all profiles, besides `control` and `status
 def own_errors(
     name: str, register: Register[Any], roles: Mapping[str, Role], taken: Collection[str]
 ) -> Iterator[str]:
-    """Find errors in a family's register; `taken` are the reserved names of profiles."""
+    """Yield the errors in one register of a family; `taken` are names that profiles reserve."""
     if name in roles:
         yield from role_errors(name, roles[name], register)
     elif name in taken:
@@ -83,7 +83,7 @@ def own_errors(
 
 
 def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iterator[str]:
-    """Find roles that are missing, and those that do not fit each other."""
+    """Yield an error for each role that is missing or does not fit another role."""
     for name, role in roles.items():
         if role.needed and not isinstance(found[name], Register):
             yield f"{name}: this profile needs a register of this name, which is not declared"
@@ -96,7 +96,7 @@ def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iter
 
 
 def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
-    """Find facts of a role that the family must leave out or declare differently."""
+    """Yield an error for each fact of a role that the family must omit or declare differently."""
     if register.access not in role.access:
         wanted = " or a ".join(access.value for access in role.access)
         yield f"{name}: in this profile it is a {wanted}, and not a {register.access.value}"
@@ -145,7 +145,7 @@ def _extra_errors(name: str, role: Role, extra: type[Any]) -> Iterator[str]:
 
 
 def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[str]:
-    """Find errors in a family's own numbers for the profile's words."""
+    """Yield the errors in a family's own numbers for the profile's words."""
     assert role.values is not None
     known = [str(member.name).lower() for member in role.values]
     names = [name.lower() for name in values.__members__]
@@ -162,7 +162,7 @@ def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[st
 
 
 def completed(role: Role, register: Register[Any]) -> Register[Any]:
-    """Return the family's declaration, completed by the profile's facts of the role."""
+    """Return the family's declaration of a role, completed with the profile's facts."""
     facts: dict[str, Any] = {"moves": role.moves}
     harmless = role.harmless
     if role.renumbered and register.values is not None:
@@ -189,22 +189,22 @@ def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
     return cast(type[Any], kind(name, members))
 
 
-STOP_TIME = 60.0  # s; the deceleration ramp is a role of no profile
-RESET_TIME = 2.0  # s, after which a fault that was reset must be gone
+STOP_TIME = 60.0  # s; profiles have no role for the deceleration time
+RESET_TIME = 2.0  # s within which a reset fault must disappear
 
 
 class Profile(Drive):
-    """Base of the profiles: verbs over roles; a family derives from a profile and declares the roles.
+    """Base of the profiles: the verbs use roles; a family derives from a profile and declares the roles.
 
     A role is a register with a fixed name. The family says its address, table, unit, step, memory and place
     in the manual; the profile says its bits, and which of its counts are harmless. Every profile has these:
 
     - `control` (a command), `status` (a reading), `reference` (a setting, or a command if it cannot be
       read), in Hz, or in % of the option `maximum_frequency`; `output_frequency` (a reading);
-    - `fault` (a reading, not needed): shown by its names if it has any;
-    - `reference_in_force` (a reading, not needed): the setpoint as the drive shows it;
-    - `station` (a reading, not needed): a drive of the family has its own address there;
-    - `signature` (a reading of named values, not needed): each drive of the family has one of the values.
+    - `fault` (an optional reading): the fault code, shown by name if it has names;
+    - `reference_in_force` (an optional reading): the setpoint that the drive shows;
+    - `station` (an optional reading): the drive's own address;
+    - `signature` (an optional reading of named values): every drive of the family has one of these values.
 
     The verbs guarantee the same as those of the built-in families. A stop is always sent, repeated until it
     is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is
@@ -232,7 +232,7 @@ class Profile(Drive):
     output_frequency: ClassVar[Register[float]]
 
     def __init_subclass__(cls) -> None:
-        """Complete the roles with the profile's facts. Raises DeclarationError with all their mistakes."""
+        """Complete the roles with the profile's facts. Raises DeclarationError that lists all mistakes."""
         own = {name: register for name, register in vars(cls).items() if isinstance(register, Register)}
         if own and (wrong := cls.role_mistakes(own)):
             raise DeclarationError(cls.__name__, wrong)
@@ -246,7 +246,7 @@ class Profile(Drive):
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
-        """Return a sentence for each mistake in a family's registers, alone or combined with the profile."""
+        """Return a sentence for each mistake in a family's registers, alone or with the profile."""
         taken = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
         found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
         singly = (own_errors(name, one, cls.roles, taken) for name, one in own.items())
@@ -254,29 +254,29 @@ class Profile(Drive):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """Return the registers that are polled by default: not those that only identify the family."""
+        """Return the registers that are polled by default: all readings except those that only identify."""
         return tuple(one for one in super().readings() if one.name not in PROOFS)
 
     @property
     def identity_is_weak(self) -> bool:
-        """True without a `signature` and [[identify]]: a status or an address may coincide."""
+        """True if there is neither `signature` nor [[identify]]: status and address may match by chance."""
         return "signature" not in self.registers and not self.identity_proofs
 
-    # ---- for each profile ----
+    # ---- overridden by profiles ----
 
     def _impossible(self, status: int) -> str:
-        """Return why no drive of this profile can show this status; "" if one can."""
+        """Return why no drive of this profile can have this status; "" if the status is possible."""
         return ""
 
     def _is_tripped(self, status: int) -> bool:
         raise NotImplementedError
 
     def _turns(self, status: int) -> bool:
-        """Return True if the status says that the motor gets voltage."""
+        """Return True if the status shows that the motor has voltage."""
         raise NotImplementedError
 
     def _not_ready(self, status: int) -> str:
-        """Return why the drive cannot be started from the line; "" if it can."""
+        """Return why the drive cannot be started from the line; "" if it can be."""
         return ""
 
     def _cannot_reset(self, status: int) -> str:
@@ -284,7 +284,7 @@ class Profile(Drive):
         return ""
 
     def _direction(self, status: int) -> Direction | None:
-        """Return the direction that the status shows; None if it shows none."""
+        """Return the direction that the status shows; None if it does not show one."""
         return None
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
@@ -295,21 +295,21 @@ class Profile(Drive):
         yield from ()
 
     def _condition(self, status: int) -> Condition:
-        """Return the condition of a drive that has no fault, by its status alone."""
+        """Return the condition of a drive without a fault, from its status."""
         return Condition.RUNNING if self._turns(status) else Condition.STOPPED
 
-    # ---- readings ----
+    # ---- state ----
 
     def _status(self) -> Script[int]:
         return int((yield from read(self.status)))
 
     def _fault(self) -> Script[str]:
-        """Return the fault in words; "" if the family has no register for it."""
+        """Return the fault as text; "" if the family has no register for it."""
         register = self.registers.get("fault")
         return "" if register is None else register.format((yield from read(register)))
 
     def _tripped(self, status: int) -> Script[bool]:
-        """Return True if the drive has a fault; most show it in their status."""
+        """Return True if the drive has a fault; by default the status shows it."""
         return self._is_tripped(status)
         yield
 
@@ -339,7 +339,7 @@ class Profile(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that the status is one of this profile, and `station`, `signature` and [[identify]]."""
+        """Check that the status fits this profile, and that `station`, `signature` and [[identify]] match."""
         wrong: list[str] = []
         status = yield from self._status()
         if impossible := self._impossible(status):
@@ -366,7 +366,7 @@ class Profile(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        """Start at the setpoint in force. Without a direction: as the motor turns, or forward from rest."""
         status = yield from self._status()
         yield from self._may_start(status)
         word = self._start_word(direction, status)
@@ -377,27 +377,27 @@ class Profile(Drive):
         yield from self._started(direction)
 
     def _may_start(self, status: int) -> Script[None]:
-        """Raise WriteForbidden in a fault, in local control, and if the status prevents a start."""
+        """Raise WriteForbidden in a fault, in local control, or if the status prevents a start."""
         if (yield from self._tripped(status)):
             raise self._reset_first((yield from self._fault()))
         if why := self._not_ready(status):
             raise WriteForbidden(f"{self.name} {why}; {self.remote}")
 
     def _may_jog(self, status: int) -> Script[None]:
-        """Raise WriteForbidden as before a start, and while the motor turns: no manual defines a jog then."""
+        """Raise WriteForbidden as before a start, or if the motor turns: no manual defines a jog then."""
         yield from self._may_start(status)
         if self._turns(status):
             raise self._stop_first("turns, and may go on through a jog:")
 
     def _word(self, count: int, role: str = "control") -> Any:
-        """Return the value of a role for one of the profile's words."""
+        """Decode one of the profile's words to a value of the role's register."""
         values = self.register(role).values
         assert values is not None
         return values(count)
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp, until the status says so and the output frequency is 0."""
+        """Stop along the ramp; wait until the status shows a stop and the output frequency is 0."""
         yield from self._stop_by(self.stop_word)
 
     @verb
@@ -414,7 +414,7 @@ class Profile(Drive):
     def _send_stop(self, word: int) -> Script[None]:
         try:
             yield from insist(self.control, self._word(word))
-        except DriveException:  # as some do in a fault, when already at rest
+        except DriveException:  # some drives refuse it in a fault, when already at rest
             if not (yield from self._stands()):
                 raise
 
@@ -426,7 +426,7 @@ class Profile(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault after a stop; never starts the motor. It is sent once, then verified."""
+        """Reset a fault after a stop; never starts the motor. The reset is sent once, then verified."""
         status = yield from self._status()
         if not (yield from self._tripped(status)):
             if not (yield from self._stands()):
@@ -441,7 +441,7 @@ class Profile(Drive):
             raise NotVerified(self.name, "the fault reset", f"the fault remains: {fault}")
 
     def _pulse(self) -> Script[None]:
-        """Write the reset once, then clear its bit, so that it cannot reset a later fault."""
+        """Write the reset word once, then clear its bit, so that it cannot reset a later fault."""
         register: Register[Any] = self.register(self.reset_role)
         try:
             yield from write(register, self._word(self.reset_word, self.reset_role))

@@ -1,4 +1,4 @@
-"""Yaskawa's MEMOBUS registers of the 1000 series: A1000, V1000 and relatives."""
+"""The MEMOBUS registers of Yaskawa's 1000 series: A1000, V1000 and relatives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
 class YaskawaControl(IntFlag):
-    """0001H: A1000 technical manual SIEP C710616 27G, p. 559. Bit 2, an external fault, is never set."""
+    """The control word 0001H (A1000 manual SIEP C710616 27G, p. 559). Bit 2, external fault, is never set."""
 
     FORWARD = 1 << 0
     REVERSE = 1 << 1
@@ -19,7 +19,7 @@ class YaskawaControl(IntFlag):
 
 
 class YaskawaStatus(IntFlag):
-    """004BH, monitor U1-12: A1000 technical manual SIEP C710616 27C, p. 494."""
+    """The status 004BH, monitor U1-12 (A1000 technical manual SIEP C710616 27C, p. 494)."""
 
     RUNS = 1 << 0
     ZERO_SPEED = 1 << 1
@@ -44,13 +44,13 @@ FORWARD, REVERSE = YaskawaControl.FORWARD, YaskawaControl.REVERSE
 
 
 class Yaskawa(Profile):
-    """Yaskawa's bits: 0 runs forward and 1 in reverse while it is 1, bit 3 resets.
+    """Yaskawa: while bit 0 is 1 the motor runs forward, while bit 1 is 1 in reverse; bit 3 resets.
 
     - Bits 0 and 1 are those of H5-12 = 0, the factory setting. With H5-12 = 1 bit 1 is the direction, and a
-      start in reverse is not carried out: it ends as not verified.
+      start in reverse has no effect: `start` raises NotVerified.
     - No word coasts, and no jog is sent.
     - A status of 0 is impossible: at rest "zero speed" is set, else "during run".
-    - Bit 15 of the status says that the drive takes its commands from the line; a start needs it.
+    - Bit 15 of the status says that the drive takes its commands from the line; a start requires it.
     """
 
     stop_word: ClassVar[int] = STOP
