@@ -1,4 +1,4 @@
-"""Every family: consistent declarations, and no verb that its document forbids."""
+"""Every family has consistent declarations, and no verb that its document forbids."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ family = pytest.mark.parametrize("family", FAMILIES, ids=lambda each: each.model
 
 
 def registers(wanted: Callable[[Register[Any]], object]) -> list[tuple[type[Drive], Register[Any]]]:
-    """Return each register of each family that is wanted."""
+    """Return (family, register) pairs of all registers that `wanted` accepts."""
     return [(family, each) for family in FAMILIES for each in family.registers.values() if wanted(each)]
 
 
@@ -80,7 +80,7 @@ def test_invalid_address_is_refused(family: type[Drive], given: object) -> None:
         family(given)  # type: ignore[arg-type]
 
 
-TERMINALS = {  # as each document names them; CHE's does not
+TERMINALS = {  # as named in each document; the CHE's names none
     "erman-er-g-220": "485A and 485B",
     "innovert-ibd": "RS+ and RS-",
     "delixi-modbus": "SG+ and SG-",
@@ -126,7 +126,7 @@ def test_drive_base_class_cannot_be_used_as_a_family() -> None:
 def test_value_that_is_not_a_direction_raises_type_error(
     family: type[Drive], name: str, given: object
 ) -> None:
-    """A value other than a Direction must not turn the motor; no frame is sent."""
+    """A value other than a Direction must not turn the motor, so no frame is sent."""
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
     sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
@@ -159,7 +159,7 @@ def test_every_verb_has_a_docstring(family: type[Drive]) -> None:
 
 @family
 def test_no_two_registers_have_the_same_address(family: type[Drive]) -> None:
-    """But for a command and the reading that shows it."""
+    """Exception: a command and the reading that shows it."""
     places = [
         (register.table, register.address + at, register.access is Access.COMMAND)
         for register in family.registers.values()
@@ -275,7 +275,7 @@ def test_raw_count_survives_decoding_and_encoding(family: type[Drive], register:
 def test_value_survives_a_write_and_a_read(
     family: type[Drive], register: Register[Any], data: st.DataObject
 ) -> None:
-    """Written in any framing, held by the drive as sent, and read back."""
+    """In every framing, a written value is stored as sent and read back."""
     drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
     value = data.draw(_values(register))
     asked = write_request(drive, register, register.encode(value))
@@ -300,7 +300,7 @@ def test_value_survives_a_write_and_a_read(
 
 
 def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
-    """Values that may be written."""
+    """Return a strategy for values that may be written."""
     if register.values is not None:
         members = [
             value
@@ -344,7 +344,7 @@ def scripts_of(tree: ast.AST) -> set[str]:
 
 
 def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
-    """Return the lines that call such a function and drop the generator."""
+    """Return the lines that call one of these functions and discard the generator."""
     calls = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
     found = []
     for call in calls:
@@ -371,14 +371,14 @@ def test_every_script_call_uses_yield_from() -> None:
         and isinstance(node.value.value, ast.Call)
     ]
     assert len(carried_out) > 80
-    for node in carried_out:  # each would be found, were it forgotten
+    for node in carried_out:  # `forgotten` would detect each call without its `yield from`
         call = node.value.value  # type: ignore[attr-defined]
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 
 
 def test_verb_that_a_family_lacks_raises_unsupported() -> None:
     class Mute(Drive):
-        """Can only be read."""
+        """A drive without verbs."""
 
         speed = reading(0, "rpm")
 

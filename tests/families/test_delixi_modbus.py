@@ -1,4 +1,4 @@
-"""Delixi 9200 and 9100-SC in standard Modbus: their table, and what their verbs send."""
+"""Delixi 9200 and 9100-SC in standard Modbus: the register table, and the frames that verbs send."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_start_after_a_jog_requires_a_stop() -> None:
         wire.drive.start(Direction.FORWARD)
     wire.drive.stop()
     wire.drive.start(Direction.FORWARD)
-    wire.drive.start(Direction.REVERSE)  # while it runs
+    wire.drive.start(Direction.REVERSE)  # while the motor runs
     assert wire.sent == [jog, STOP[Framing.RTU], FORWARD[Framing.RTU], REVERSE[Framing.RTU]]
 
 

@@ -1,4 +1,4 @@
-"""Delixi's own protocol: its tables, and what its verbs send. Frames as printed in part 3."""
+"""Delixi's own protocol: the register tables, and the frames that verbs send, as printed in part 3."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_line_settings_and_limits_are_those_of_the_document() -> None:
 
 
 def test_character_formats_have_the_codes_of_the_manual() -> None:
-    """P04.29 has other codes than in standard Modbus."""
+    """The codes of P04.29 differ from those in standard Modbus."""
     assert [DelixiNative.format_setting.decode(raw).name for raw in range(3)] == ["N81", "E81", "O81"]
 
 
@@ -121,7 +121,7 @@ def test_start_without_a_known_setpoint_is_refused() -> None:
     ],
 )
 def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
-    """P05.31 is 0 all the same: a run command without mains may wait for them."""
+    """P05.31 shows no fault here, but a run command without mains voltage may take effect later."""
     wire = Wire(DelixiNative(1), {**STANDING, "status": status})
     wire.drive.set_frequency(50)
     for direction in (None, *Direction):
@@ -207,7 +207,7 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
             State(Condition.RUNNING, Direction.REVERSE),
         ),
         (
-            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},  # never taken for stopped
+            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},  # at 0 Hz, but not stopped
             State(Condition.RUNNING, Direction.FORWARD, note="output frequency 0"),
         ),
         (
@@ -237,7 +237,7 @@ def test_identify_reads_address_and_baud_rate() -> None:
 
 def test_subclass_keeps_the_registers_and_adds_its_own() -> None:
     class Mine(DelixiNative):
-        """A Delixi whose owner has its list of parameters."""
+        """A user's family with a parameter from the drive's list."""
 
         acceleration_time = setting(parameter(0, 17), "s", step=0.1, table=PARAMETER_RAM)
 
@@ -247,7 +247,7 @@ def test_subclass_keeps_the_registers_and_adds_its_own() -> None:
 
 
 class Owned(DelixiNative):
-    """One parameter written by K = 05, which does not store it, and one by K = 06, which does."""
+    """A user's family with a parameter in RAM, written by K = 05, and one in EEPROM, by K = 06."""
 
     ramp = setting(parameter(0, 17), "s", step=0.1, table=PARAMETER_RAM)
     stored_ramp = setting(parameter(0, 18), "s", step=0.1, table=PARAMETER)
@@ -290,7 +290,7 @@ def test_fault_that_remains_after_reset_is_reported(status: DelixiNativeStatus) 
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
     with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):
         wire.drive.reset_fault()
-    assert wire.sent == [RESET]  # once
+    assert wire.sent == [RESET]  # sent once
 
 
 @table(

@@ -1,4 +1,4 @@
-"""ERMAN ER-G-220-01(02): its table, and what its verbs send."""
+"""ERMAN ER-G-220-01(02): the register table, and the frames that verbs send."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STOP_OFF = "01 05 00 01 00 00 9C 0A"
 EMERGENCY_ON = "01 05 00 02 FF 00 2D FA"
 RESET_ON = "01 05 00 09 FF 00 5C 38"
 RESET_OFF = "01 05 00 09 00 00 1D C8"
-FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the right address
+FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the address corrected
 
 STOPPED = {
     "frequency": 25.0,
@@ -159,7 +159,7 @@ def test_stop_sets_stop_and_clears_start_and_waits() -> None:
     )
     wire.drive.stop()
     assert wire.sent == [STOP_ON, START_OFF]
-    assert wire.reads.count("status") == 4  # stopped, but 0.4 Hz at the third
+    assert wire.reads.count("status") == 4  # the third read shows stopped, but the frequency is 0.4 Hz
 
 
 def test_stop_escalates_to_emergency_stop_and_then_raises() -> None:
@@ -189,11 +189,11 @@ def test_start_coil_is_written_off_after_an_unconfirmed_stop() -> None:
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
     for stop in (STOP_ON, EMERGENCY_ON):
         wire = Wire(ErmanERG220(1), STOPPED, {stop: lost})
-        with pytest.raises(Unconfirmed, match="no reply"):  # so that it is repeated as a whole
+        with pytest.raises(Unconfirmed, match="no reply"):  # so that the caller repeats the whole stop
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]
         wire = Wire(ErmanERG220(1), STOPPED, {stop: lost, START_OFF: lost})
-        with pytest.raises(Unconfirmed, match="no reply"):  # once: the whole is repeated, the stop first
+        with pytest.raises(Unconfirmed, match="no reply"):  # START_OFF is tried once
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]
 
@@ -204,7 +204,7 @@ def test_refused_stop_is_followed_by_the_emergency_stop() -> None:
         wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
         wire.drive.stop()
         assert wire.sent == [*begun, EMERGENCY_ON, START_OFF]
-        assert wire.reads == ["deceleration_time", "status", "output_frequency"]  # it is watched once
+        assert wire.reads == ["deceleration_time", "status", "output_frequency"]  # watched once
 
 
 def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
@@ -312,7 +312,7 @@ def test_state_shows_the_ramp_phase_and_the_last_fault(
 
 
 def test_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
-    """Bits 8, 9 and 12 to 31 are reserved (section 10, state: 1026-1027)."""
+    """Bits 8, 9 and 12 to 31 of the last fault are reserved (section 10, state registers 1026-1027)."""
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
     assert "last fault bit 8, bit 12" in wire.drive.state().note
     with pytest.raises(WriteForbidden, match="may have a fault, bit 8, bit 12"):
@@ -339,7 +339,7 @@ def test_undocumented_verbs_are_unsupported(name: str) -> None:
 def test_coils_are_read_within_one_byte_and_only_on_request(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The order of two bytes would be doubtful (section 6, the example of function 01)."""
+    """The order of two bytes in a reply is doubtful (section 6, the example of function 01)."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())
@@ -361,12 +361,12 @@ def test_coils_are_read_within_one_byte_and_only_on_request(
 
 
 def test_printed_diagnostics_can_be_sent_raw(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Function 08 by raw (section 8), its error reply as printed and as it should be."""
+    """Function 08 with `send_raw` (section 8); the printed and the correct error reply are refusals."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     assert drive.send_raw(0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
     asked, read = (frame for _, frame in line.frames)
     assert asked == "01 08 00 00 A5 37 DA 8D"
-    assert read.startswith("01 04")  # that was a copy, as an adapter's echo is
+    assert read.startswith("01 04")  # the reply was a copy, so a read checks for an adapter's echo
     for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
         line.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
         with pytest.raises(DriveException, match="unknown command"):

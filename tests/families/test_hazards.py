@@ -1,9 +1,8 @@
-"""Hazards: the frames of a naive client, and the safe frames or the refusal of this library.
+"""Hazards: the frames of a naive client, and this library's safe frames or refusal.
 
-A row for each collision of addresses between families, and for each error or gap in a family's document
-that concerns a client. `naive` must never be sent: the document's frame, if it prints one. `sends` is all
-that is sent instead, without reads. Both are
-without their checksum.
+There is a row for each address collision between families, and for each error or gap in a family's document
+that concerns a client. The frame `naive`, printed in the document if possible, must never be sent. `sends`
+has all frames that are sent instead, except reads. Both are without checksums.
 """
 
 from __future__ import annotations
@@ -55,17 +54,17 @@ def yd() -> Drive:
 
 @dataclass(frozen=True)
 class Hazard:
-    """`do(line, drive, sim)` is the user's action; `shows` is set on the simulated drive before."""
+    """A hazard: `do(line, drive, sim)` is the user's action; `shows` is set on the simulated drive before."""
 
     place: str
     drive: Callable[[], Drive]
     do: Callable[[SimulatedBus, Any, Any], object]
     naive: str
     sends: tuple[str, ...] = ()
-    refuses: str = ""  # the sentence with which it is refused
+    refuses: str = ""  # text of the error with which the action is refused
     error: type[Exception] = WriteForbidden
     shows: Mapping[str, Any] = field(default_factory=dict)
-    turning: bool = False  # it was given a setpoint, started, and has run for a second
+    turning: bool = False  # before the action, the drive was started and has run for a second
 
 
 def start(line: SimulatedBus, drive: Any, sim: Any) -> None:
@@ -102,7 +101,7 @@ def broadcast(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], objec
 
 
 HAZARDS = [
-    # ---- section 0: one address, several meanings ----
+    # ---- section 0: one address with several meanings ----
     Hazard(
         "0.1: 2000H, Delixi's run forward is run and fault reset on an IBD",
         ibd,
@@ -469,7 +468,7 @@ HAZARDS = [
 
 
 class Mine(InvtCHE):
-    """A CHE whose owner has its manual."""
+    """A user's family with parameters from the drive's manual."""
 
     acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
@@ -495,7 +494,7 @@ def test_action_sends_only_the_safe_frames_or_is_refused(
 
 
 def body(frame: str) -> str:
-    """Without its checksum."""
+    """Return a frame without its checksum."""
     return frame[:-2] if frame.startswith(":") else frame[:-6]
 
 
@@ -505,7 +504,7 @@ def test_y2_low_byte_of_the_checksum_is_sent_first(monkeypatch: pytest.MonkeyPat
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
 
 
-# ---- errata of reads ----
+# ---- errata that concern reads ----
 
 
 def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
@@ -554,7 +553,7 @@ def test_i4_request_refused_as_damaged_is_repeated(monkeypatch: pytest.MonkeyPat
 
 
 def test_i2_e_identify_refuses_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Function 04 does not exist on them; its exception is an identity that is refused."""
+    """These models lack function 04; the exception makes `identify` refuse them."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
     line.answers = lambda request: refusal if request.function == 4 else None
@@ -565,8 +564,8 @@ def test_i2_e_identify_refuses_the_models_03_and_04(monkeypatch: pytest.MonkeyPa
 
 def test_e7_byte_count_of_coils_is_rounded_up() -> None:
     request = Message(1, 1, 0, 12)
-    assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0  # as printed: 12 coils in 2 bytes
-    assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0  # as 12 / 8 would be
+    assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0  # as printed: 12 coils in 2 bytes are accepted
+    assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0  # 12 / 8 rounded down
 
 
 def test_e8_reserved_state_registers_are_not_readings() -> None:
@@ -609,7 +608,7 @@ def test_d2_d15_states_2_and_3_are_running_and_a_changed_copy_is_rejected(
     assert drive.state().condition is Condition.RUNNING
     request = Message(1, 4, 1, data=b"\0\0\x13\x88")
     swapped = build_reply(Framing.DELIXI, Message(1, 4, 1, data=b"\0\0\x88\x13"))
-    assert text(swapped)[-2:] == "A1"  # the sum does not see it
+    assert text(swapped)[-2:] == "A1"  # the checksum does not detect the swap
     assert parse_reply(Framing.DELIXI, swapped, request)[0] < 0
 
 
@@ -665,7 +664,7 @@ def test_y8_frozen_state_is_not_reported_as_running(monkeypatch: pytest.MonkeyPa
     drive.state()
     sim.pass_time(line.seconds)
     sim.trip(5)
-    assert drive.read(drive.status)  # still says that it runs
+    assert drive.read(drive.status)  # the frozen register still shows a run
     assert drive.state().condition is Condition.FAULT
     drive.stop()
 
@@ -687,11 +686,11 @@ def test_0_8_registers_kept_in_eeprom_are_declared_so() -> None:
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
 
 
-# ---- an echo, and another family ----
+# ---- adapters with an echo ----
 
 
 def test_0_3_adapter_echo_is_not_accepted_as_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only copies of requests arrive: no write is sent, because no read is answered."""
+    """If only copies of requests arrive, no write is sent, because no read gets a valid reply."""
     line = SimulatedBus(monkeypatch)
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:
@@ -701,7 +700,7 @@ def test_0_3_adapter_echo_is_not_accepted_as_a_drive(monkeypatch: pytest.MonkeyP
     assert line.written == []
 
 
-# ---- none is left out ----
+# ---- completeness ----
 
 FAMILIES = {"E": 18, "I": 6, "N": 10, "D": 17, "Y": 15}
 OF_PRINT_ALONE = {

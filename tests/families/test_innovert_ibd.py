@@ -1,4 +1,4 @@
-"""INNOVERT IBD: its table, and what its verbs send. Frames as printed in appendix 2."""
+"""INNOVERT IBD: the register table, and the frames that verbs send, as printed in appendix 2."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_control_words_never_have_the_toggle_or_reserved_bits() -> None:
 
 def test_terminal_bits_have_the_documented_names() -> None:
     assert [bit.value for bit in Terminals] == [1 << at for at in (*range(11), 13)]
-    printed = InnovertIBD.terminals.decode(0x1800)  # in the example; bits 11 and 12 have no name
+    printed = InnovertIBD.terminals.decode(0x1800)  # from the manual's example; bits 11 and 12 have no name
     assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
 
 
@@ -119,7 +119,7 @@ def test_reset_and_a_setpoint_of_0_send_the_documented_frames() -> None:
 
 
 def test_stop_is_sent_before_the_fault_reset() -> None:
-    """In table 3 the word of the reset has no action in bits 1 and 0: a run of before may still be there."""
+    """In table 3 the reset word has no action in bits 1 and 0, so an earlier run may still be in force."""
     stop = STOP[Framing.RTU]
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
     wire = Wire(InnovertIBD(1), STANDING, {stop: lost})
@@ -170,7 +170,7 @@ def test_jog_sends_the_word_of_table_3() -> None:
     ids=["speed", "current", "outputs"],
 )
 def test_start_and_jog_of_a_turning_motor_are_refused(turning: dict[str, object]) -> None:
-    """A jog is left by a stop and a new start (table 3)."""
+    """A jog ends only with a stop; then the drive can be started (table 3)."""
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **turning})
     wire.drive.set_frequency(50)
     for verb in (wire.drive.start, wire.drive.jog):
@@ -295,7 +295,7 @@ def test_state_is_unknown_unless_the_outputs_are_programmed() -> None:
 @table(
     ("raw", "condition"),
     [
-        (0x1800, Condition.STOPPED),  # the reply that is printed, with its reserved bits
+        (0x1800, Condition.STOPPED),  # the printed reply, with reserved bits set
         (0x1900, Condition.RUNNING),
         (0x1B00, Condition.ACCELERATING),
         (0x1D00, Condition.DECELERATING),

@@ -1,4 +1,4 @@
-"""INVT CHE: its table (CHE100 manual v1.4), and what its verbs send."""
+"""INVT CHE: the register table (CHE100 manual v1.4), and the frames that verbs send."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_registers_equal_the_typed_table_of_the_che100() -> None:
 
 
 def test_scales_on_which_sources_differ_are_not_stated() -> None:
-    """3006H: 0.01 kW on a CHF100A, by its owner's log of 26 rows; 0.1 % in the Goodrive300L manual."""
+    """3006H is in 0.01 kW by an owner's log of a CHF100A, but in 0.1 % by the Goodrive300L manual."""
     for register, raw in ((InvtCHE.output_power, 262), (InvtCHE.dc_bus_voltage, 5370)):
         assert register.value_unit == "raw count"
         assert register.decode(raw) == raw
@@ -153,7 +153,7 @@ def test_jog_is_refused_if_the_motor_may_turn(
 
 @pytest.mark.parametrize("direction", [None, *Direction])
 def test_start_is_refused_in_an_undocumented_state(direction: Direction | None) -> None:
-    """The manual has 1 to 4 at 1001H: 5 may be anything, and the motor may turn the other way."""
+    """The manual documents 1 to 4 for 1001H; with any other value the motor may turn the other way."""
     wire = Wire(InvtCHE(1), {**STANDBY, "status": 5})
     with pytest.raises(WriteForbidden, match="has 0005H at 1001H, which is not explained"):
         wire.drive.start(direction)
@@ -168,7 +168,7 @@ def test_stop_waits_for_standby() -> None:
 
 
 def test_stop_jog_follows_immediately_if_a_jog_continues() -> None:
-    """For any caller: neither only after `stop_time`, nor only if more time is given."""
+    """STOP_JOG is sent without waiting for `stop_time`."""
     wire = Wire(
         InvtCHE(1),
         {"status": CHEStatus.FORWARD},
@@ -199,9 +199,9 @@ def test_stop_jog_follows_a_refused_stop() -> None:
 
 
 def test_stop_jog_follows_an_unconfirmed_stop() -> None:
-    """The drive may hear, though it is not heard: the stop that it did hear may not end a jog."""
+    """A drive whose replies are lost may still receive the stop, which may not end a jog."""
     lost = Unconfirmed("drive", "control = STOP", "no reply")
-    for of_a_jog in ([], [lost] * 3):  # once: the whole is repeated, the stop first
+    for of_a_jog in ([], [lost] * 3):  # STOP_JOG is tried once: the caller repeats the whole stop
         wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [lost] * 3, STOP_JOG: of_a_jog})
         with pytest.raises(Unconfirmed, match="control = STOP"):
             wire.drive.stop()
@@ -247,7 +247,7 @@ def test_stop_refused_at_rest_counts_as_stopped() -> None:
         wire.drive.stop()
     assert told.value is refusal
     wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.STANDBY]}, loses)
-    wire.drive.stop()  # at rest after both were refused
+    wire.drive.stop()  # both stops are refused, but the motor is at rest
     assert wire.sent == [STOP] * 3 + [STOP_JOG] * 3
     assert wire.reads == ["status"] * 2
 
@@ -349,12 +349,12 @@ def test_identify_refuses_other_makes() -> None:
 
 def test_users_parameter_is_written_to_its_ram_alias() -> None:
     class Mine(InvtCHE):
-        """A CHE whose owner has its manual."""
+        """A user's family with parameters from the drive's manual."""
 
         acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
         way = parameter(13, CHEStatus)
 
-    assert Mine.acceleration_time.ram_address == 0x800C  # as printed in section 11.6.4
+    assert Mine.acceleration_time.ram_address == 0x800C  # the alias as printed in section 11.6.4
     assert Mine.acceleration_time.kept is Kept.EEPROM
     assert Mine.acceleration_time.readable
     assert parameter(58).address == 0x003A
@@ -367,10 +367,10 @@ def test_users_parameter_is_written_to_its_ram_alias() -> None:
 def test_stored_parameter_is_written_to_eeprom_and_counted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Written to EEPROM, and counted; 11.6.2 has the frame, with an unexplained value."""
+    """The frame is the example of section 11.6.2, which does not explain its value."""
 
     class Mine(InvtCHE):
-        """A CHE whose owner has its manual."""
+        """A user's family with parameters from the drive's manual."""
 
         jump = stored_parameter(8, place="P0.08")
         ramp = parameter(11, "s", step=0.1)
@@ -383,7 +383,7 @@ def test_stored_parameter_is_written_to_eeprom_and_counted(
     drive.write(drive.ramp, 3.0)
     assert ledger.wear(line.seconds) == []
     drive.write(drive.jump, 0x1388)
-    assert line.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
+    assert line.written[-1] == "02 06 00 08 13 88 05 6D"  # computed manually from section 11.6.2
     with pytest.raises(WriteForbidden, match="once in 60 s"):
         drive.write(drive.jump, 0x1389)
     assert sim.counters.eeprom_writes == {"jump": 1}
@@ -401,7 +401,7 @@ def test_start_after_a_jog_requires_a_stop() -> None:
         wire.drive.start()
     wire.drive.stop()
     wire.drive.start()
-    wire.drive.start()  # while it runs
+    wire.drive.start()  # while the motor runs
     assert wire.sent == [jog, STOP, FORWARD, FORWARD]
 
 

@@ -1,4 +1,4 @@
-"""The habits of A1000 and CP2000 drives are learnt without options: what they refuse costs no other value."""
+"""Reads that A1000 and CP2000 drives refuse are learnt without options, and cost no other value."""
 
 from __future__ import annotations
 

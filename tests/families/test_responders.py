@@ -1,4 +1,4 @@
-"""Shipped families at responders that were typed from the sources, without the library's simulation."""
+"""Shipped families command responders that are typed from the sources, independent of the simulation."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ Word = tuple[int, int]  # address and value
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a family's sources say: registers at rest, what replaces them, and the words of each verb."""
+    """Facts from a family's sources: registers at rest and while running, and the words of each verb."""
 
-    rest: Mapping[int, int]  # every register that answers, with its value at rest
+    rest: Mapping[int, int]  # all readable registers, with their values at rest
     turning: Mapping[int, int]
     tripped: Mapping[int, int]
-    setpoint: Word  # of 20 Hz
-    starts: tuple[Word, ...]  # the last one runs the motor
+    setpoint: Word  # write of a setpoint of 20 Hz
+    starts: tuple[Word, ...]  # words of a start; the last one runs the motor
     stops: tuple[Word, ...]
     resets: tuple[Word, ...]
-    shown: Mapping[str, float]  # by register, what the keypad shows while it turns
+    shown: Mapping[str, float]  # values on the keypad while the motor turns, by register
     write: int = 6
-    shows_setpoint: int = 0  # a register that repeats it
-    passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)  # what other words change
+    shows_setpoint: int = 0  # address of a register that repeats the setpoint
+    passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)  # effects of other words
 
 
 SHEETS = {
@@ -155,7 +155,7 @@ SHEETS["yaskawa-v1000"] = SHEETS["yaskawa-a1000"]
 
 
 class Responder:
-    """One drive: a table of registers and its motor. Any word that the sheet does not have is a mistake."""
+    """A drive with registers and a motor; it fails on any word that its sheet does not have."""
 
     def __init__(self, drive: Drive, sheet: Sheet) -> None:
         self.drive = drive
@@ -216,5 +216,5 @@ def test_start_stop_and_reset_send_the_documented_words_and_readings_match(name:
         assert driven.state().condition is Condition.FAULT
         there.words.clear()
         driven.reset_fault()
-        assert there.words == [*sheet.stops, *sheet.resets]  # no word that runs it may remain
+        assert there.words == [*sheet.stops, *sheet.resets]  # no further word may run the motor
         assert driven.state().condition is Condition.STOPPED

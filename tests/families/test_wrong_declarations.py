@@ -1,4 +1,4 @@
-"""The matrix: every family that commands a motor, declared at the address of every simulated drive."""
+"""Wrong declarations: every family that commands a motor, declared for every other simulated drive."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ THERE: dict[str, Callable[[int], Any]] = {
     **DECLARED,
     **{name: shipped_family(name) for name in READ_ONLY},
 }
-# Families with the same registers and words, so that each commands the other's drives.
+# Families with the same registers and words: each can command the other's drives.
 SAME_WORDS = (
     {"delta-vfd-el", "delta-ms300", "delta-cp2000"},
     {"erman-er-g-220", "erman-er-g-220-02"},
@@ -45,7 +45,7 @@ SAME_WORDS = (
 SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
 
 AT_2000 = ("invt-goodrive", "powtran-pi130")
-# Stops that would run the motor, so that they are withheld on proof. docs/reference/profiles.md lists them.
+# Stops that would run another make's motor; withheld if the make is proven. See docs/reference/profiles.md.
 RUNS_AT_A_STOP = {
     **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
     **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),
@@ -62,7 +62,7 @@ def same_words(declared: str, there: str) -> bool:
 
 
 class Pair:
-    """A drive as it is declared, and the simulated drive of another make, whose motor may turn."""
+    """A declared drive, and the simulated drive of another make at its address, whose motor may turn."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, declared: str, there: str, turns: bool) -> None:
         self.sim: Any = simulated(THERE[there](1))
@@ -125,7 +125,7 @@ def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
     if {declared, there} <= SAME_STOP:
         assert pair.bus.written != []
         return
-    assert failure is not None  # no standstill is reported from registers that only read 0
+    assert failure is not None  # registers that just read 0 do not prove standstill
 
 
 @table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
@@ -139,7 +139,7 @@ def test_documentation_lists_the_withheld_stops(declared: str, there: str) -> No
 def test_parameter_that_looks_like_the_address_does_not_hide_a_goodrive(
     monkeypatch: pytest.MonkeyPatch, declared: str
 ) -> None:
-    """0900H of a Goodrive is P09.00, the source of the PID reference, which may be 1."""
+    """0900H of a Goodrive is P09.00, the PID reference's source; its value may equal the drive's address."""
     pair = Pair(monkeypatch, declared, "invt-goodrive", turns=False)
     show = pair.sim.answer
     pair.sim.answer = lambda request, now: (
@@ -157,7 +157,7 @@ def replace_data(request: Any, value: int) -> Any:
 
 
 def test_confirmed_ibd_family_does_not_run_a_goodrive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As after a drive was replaced: its owner has confirmed the former one."""
+    """This happens after a replacement: the owner has confirmed the former drive as an IBD."""
     sim: Any = simulated(shipped("invt-goodrive", 1))
     bus = SimulatedBus(monkeypatch, sim)
     drive = bus.attach(InnovertIBD(1, confirmed=1))

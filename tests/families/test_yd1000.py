@@ -1,4 +1,4 @@
-"""YD1000: its table, and what its verbs send. The document prints no frames, but command words."""
+"""YD1000: the register table, and the frames that verbs send; the document prints only command words."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ STANDING = {
 }
 AT_30_HZ = {**STANDING, "frequency": 30.0}
 
-# address, name, step and unit; default; changeable while running
+# Address, name, step and unit; factory value; changeable while running.
 TURNS = {
     FORWARD: {"output_frequency": 12.0, "status": YD1000Status.RUN},
     REVERSE: {"output_frequency": 12.0, "status": YD1000Status.RUN | YD1000Status.REVERSE},
@@ -172,7 +172,7 @@ def test_registers_never_written_are_those_of_the_notes() -> None:
 
 
 def test_line_parameters_are_read_only() -> None:
-    """Section 7: 0800H and 0801H after a reset or power-on, 0802H and 0803H at once."""
+    """By section 7, 0800H and 0801H take effect after a reset or power-on, 0802H and 0803H immediately."""
     later = {register.address for register in YD1000.registers.values() if "after a reset" in register.note}
     at_once = {register.address for register in YD1000.registers.values() if "at once" in register.note}
     assert (later, at_once) == ({0x0800, 0x0801}, {0x0802, 0x0803})
@@ -182,10 +182,10 @@ def test_line_parameters_are_read_only() -> None:
 
 
 def test_extended_parameter_address_follows_from_its_name() -> None:
-    """F is put as 0 (section 6.2), as the table itself has it."""
+    """The letter F becomes the digit 0 (section 6.2), as in the table itself."""
 
     class Mine(YD1000):
-        """A YD1000 whose owner has its manual."""
+        """A user's family with a parameter from the drive's manual."""
 
         start_frequency = extended("F240", "Hz", step=0.01)
 
@@ -196,7 +196,7 @@ def test_extended_parameter_address_follows_from_its_name() -> None:
             name = register.place.removeprefix("6.2, ")
             assert f"F{register.address:03X}" == name
             with pytest.raises(ValueError, match=f"^{name} is declared by every YD1000, as {register.name}$"):
-                extended(name)  # nor is a register with `never` redeclared as writable
+                extended(name)  # a register with `never` cannot be redeclared as writable
     for wrong in ("F1000", "F24A", "f240", "240", "F24"):
         with pytest.raises(ValueError, match="F and three digits"):
             extended(wrong)
@@ -277,7 +277,7 @@ def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
 
 
 def yd_word(word: int) -> str:
-    """A write of the control word (section 5.2), with its checksum."""
+    """Return the frame that writes this control word (section 5.2)."""
     return checksums.rtu(f"01 06 10 00 {word:04X}").hex(" ").upper()
 
 
@@ -414,7 +414,7 @@ def test_coast_sends_its_bit_and_waits_for_two_zero_readings() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
-    assert wire.seconds == 0.1  # between two readings: the drive may show 0 for a moment
+    assert wire.seconds == 0.1  # between two readings, because one may show 0 by chance
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
     with pytest.raises(Unconfirmed, match="5 s"):
         wire.drive.coast()
@@ -438,7 +438,7 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
 
 
 def test_start_after_a_reset_requires_a_new_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The restart loses it: a start at the drive's own setpoint was not requested."""
+    """The restart loses the written setpoint; a start at the drive's own setpoint was not requested."""
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.set_frequency(30)
     wire.drive.reset_fault()
@@ -475,7 +475,7 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
     ],
 )
 def test_reset_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
-    """Bit 15 goes with a power-on (section 8.1), and may with the restart: then the terminals command."""
+    """A restart may clear bit 15, as a power-on does (section 8.1); then the terminals are in control."""
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
     with pytest.raises(WriteForbidden, match=f"^{terminal}.* says run, and may start its motor"):
         wire.drive.reset_fault()
@@ -490,7 +490,7 @@ def test_other_terminals_do_not_block_a_reset(closed: Inputs) -> None:
 
 
 def test_limit_from_outside_the_notes_names_its_source() -> None:
-    """It has 0.5 to FH for UL, and of FH only 30.0 to 320.0."""
+    """The notes limit UL to 0.5 .. FH, but FH only to 30.0 .. 320.0; so UL as FH's limit is inferred."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
         WriteForbidden, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz"
@@ -506,7 +506,7 @@ def test_release_control_is_refused_unless_the_motor_is_at_rest() -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS})
     wire.drive.release_control()
     assert wire.sent == [RELEASE]
-    for frequencies in (12.0, [0.0, 12.0]):  # 1100H must be 0 twice
+    for frequencies in (12.0, [0.0, 12.0]):  # 1100H must be 0 in two readings
         wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "output_frequency": frequencies})
         with pytest.raises(WriteForbidden, match=r"turns: call stop\(\) first"):
             wire.drive.release_control()
@@ -557,7 +557,7 @@ def test_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.Monke
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert isinstance(sim, SimulatedYD1000)
     drive.write(drive.panel_frequency, 20.0)
-    drive.stop()  # which takes the command
+    drive.stop()  # the stop takes control from the panel
     sim.panel_runs = True
     assert not sim.motor.energised
     with pytest.raises(NotVerified, match="started the motor"):
@@ -610,7 +610,7 @@ def test_identify_checks_address_and_maximum_frequency() -> None:
 def test_start_in_a_fault_is_refused() -> None:
     wire = Wire(YD1000(1), AT_30_HZ)
     wire.drive.state()
-    wire.says["fault_record_1"] = [0x0A]  # since then
+    wire.says["fault_record_1"] = [0x0A]  # a new entry in the fault record
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(
             WriteForbidden, match=r"has a fault, code 0AH: remove its cause, then call reset_fault\(\)$"
@@ -620,7 +620,7 @@ def test_start_in_a_fault_is_refused() -> None:
 
 
 def test_trip_is_detected_by_the_frozen_registers() -> None:
-    """Section 8.2: 1200H is held while the drive has tripped, and 1100H is not."""
+    """By section 8.2, 1200H is frozen while the drive has tripped, and 1100H is not."""
     wire = Wire(YD1000(1), {**STANDING, "held_frequency": 30.0, "fault_record_1": 0x0A})
     assert wire.drive.state() == State(Condition.FAULT, fault="code 0AH")
     starting = {**STANDING, "held_frequency": 0.2, "output_frequency": [0.0, 0.0, 0.4]}
@@ -628,7 +628,7 @@ def test_trip_is_detected_by_the_frozen_registers() -> None:
 
 
 def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From a new object too, as the command line has it each time."""
+    """Also with a new drive object, as every command-line call creates."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(30)
     drive.start()
@@ -649,7 +649,7 @@ def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.Monk
 def test_start_after_an_emergency_stop_at_rest_advises_reset_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """No register is frozen then, and the record is new only to an object that read it before."""
+    """Then no register is frozen; only an object that had read the fault record could see a new entry."""
     _, drive, _ = one(monkeypatch, YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)

@@ -1,4 +1,4 @@
-"""Families from files in use: simulated, scanned for, polled, recorded, decoded, and commanded."""
+"""Use families from files: simulate, scan for, poll, record, decode and command their drives."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_model_path_is_relative_to_the_plant_file(plant: Path, pump: type[Drive]
 
 
 def test_family_file_gives_the_same_poll_plan_as_the_class(plant: Path) -> None:
-    """A family from a file causes the same frames as a class."""
+    """A family from a file causes the same requests as the equivalent class."""
     loaded = load_family(plant.parent / "families" / "meter.toml")(3)
     written = Meter(3)
 
@@ -147,14 +147,14 @@ def test_plant_with_two_family_files_is_scanned_recorded_and_reported(
     assert run("report", "run.arrows")[0] == 0
 
 
-# ---- confirmation ----
+# ---- confirmation of the family by its owner ----
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
 def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
     pump: type[Drive], name: str, value: str
 ) -> None:
-    """Nor are its harmless counts sent: without a stop verb they are untested."""
+    """Without a stop verb not even its harmless counts are sent, because they are untested."""
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2)
@@ -165,7 +165,7 @@ def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
 
 
 def test_unconfirmed_file_sends_no_broadcast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor does stop_all send its broadcast counts, which are untested."""
+    """stop_all does not send its broadcast counts either, because they are untested."""
     path = tmp_path / "fan.toml"
     head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
     path.write_text(head + "[command]\ncontrol = { at = 0, broadcast = [0x047F] }\n")
@@ -224,7 +224,7 @@ def test_identify_section_recognises_drives_by_register_values(
 
 
 def test_eeprom_writes_of_two_files_with_the_same_name_are_counted_separately(plant: Path) -> None:
-    """Writes of two devices that happen to have files of one name are counted apart."""
+    """The ledger counts EEPROM writes separately for two devices whose family files have the same name."""
     other = plant.parent / "other"
     other.mkdir()
     for name, text in (("pump.toml", PUMP.replace("P-2", "P-9")), ("pump.csv", PUMP_CSV)):

@@ -1,4 +1,4 @@
-"""Families from files: the resulting class; each mistake with its place and a correct example."""
+"""Load families from files: the resulting class; every mistake is reported with place and correct example."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def mistakes(folder: Path, text: str) -> list[str]:
 
 
 def facts(register: Register[Any]) -> dict[str, Any]:
-    """Return a register's facts; enumerations as their names."""
+    """Return a register's declared facts, with the names of its enumeration."""
     found = {one.name: getattr(register, one.name) for one in dataclasses.fields(register)}
     values = register.values
     found["values"] = values and ({each.name: each.value for each in values}, values.__mro__[1])
     return found
 
 
-# ---- the class ----
+# ---- the resulting class ----
 
 
 def test_family_file_equals_the_hand_written_class(tmp_path: Path) -> None:

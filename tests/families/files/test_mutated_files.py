@@ -1,4 +1,4 @@
-"""Damaged family files: each loads, or is refused with sentences."""
+"""Damaged family files either load or are refused with sentences."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ WORDS = (
     *(b"at = ", b"values = ", b"bits = ", b"table = ", b"unit = ", b"span = ", b"steps = ", b"await = "),
 )
 
-ENOUGH = 20.0  # s
+ENOUGH = 20.0  # s, limit for one file
 
 
 def mutated(data: bytes, chosen: random.Random) -> bytes:
-    """Return a file in which up to four pieces were replaced, doubled, moved or taken out."""
+    """Return the file with up to four pieces replaced, doubled, moved or removed."""
     for _ in range(chosen.randint(1, 4)):
         begin = chosen.randrange(len(data) + 1)
         end = min(len(data), begin + chosen.choice((0, 1, 3, 10, 40)))
@@ -44,7 +44,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
         piece = chosen.choice(
             (chosen.choice(WORDS), b"", data[other : other + 30], data[begin:end] * 2, chosen.randbytes(2))
         )
-        if chosen.random() < 0.4:  # a whole value, which leaves the file TOML
+        if chosen.random() < 0.4:  # replace a whole value, so that the file stays valid TOML
             begin = data.find(b"= ", begin) + 2
             ends = [at for at in (data.find(mark, begin) for mark in (b",", b" }", b"\n")) if at > 0]
             end = min(ends, default=begin)
@@ -78,7 +78,7 @@ LARGE = {
 @pytest.mark.long
 @pytest.mark.parametrize("name", [*list(LARGE)[:4], *usually(*list(LARGE)[4:])])
 def test_large_file_loads_in_time(tmp_path: Path, name: str) -> None:
-    """The bound is generous: a loader that compares all with all would take minutes."""
+    """The limit is generous; a loader that compares every register with every other would take minutes."""
     large = LARGE[name]()
     begun = time.process_time()
     read("family", large, tmp_path)

@@ -1,4 +1,4 @@
-"""Addresses of a family file: each notation, and the address on the wire."""
+"""Addresses in a family file: every notation gives the right address as sent."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from multidrop.families.files.notation import Counting, sent_as
         ("10017", None, None, (16, "discrete")),
         ("00001", None, None, (0, "coil")),
         ("000065", None, "coil", (64, "coil")),
-        (50200, 1, None, (50199, "holding")),  # Danfoss's status word: no table has the digit 5
-        (16130, 1, None, (16129, "holding")),  # its output frequency: 1 is that of another table
+        (50200, 1, None, (50199, "holding")),  # Danfoss' status word; no table has the digit 5
+        (16130, 1, None, (16129, "holding")),  # its output frequency; 1 is another table's digit
         (40001, 0, "input", (40001, "input")),
     ],
 )

@@ -1,4 +1,4 @@
-"""Hazards of motor commands, with a simulated drive of every profile."""
+"""Hazards of motor commands, tested on a simulated drive of every profile."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def line(monkeypatch: pytest.MonkeyPatch, model: str) -> Line:
 
 
 class Line:
-    """A simulated bus with one drive; `starts` are the requests that turn its motor."""
+    """A simulated bus with one drive; `starts` has the requests sent so far that start its motor."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
         self.is_start = STARTS[model]
@@ -93,7 +93,7 @@ def test_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyP
 
 
 def test_reset_never_starts_the_motor(line: Line) -> None:
-    """Also if the run command was active at the trip, and the drive obeys its level."""
+    """Not even if the run command was active at the trip and the drive obeys the level of the run bit."""
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -103,10 +103,10 @@ def test_reset_never_starts_the_motor(line: Line) -> None:
     line.bus.sleep(5)
     assert line.drive.state().condition is Condition.STOPPED
     assert not line.sim.motor.energised
-    line.sim.trip(FAULT)  # a later fault stays: the reset does not stand
+    line.sim.trip(FAULT)  # a later fault stays: the reset bit was cleared
     line.bus.sleep(1)
     assert line.drive.state().condition is Condition.FAULT
-    line.drive.reset_fault()  # and can be reset again
+    line.drive.reset_fault()  # the later fault can be reset too
     line.drive.start()
     assert line.sim.motor.energised
 
@@ -128,7 +128,7 @@ def test_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -
     line.sim.trip(FAULT)
     line.bus.sleep(1)
     line.drive.state()
-    assert line.sim.motor.fault == FAULT  # no reset bit was left behind
+    assert line.sim.motor.fault == FAULT  # the reset bit was cleared, so the new fault stays
 
 
 def test_reset_without_a_fault_sends_no_write(line: Line) -> None:
@@ -155,14 +155,14 @@ def test_start_without_a_setpoint_is_refused(line: Line) -> None:
 
 
 def test_start_after_a_power_cycle_requires_a_new_setpoint(line: Line, model: str) -> None:
-    """The motor stays off, and the next start reports it if the drive shows its setpoint."""
+    """The motor stays off; the next start is refused, unless the drive's setpoint cannot be read."""
     line.runs()
     line.sim.power_cycle()
     line.bus.sleep(5)
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
     begun = len(line.writes)
-    if model == "danfoss-fc51":  # whose reference cannot be read
+    if model == "danfoss-fc51":  # its reference cannot be read
         line.drive.start()
         return
     with pytest.raises(WriteForbidden, match="set_frequency"):
@@ -207,11 +207,11 @@ def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.bus.sleep(2)
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
-    if model in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
+    if model in ("danfoss-fc51", "schneider-atv320"):  # their status shows no direction
         with pytest.raises(WriteForbidden, match="cannot say which way"):
             line.drive.start()
     else:
-        line.drive.start()  # does not turn it round
+        line.drive.start()  # keeps the direction
         line.bus.sleep(3)
         line.drive.state()
         assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
@@ -250,7 +250,7 @@ def test_frequency_out_of_range_is_refused(line: Line) -> None:
 
 
 def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
-    """In Hz, even if the reference is an unreadable percentage."""
+    """The ramp is in Hz, even if the reference is a percentage that cannot be read."""
     line.drive.set_frequency(20)
     begun = len(line.writes)
     ramp(line.drive, 22, rate=1, every=1)
@@ -273,7 +273,7 @@ def test_jog_that_continues_after_a_stop_gets_its_own_stop(monkeypatch: pytest.M
 
 @pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
 def test_stop_jog_follows_an_unconfirmed_stop(monkeypatch: pytest.MonkeyPatch, is_refused: bool) -> None:
-    """Replies are lost, as with one broken wire; or the drive refuses a stop during a jog."""
+    """The stop's replies are lost, as with one broken wire, or the drive refuses a stop during a jog."""
     line = Line(monkeypatch, "invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.jog()
@@ -359,7 +359,7 @@ def test_start_of_an_optidrive_of_the_first_guide_is_refused(monkeypatch: pytest
     line.drive.set_frequency(20)
     with pytest.raises(WriteForbidden, match="not ready to run"):
         line.drive.start()
-    line.sim.motor.run(1)  # at its keypad
+    line.sim.motor.run(1)  # started on the keypad
     line.bus.sleep(2)
     assert line.drive.state().condition is not Condition.STOPPED
     line.drive.stop()
@@ -367,8 +367,8 @@ def test_start_of_an_optidrive_of_the_first_guide_is_refused(monkeypatch: pytest
     assert line.starts == []
 
 
-OF_ANOTHER = {  # values that the family shows at most while a setting is not in force yet
-    "status": 0x0241,  # of no state of PROFIdrive
+OF_ANOTHER = {  # values of another make; this family could show at most one, for instance before a restart
+    "status": 0x0241,  # not a state of PROFIdrive
     "station": 7,
     "signature": 1,
 }
@@ -379,7 +379,7 @@ OF_ANOTHER = {  # values that the family shows at most while a setting is not in
 def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
     monkeypatch: pytest.MonkeyPatch, first: str, second: str
 ) -> None:
-    """One make's stop is another's run, but one value or two stale settings are not a proof."""
+    """One make's stop word may run another's motor; but one value, or two stale settings, prove nothing."""
     line = Line(monkeypatch, "abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
 

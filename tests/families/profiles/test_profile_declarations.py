@@ -1,4 +1,4 @@
-"""A family of a profile: its required and forbidden declarations, and its identification."""
+"""Families of a profile: required and forbidden declarations, and identification."""
 
 from __future__ import annotations
 
@@ -215,12 +215,12 @@ def test_drive_that_refuses_a_role_is_not_identified() -> None:
         identify("abb-acs355", signature=DriveException("abb", 2, "illegal address"))
 
 
-# ---- derived once more ----
+# ---- subclasses of a family ----
 
 
 def test_family_class_can_be_extended_by_a_subclass() -> None:
     class Longer(Acs355):
-        """Some more registers of the same drive."""
+        """The same drive with more registers."""
 
         output_current = reading(103, "A", step=0.1)
 

@@ -1,4 +1,4 @@
-"""The frames that each profile's verbs send, compared with words that were typed from the manuals."""
+"""The frames that each profile's verbs send equal words typed from the manuals."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from multidrop.drive.register import Register, command
 from multidrop.sim import SimulatedDrive, Simulator, simulated
 from multidrop.sim import Wire as SimulatedWire
 
-# Each without its checksum: address 1, function 06, as printed in the manual.
+# Starts of frames as printed in the manuals, for drive address 1; without checksums.
 ABB = "01 06 00 00 "  # 40001 (ACS355 manual p. 313)
 FC = "01 06 C3 4F "  # 50000, counted from 1 (FC 202 design guide p. 175)
 DELTA = "01 06 20 00 "
@@ -43,7 +43,7 @@ ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS = 0x0270, 0x0231, 0x0233, 0x0237  # ACS355 
 ABB_FAULT = 0x0238
 FC_READY, FC_RUNS, FC_TRIP, FC_LOCK = 0x0607, 0x0E07, 0x0604 | 8, 0x0604 | 0x48
 DELTA_STOP, DELTA_RUNS, DELTA_REVERSE = 0x0500, 0x0503, 0x051B
-DELTA_TO_REVERSE = 0x0513  # it still turns forward
+DELTA_TO_REVERSE = 0x0513  # reverse was commanded, and the motor still turns forward
 GD_STANDBY, GD_RUNS, GD_FAULT = 3, 1, 4
 MD_STOPPED, MD_RUNS = 3, 1  # PI130 p. 116: 3000H
 YK_OFF, YK_RUNS, YK_REVERSE, YK_FAULT = 0xC022, 0xC031, 0xC035, 0xC082  # A1000 27C p. 494
@@ -54,7 +54,7 @@ FREE = {"reference": 40.0, "output_frequency": 0.0, "fault": 0, "reference_in_fo
 
 
 def wire(model: str, status: Any, **says: Any) -> Wire:
-    """Return the drive on a wire, on which its status is the same after each of its own words."""
+    """Return a test wire with the drive, whose status does not change when it is commanded."""
     drive: Any = MAKE[model](1)
     drive.commanded = 40.0
     kind = drive.status.values
@@ -63,13 +63,13 @@ def wire(model: str, status: Any, **says: Any) -> Wire:
 
 
 def sent(found: Wire) -> list[str]:
-    """Return the frames without their checksums, which are checked here."""
+    """Return the sent frames without their checksums, after checking these."""
     assert all(checksums.rtu(frame[:-6]).hex(" ").upper() == frame for frame in found.sent)
     return [frame[:-6] for frame in found.sent]
 
 
 STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
-    # ACS550-02/U2 manual p. 246: ...0110, 100 ms, ...0111, then operation enabled with all of the ramp's bits
+    # ACS550-02/U2 manual p. 246: bits 0110, 100 ms later 0111, then operation enabled with all ramp bits.
     "abb-acs355": (
         [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS],
         (ABB + "04 76", ABB + "04 77", ABB + "04 7F"),
@@ -133,7 +133,7 @@ def test_stop_and_coast_send_the_words_of_the_manual(model: str) -> None:
     found = wire(model, status, output_frequency=[12.0, 0.0])
     found.drive.stop()
     assert sent(found) == [stop]
-    assert found.reads.count("output_frequency") == 2  # it is watched
+    assert found.reads.count("output_frequency") == 2  # the stop is watched until 0 Hz
     found.sent.clear()
     if coast is None:
         with pytest.raises(Unsupported, match="no coast"):
@@ -223,7 +223,7 @@ def test_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
     assert sent(found) == []
 
 
-# A setpoint of 25 Hz: half of 50 Hz if it is a percentage.
+# Frames for a setpoint of 25 Hz; as a percentage it is half of 50 Hz.
 SETPOINTS = {
     "abb-acs355": "01 06 00 01 27 10",  # 10000 of 20000 (ACS355 manual p. 308)
     "siemens-v20": "01 06 00 64 20 00",  # 2000H of 4000H
@@ -284,8 +284,8 @@ STATES = [
     ("abb-acs355", ABB_FAULT, {"fault": 7}, Condition.FAULT),
     ("danfoss-fc51", FC_LOCK, {}, Condition.FAULT),
     ("delta-vfd-el", 0x0501, {}, Condition.DECELERATING),
-    ("delta-vfd-el", 0x0502, {}, Condition.RUNNING),  # standby: a run at 0 Hz
-    ("delta-vfd-el", DELTA_STOP, {"fault": 0x0500}, Condition.STOPPED),  # a warning, in the high byte
+    ("delta-vfd-el", 0x0502, {}, Condition.RUNNING),  # standby: running at 0 Hz
+    ("delta-vfd-el", DELTA_STOP, {"fault": 0x0500}, Condition.STOPPED),  # the high byte is only a warning
     ("delta-vfd-el", DELTA_STOP, {"fault": 0x0031}, Condition.FAULT),
     ("invt-goodrive", 2, {}, Condition.RUNNING),
     ("invt-goodrive", 5, {}, Condition.STOPPED),
@@ -307,7 +307,7 @@ def test_status_is_decoded_to_the_condition(
     assert wire(model, status, **says).drive.state().condition is condition
 
 
-# ---- what only one profile has ----
+# ---- behaviour of single profiles ----
 
 
 @table(
@@ -338,7 +338,7 @@ def test_start_of_a_delta_that_follows_another_setpoint_is_refused(shown: float,
 
 
 def test_stop_of_an_invt_that_continues_to_jog_sends_stop_jog_immediately() -> None:
-    """At once, and not when all the time that a stop may take is over."""
+    """STOP_JOG is sent immediately, not only after the stop's timeout."""
     found = wire("invt-goodrive", GD_RUNS)
     found.drive.option["stop_time"] = 5.0
     with pytest.raises(Unconfirmed, match="5 s"):
@@ -355,7 +355,7 @@ def test_start_of_an_invt_after_a_jog_requires_a_stop() -> None:
         found.drive.start()
     assert found.sent == []
     found.say({"status": found.drive.status.values(GD_STANDBY)})
-    with pytest.raises(Unconfirmed):  # at rest, so it may be started; it is not seen to run
+    with pytest.raises(Unconfirmed):  # a start is allowed at rest; this drive never shows a run
         found.drive.start()
     assert sent(found) == [DELTA + "00 01"]
 
@@ -381,7 +381,7 @@ def test_profidrive_that_does_not_become_ready_is_switched_off() -> None:
     assert sent(found) == [ABB + "04 76", ABB + "04 77", ABB + "04 7E"]
 
 
-# ---- a family with numbers of its own for INVT's words ----
+# ---- a family with its own numbers for INVT's words ----
 
 EXCHANGED = {"forward": 1, "reverse": 2, "stop": 6, "coast": 5, "reset_fault": 7}
 
@@ -392,7 +392,7 @@ def numbered(words: Mapping[str, int], **facts: Any) -> Register[Any]:
 
 
 class Clone(Goodrive):
-    """A copy of INVT's words with 5 and 6 exchanged, and without jogs."""
+    """A family whose words are INVT's with 5 and 6 exchanged, and without jogs."""
 
     control = numbered(EXCHANGED)
 

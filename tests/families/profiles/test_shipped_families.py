@@ -1,4 +1,4 @@
-"""The families that ship as files: their tables, typed from the manuals, and their use."""
+"""The families that ship as files: their register tables, typed from the manuals, and their use."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ every_family = pytest.mark.parametrize("name", SHIPPED)
 every_profile_family = pytest.mark.parametrize("name", OF_PROFILE)
 every_commanded_family = pytest.mark.parametrize("name", COMMANDED)
 
-# How the places name the editions and public programs that [family].manual lists.
+# Names that `place` may use for the editions and public programs listed in [family].manual.
 EDITIONS = {
     "abb-acs355": ("ACS355", "ACS550-02/U2", "ACS550-01", "ACS550 p. 209"),
     "danfoss-fc51": ("FC 51", "FC 101", "FC 202", "MG02A4", "MG02C6"),
@@ -54,7 +54,7 @@ PAGE_OR_FILE = re.compile(
     r"\bp\. (A-)?\d|sheet \d|\.(py|h|c|cpp|yaml)\b|wb-community|energy-management|H300|GD100-PV"
 )
 
-# Function codes, address on the wire, name, step, unit.
+# Function codes, address as sent, name, step, unit.
 TABLES = {
     "abb-acs355": """
 03/06 0000 control           - ProfidriveControl
@@ -307,7 +307,7 @@ TABLES = {
 03/06 045A dry_run_time             1 s
 03/06 045B start_pressure_difference 0.01 kgf/cm²
 """,
-    # beside the registers of the built-in family
+    # Registers in addition to those of the built-in family.
     "erman-er-g-220-02": """
 03/06 0062 pressure_setpoint 0.01 bar
 04/00 001A water_pressure    0.01 bar
@@ -394,7 +394,7 @@ def test_no_command_except_a_stop_is_sent_before_confirmation(
         with pytest.raises(WriteForbidden, match=rf"multidrop check {name}` .*confirmed = 1"):
             call()
     assert bus.frames == []
-    drive.stop()  # which is sent all the same
+    drive.stop()  # a stop is sent even without confirmation
     assert bus.written
 
 
@@ -462,7 +462,7 @@ def test_shipped_files_are_loaded_on_demand() -> None:
     assert told.stdout.split() == [str(len(SHIPPED)), "{}", "False"]
 
 
-# ---- profiles in files of one's own ----
+# ---- profiles in users' files ----
 
 
 def load(tmp_path: Path, text: str) -> type[Drive]:
@@ -515,11 +515,11 @@ def test_adjacent_registers_are_read_in_one_request_if_the_manual_allows_it() ->
     assert {register.access for register in shipped_family("abb-acs355").readings()} == {Access.READING}
 
 
-# ---- families of other packages ----
+# ---- families of other installed packages ----
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
-    """Pretend that these entry points are installed, as name="module:attribute"; "name__" repeats a name."""
+    """Fake installed entry points, given as name="module:attribute"; "name__" repeats a name."""
     points = [EntryPoint(name.rstrip("_"), value, GROUP) for name, value in values.items()]
     monkeypatch.setattr(
         importlib.metadata, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted)
@@ -575,7 +575,7 @@ def test_unusable_package_raises_a_one_sentence_error(
         find_model("acme")
 
 
-# ---- what users' logs and lines show ----
+# ---- evidence from users' logs ----
 
 # A row of pjbardolia/energy-management, gateway/vfd_log.csv, as the drive's keypad shows it.
 CHF100A_LOG = {
