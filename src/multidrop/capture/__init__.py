@@ -1,7 +1,7 @@
 """Captures: the bytes that went over a line, in files that Wireshark opens.
 
-`CaptureWriter` writes pcapng with link type 252 (Wireshark's "exported PDU"), one packet a frame, with
-ns time stamps, direction, and the line's name as the interface's. Wireshark decodes RTU frames as
+`CaptureWriter` writes pcapng with link type 252 (Wireshark's "exported PDU"), one packet per frame, with time
+stamps in ns and direction. Each line is an interface with the line's name. Wireshark decodes RTU frames as
 Modbus RTU without configuration. With the preference `mbrtu.tcp.port` set to 502 it also distinguishes
 requests from replies if both look alike (functions 05, 06 and 08):
 
@@ -9,12 +9,12 @@ requests from replies if both look alike (functions 05, 06 and 08):
 
 Broadcasts, ASCII frames, Delixi's own frames and bytes outside of frames are shown as bytes.
 
-`Tapped` taps polled lines: their traffic goes into a capture, or is kept by a `FlightRecorder`, which
-writes the last minutes when something goes wrong.
+`Tapped` taps polled lines: their traffic goes into a capture, or to a `FlightRecorder`, which keeps the last
+minutes and writes them into a file after an anomaly.
 
-`Capture` reads these files, and pcap and pcapng files of other programs: link type 250 (RTAC serial),
-252, and frames without a header under any other, such as the user link types 147 to 162. A packet need
-not hold exactly one frame.
+`Capture` reads these files, and pcap and pcapng files of other programs: link type 250 (RTAC serial), link
+type 252, and packets of bytes without a header under other link types, such as the user types 147 to 162.
+Packets may have parts of frames, or several frames.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Captures as columns: a row for every register that was read or written, and for every miss.
+"""Decode captures to columns: a row for every register that was read or written, and for every miss.
 
-Rows are like those of a poll: `time` is the request's time stamp, and the value was taken between the time
-stamps of request and reply. A capture has only one clock, so `monotonic_ns` equals `time`.
+Rows are like those of a poll: `time` is the request's time stamp, and the drive took the value between the
+time stamps of request and reply. A capture has only one clock, so `monotonic_ns` equals `time`.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from multidrop.iso_time import format_time
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
-ROWS = 1 << 16  # limit of a batch
-_MOST_NAMES = 60_000  # limit of register names; a column's codes end at 65535
+ROWS = 1 << 16  # limit of rows per batch
+_MOST_NAMES = 60_000  # limit of register names per batch; codes of names have 16 bits
 
 
 class Decoding:
-    """The rows of a capture as batches, each of one line."""
+    """Decodes a capture to batches; each batch has rows of one line only."""
 
     def __init__(self, capture: Capture, known: Plant | None = None) -> None:
         self._capture = capture
@@ -58,12 +58,12 @@ class Decoding:
             yield from line.rest()
 
     def counts(self) -> Counter[str]:
-        """Return the numbers of exchanges, frames, unknown bytes and so on decoded so far, of all lines."""
+        """Return how many exchanges, frames, unknown bytes and so on were decoded so far, on all lines."""
         return sum((Counter(line.decoder.counts()) for line in self._lines), Counter())
 
 
 class _LineDecoding:
-    """The decoder of one line, and the rows of its next batch."""
+    """The decoder of one line's bytes, and the rows of its next batch."""
 
     def __init__(self, line: PlantLine | None) -> None:
         self._lookup = RegisterLookup(line)
@@ -94,7 +94,7 @@ class _LineDecoding:
         if len(self._registers) > _MOST_NAMES:
             return False
         target = self._lookup.find(framing, request)
-        is_broadcast = request.address == 0 and framing is not Framing.TCP  # has no reply
+        is_broadcast = request.address == 0 and framing is not Framing.TCP  # a broadcast has no reply
         block = None if is_broadcast else self._layout(target)
         return self.decoder.know(block)
 
@@ -122,14 +122,19 @@ _TABLES = {
     0x10: "holding_register",
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
-_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # limit for a reply, whatever its request says
-_WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # by function
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # most registers in a reply, even if the request asks for more
+_WRITES = {  # function code of a request: the write functions of registers that it may write
+    0x05: (0x05,),
+    0x06: (0x06,),
+    0x0F: (0x05, 0x0F),
+    0x10: (0x06, 0x10),
+}
 _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
 
 
 @dataclass(frozen=True)
 class RegisterPlace:
-    """A register (None: unknown) and its offset in an exchange's data, in words or bits."""
+    """A register (None: unknown) and its offset in the data of an exchange, in 16-bit words or in bits."""
 
     name: str
     at: int
@@ -139,7 +144,7 @@ class RegisterPlace:
 
 @dataclass(frozen=True)
 class RequestTarget:
-    """The drive that a request is for, and the registers that it reads or writes."""
+    """The drive that a request addresses, and the registers that the request reads or writes."""
 
     drive: str
     is_write: bool
@@ -154,7 +159,7 @@ def line_of(plant: Plant | None, name: str) -> PlantLine | None:
 
 
 class RegisterLookup:
-    """The registers of one line's drives."""
+    """Finds the registers that a request on one line reads or writes."""
 
     def __init__(self, line: PlantLine | None) -> None:
         drives = [polled.drive for polled in line.drives] if line else []
@@ -184,7 +189,7 @@ def _known(
 
 
 def _offset(register: Register[Any], request: Message) -> int | None:
-    """Return the register's offset in the data; None if the request does not cover the whole register."""
+    """Return the register's offset in the request's data; None if the data lack a part of the register."""
     if register.table.carrier is Carrier.NUMBER:
         return 0
     end, reach = request.start + max(request.count, 1), register.reach
@@ -203,7 +208,7 @@ def _raw(framing: Framing, request: Message) -> tuple[RegisterPlace, ...]:
     return tuple(RegisterPlace(f"{table}_{request.start + at}", at, number_format) for at in range(count))
 
 
-_MOST_SHOWN = 16  # raw registers in a line of text
+_MOST_SHOWN = 16  # limit of raw registers in a line of text
 _MOST_BYTES = 32
 
 
@@ -214,7 +219,7 @@ class ExchangeFormatter:
         self._lookup = lookup
 
     def text(self, sniffed: Sniffed) -> str:
-        """Return one line of text, without the bus line's name."""
+        """Return the exchange as one line of text, without the name of the serial line."""
         clock = _clock(sniffed.time_ns)
         if isinstance(sniffed, Junk):
             return f"{clock}  unknown: {_hex(sniffed.raw)}"
@@ -247,7 +252,7 @@ class ExchangeFormatter:
         return values + (": no reply" if exchange.reply is None else _delay(exchange))
 
     def json(self, sniffed: Sniffed) -> dict[str, Any]:
-        """Return an object for JSON, without the bus line's name."""
+        """Return the exchange as an object for JSON, without the name of the serial line."""
         found: dict[str, Any] = {"time": format_time(sniffed.time_ns)}
         if isinstance(sniffed, Junk):
             return found | {"unknown": sniffed.raw.hex(" ").upper()}
@@ -280,7 +285,7 @@ class ExchangeFormatter:
 
 
 def data_of(exchange: SniffedExchange, request: Message) -> bytes:
-    """Return the data that was read or written: a write's reply does not always repeat it."""
+    """Return the data that was read or written, for a write from its request: some replies do not repeat it."""
     if exchange.framing is Framing.DELIXI and request.function == 0x02:
         return struct.pack(">I", request.start)
     if exchange.framing is not Framing.DELIXI and request.function >= 0x05:
@@ -289,7 +294,7 @@ def data_of(exchange: SniffedExchange, request: Message) -> bytes:
 
 
 def _clock(time_ns: int) -> str:
-    """Return the local time of day, to the microsecond."""
+    """Return the local time of day with microseconds, such as 09:30:00.123456."""
     return f"{datetime.fromtimestamp(time_ns // 10**9).strftime('%H:%M:%S')}.{time_ns % 10**9 // 1000:06}"
 
 

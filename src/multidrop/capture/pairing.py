@@ -1,4 +1,4 @@
-"""Pair sniffed requests with their replies; report other bytes."""
+"""Pair sniffed requests with their replies; report bytes outside of frames as junk."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 
 from multidrop.core import FrameSpan, Framing, Kind, Message, Side
 
-_MOST_JUNK = 4096  # bytes in one Junk
+_MOST_JUNK = 4096  # limit of bytes in one Junk
 _COUNTED = ("exchanges", "broadcasts", "unanswered", "strays", "unknown_bytes")
 
 
 def _is_broadcast(framing: Framing, request: Message) -> bool:
-    """Return True for address 0, which over Modbus TCP is a unit id like any other."""
+    """Return True for a request to address 0, except on Modbus TCP, where 0 is an ordinary unit id."""
     return request.address == 0 and framing is not Framing.TCP
 
 
 @dataclass(frozen=True)
 class SniffedExchange:
-    """A request and its reply. One of the two is None if it was not sniffed or never sent.
+    """A request and its reply; either is None if it was not sniffed or never sent.
 
-    `is_sure` is False if the request may actually be the reply that confirms an earlier request.
+    `is_sure` is False if the request may be a reply: replies to functions 05, 06 and 08 repeat the request.
     """
 
     framing: Framing
@@ -38,7 +38,7 @@ class SniffedExchange:
 
 @dataclass(frozen=True)
 class Junk:
-    """Bytes that are part of no frame."""
+    """Bytes that belong to no frame."""
 
     time_ns: int
     raw: bytes

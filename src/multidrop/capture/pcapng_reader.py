@@ -1,7 +1,7 @@
 """Read captures: pcap and pcapng files, from multidrop or other programs, as a stream of bytes per line.
 
-A capture is read in pieces, because it may be larger than memory. It is not mapped into memory: if the file
-were truncated during that, a mapping would crash the process, whereas reading raises an error.
+A capture is read in pieces, because it may be larger than memory. It is not mapped into memory: if another
+program truncated the file, a mapping would crash the process, whereas reading raises an error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _OLD_PACKET, _SIMPLE_PACKET = 2, 3
 _IF_OFFSET = 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
 _MOST_OFFSET = 1 << 33  # s; times in ns since 1970 must fit into 64 bits
-_PCAP = {  # by the first four bytes: whether it is big-endian, and ticks per second
+_PCAP = {  # by a file's first four bytes: True if it is big-endian, and its clock ticks per second
     b"\xd4\xc3\xb2\xa1": (False, 10**6),
     b"\xa1\xb2\xc3\xd4": (True, 10**6),
     b"\x4d\x3c\xb2\xa1": (False, 10**9),
@@ -38,15 +38,14 @@ _NO_SERIAL_LINE = {1: "Ethernet", 101: "IP", 105: "Wi-Fi", 113: "Linux cooked", 
 
 
 class CaptureError(ValueError):
-    """A file is not a capture, or is damaged from some byte on."""
+    """A file is not a capture, or is damaged; the message has the position of the damage."""
 
 
 class Capture:
-    """A capture file; leaving the `with` block closes it. Raises CaptureError, and OSError.
+    """A capture file that is read; leaving the `with` block closes it. Raises CaptureError and OSError.
 
-    `lines` has the name of every interface found so far, and `streams` its bytes. `truncated` is the number
-    of bytes of an incomplete packet at the file's end, which is left if the writer was killed or the disk was
-    full.
+    `lines` has the name of every interface found so far, and `streams` the bytes of each. `truncated` is the
+    number of bytes of an incomplete packet at the file's end: its writer was killed, or the disk was full.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -79,7 +78,7 @@ class Capture:
     def _begin(self) -> None:
         if not self._file.seekable():  # a serial port, or a pipe
             raise CaptureError(f"{self.path} is not a capture: it is no file")
-        self._size = self._file.seek(0, SEEK_END)  # bytes appended later are not read
+        self._size = self._file.seek(0, SEEK_END)  # bytes that are appended later are not read
         if not self._size:
             raise CaptureError(f"{self.path} is not a capture: it is empty")
         magic = self._piece(0, 4)
@@ -100,10 +99,10 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it does not begin like pcap or pcapng")
 
     def __iter__(self) -> Iterator[None]:
-        """Fill `streams` in steps. After each step, and at the end, the caller empties all streams."""
+        """Read a part of the file into `streams`, and yield; the caller then takes all bytes from `streams`."""
         unpacker = self._unpacker
         assert unpacker is not None
-        seen = unpacker.at  # end of the bytes read
+        seen = unpacker.at  # position in the file after the last byte read
         while True:
             state = unpacker.unpack()
             if state is Unpacked.NONSENSE:
@@ -125,7 +124,7 @@ class Capture:
         yield
 
     def _piece(self, at: int, most: int) -> bytes:
-        """Return up to `most` bytes of the file from `at` on."""
+        """Return up to `most` bytes of the file from position `at`."""
         self._file.seek(at)
         piece = self._file.read(most)
         if len(piece) < min(most, self._size - at):
@@ -201,7 +200,7 @@ class Capture:
             at += 4 + size + -size % 4
 
     def _order_at(self, at: int) -> str:
-        """Return the byte order of the section that starts at `at`."""
+        """Return the byte order ("<" or ">") of the pcapng section that starts at position `at`."""
         magic = self._piece(at + 8, 4)
         if magic not in (b"\x1a\x2b\x3c\x4d", b"\x4d\x3c\x2b\x1a"):
             raise self._damaged(at)

@@ -11,7 +11,7 @@ from multidrop.core import Side, Wrappings
 from multidrop.recording.format import AppendFile, RecordingError, writing
 
 EXPORTED_PDU = 252
-APPLICATION = b"multidrop"  # start of the application's name in our captures
+APPLICATION = b"multidrop"  # start of the application name in captures of this library
 
 SECTION, INTERFACE = 0x0A0D0D0A, 1
 _END, _COMMENT = 0, 1
@@ -25,10 +25,10 @@ _TCP = 2
 
 
 class CaptureWriter:
-    """A capture that is being written; leaving the `with` block closes it. Raises RecordingError.
+    """A new capture file; leaving the `with` block closes it. All methods raise RecordingError.
 
     `lines` are the names of the lines whose packets will be appended. Each packet is passed to the operating
-    system immediately, so that a crash of the process loses none.
+    system immediately, so that a crash of the process loses no packet.
     """
 
     def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
@@ -51,18 +51,18 @@ class CaptureWriter:
             raise
 
     def write(self, raw: bytes, side: Side, time_ns: int, line: str) -> None:
-        """Append bytes, such as a frame, that were on the line at `time_ns` (UTC)."""
+        """Append bytes, such as a frame, that were on the line at `time_ns` (ns UTC)."""
         if line not in self._lines:
             self._declare(line)
         self.append(WRAPPINGS.packet(self._lines[line], side, time_ns, raw))
 
     def append(self, packets: bytes) -> None:
-        """Append packets in pcapng format; interface n is the n-th of `lines`."""
+        """Append packets that are already in pcapng format; interface n is the n-th of `lines`."""
         with writing(self.path):
             self._file.append(packets)
 
     def report(self, anomalies: list[str]) -> None:
-        """Ignore anomalies: a capture has all packets."""
+        """Ignore anomalies: a capture has all packets anyway."""
 
     def _declare(self, line: str) -> None:
         self._lines[line] = len(self._lines)
@@ -99,7 +99,7 @@ def _tag(code: int, value: bytes) -> bytes:
 
 
 def _head(dissector: bytes, sender: tuple[bytes, int] | None, target: tuple[bytes, int]) -> bytes:
-    """Return the header of a frame: its dissector, sender and receiver."""
+    """Return the header of a packet: Wireshark's dissector for its bytes, their sender and receiver."""
     tags = _tag(_DISSECTOR, dissector)
     if sender:
         tags += _tag(_IPV4_SOURCE, sender[0]) + _tag(_IPV4_TARGET, target[0])
@@ -113,7 +113,7 @@ _MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
 _FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
 _OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
 _INBOUND = (_EPB_FLAGS, struct.pack("<I", 1))
-_PACKETS = {  # side: dissector of binary frames, sender, target, options
+_PACKETS = {  # side: dissector of binary frames, sender, receiver, packet options
     Side.EITHER: (_BYTES, None, _MASTER, [(_COMMENT, b"no frame")]),
     Side.ASKING: (_RTU, _MASTER, _DRIVE, [_OUTBOUND]),
     Side.ANSWERING: (_RTU, _DRIVE, _MASTER, [_INBOUND]),
@@ -123,7 +123,9 @@ _PACKETS = {  # side: dissector of binary frames, sender, target, options
 
 
 def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
-    """Return a line's wrappings: `frames` is the dissector of frames, `texts` of those starting with ':'."""
+    """Return the headers and options of a line's packets.
+
+    `frames` is the dissector for frames, and `texts` for frames that start with ':' as ASCII frames do."""
     return Wrappings(
         {
             (side, is_text): (

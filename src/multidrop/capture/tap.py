@@ -1,4 +1,4 @@
-"""Tap polled lines: hand all of their traffic to captures and flight recorders."""
+"""Tap polled lines: pass all of their traffic to captures and flight recorders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from multidrop.transport.clock import now_ns
 
 
 class Sink(Protocol):
-    """A receiver of the packets and anomalies of tapped lines."""
+    """Receives the packets and anomalies of tapped lines: a capture or a flight recorder."""
 
     def append(self, packets: bytes) -> None: ...
 
@@ -26,7 +26,7 @@ class Sink(Protocol):
 
 
 class Tapped:
-    """Taps on these lines, by name. Call `collect` several times a second.
+    """Taps lines, given by name, and passes their traffic to sinks. Call `collect` several times a second.
 
         poller = Poller(plant)
         with CaptureWriter("hall.pcapng", list(poller.buses)) as capture:
@@ -64,7 +64,7 @@ class Tapped:
         return sum(tap.lost for tap in self._taps)
 
     def close(self) -> None:
-        """Pass the remaining traffic to the sinks; here a closed port is not an anomaly."""
+        """Pass the remaining traffic to the sinks. That the ports are closed now is not an anomaly."""
         self._hand_on()
 
     def __enter__(self) -> Self:
@@ -74,18 +74,18 @@ class Tapped:
         self.close()
 
 
-AFTER_S = 2.0  # a file also has this much traffic after the anomaly
+AFTER_S = 2.0  # a file also has the traffic of this time after the anomaly
 PAUSE_S = 60.0  # least time between two files, so that a noisy line does not fill the disk
 _NAME = re.compile(r"flight-\d{8}T\d{6}Z\.pcapng")
-_MOST_NAMED = 20  # anomalies in a file's comment
+_MOST_NAMED = 20  # limit of anomalies in a file's comment
 
 
 class FlightRecorder:
-    """Keeps the last `seconds` of the lines' traffic in memory, at most `most_bytes`.
+    """Keeps the traffic of the last `seconds`, at most `most_bytes`, and writes it after an anomaly.
 
-    `AFTER_S` after an anomaly, but at least `PAUSE_S` after the last file, it writes a capture
-    `flight-<UTC>.pcapng` into `directory`, with the anomaly in its comment. The newest `most_files` captures
-    are kept. `written` lists this recorder's files. Raises RecordingError.
+    `AFTER_S` after an anomaly, but at least `PAUSE_S` after its last file, it writes a capture
+    `flight-<UTC>.pcapng` into `directory`, with the anomaly in the file's comment. It keeps the newest
+    `most_files` captures. `written` lists the files of this recorder. Methods raise RecordingError.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class FlightRecorder:
             self._bytes -= len(self._packets.popleft()[1])
 
     def report(self, anomalies: Sequence[str]) -> None:
-        """Record anomalies, and write a capture if one is due."""
+        """Record these anomalies, and write a capture file if it is due."""
         now = now_ns()
         if anomalies and not self._anomalies:
             self._due_ns = max(now + round(AFTER_S * 1e9), self._next_ns)
@@ -132,13 +132,13 @@ class FlightRecorder:
             self._write(now)
 
     def close(self) -> None:
-        """Write the capture that is still due, if any."""
+        """Write a capture file if anomalies were recorded since the last file."""
         if self._anomalies and now_ns() >= self._next_ns:
             self._write(now_ns())
 
     def _write(self, now: int) -> None:
         second = (now + utc_minus_monotonic_ns()) // 10**9
-        while (path := self.directory / _name(second)).exists():  # another recorder's file
+        while (path := self.directory / _name(second)).exists():  # another recorder has a file with this name
             second += 1
         with CaptureWriter(path, self._lines, "; ".join(dict.fromkeys(self._anomalies))) as capture:
             for _, packets in self._packets:
@@ -155,7 +155,7 @@ def _name(second: int) -> str:
     return f"flight-{datetime.fromtimestamp(second, UTC):%Y%m%dT%H%M%SZ}.pcapng"
 
 
-SILENT = 3  # exchanges in a row without a reply
+SILENT = 3  # exchanges in a row without a reply after which a drive is reported as silent
 _BAD = (
     Status.NO_START,
     Status.BAD_CHARACTER,
@@ -169,7 +169,7 @@ _BAD = (
 
 
 class AnomalyWatch:
-    """Finds the anomalies of one line."""
+    """Finds the anomalies of one line, such as damaged replies, silent drives and lost ports."""
 
     def __init__(self, name: str, bus: Bus) -> None:
         self._name = name

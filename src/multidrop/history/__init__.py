@@ -3,21 +3,21 @@
 | in the folder                             | contents                                                   |
 |-------------------------------------------|------------------------------------------------------------|
 | `rows.NUMBER.arrows`                      | a segment as it was recorded; the last one still grows     |
-| `rows/NUMBER.BEGIN-END.parquet`           | the same rows, ordered by drive and time                   |
-| `tens/FIRST-LAST.BEGIN-END.parquet`       | the same segments, with ten seconds of a register per row  |
-| `damaged/rows.NUMBER.arrows`              | a damaged segment; `rows` has its readable part            |
+| `rows/NUMBER.BEGIN-END.parquet`           | the rows of a closed segment, ordered by drive and time    |
+| `tens/FIRST-LAST.BEGIN-END.parquet`       | summaries of segments: ten seconds of a register per row   |
+| `damaged/rows.NUMBER.arrows`              | a damaged segment; `rows/` has its readable part           |
 
-Numbers grow, also across restarts. `tens` are summaries of ten seconds. Three rules make a reader use each
-row exactly once:
+NUMBER, FIRST and LAST are segment numbers, which only grow, also across restarts. BEGIN and END are UTC, such
+as 20261122T213700Z, and enclose the times of all rows in the file. Three rules make a reader use each row
+exactly once:
 
-1. Rows of a segment are read from `rows/` if they are there, else from `rows.NUMBER.arrows`. 2. Tens are read
-from the file with the widest range of numbers; without such a file they are computed from the
-   rows.
-3. An incomplete file has a name that starts with a dot. It is renamed when it is complete and on the disk,
-   `tens` before `rows`. Then the files that it replaces are removed. A reader lists the folder, then `rows/`,
-   then `tens/`, so it finds the old or the new file. The rules above prevent that it uses both.
-
-BEGIN and END are UTC, such as 20261122T213700Z, and enclose the times of all rows in the file.
+1. Rows of a segment are read from `rows/` if they are there, else from `rows.NUMBER.arrows`.
+2. Summaries are read from the file in `tens/` with the widest range of segment numbers. Without such a file
+   they are computed from the rows.
+3. An incomplete file has a name that starts with a dot. A file gets its final name when it is complete and
+   on the disk, in `tens/` before `rows/`. Then the files that it replaces are removed. A reader lists the
+   folder, then `rows/`, then `tens/`, so it finds the replaced files or the new one. If it finds both, rules
+   1 and 2 select one of them.
 """
 
 from multidrop.history.buckets import Buckets as Buckets

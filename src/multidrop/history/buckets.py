@@ -1,4 +1,4 @@
-"""Buckets: the least, mean and greatest value of a register in each of many equal intervals."""
+"""Buckets: the least, mean and greatest value of a register in each of many equal time intervals."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
-_BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # ns
-_EMPTY = 0, 0, 0.0, math.inf, -math.inf  # values, misses, sum of values, least, most
+_BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # ns: earlier and later than any time of a row
+_EMPTY = 0, 0, 0.0, math.inf, -math.inf  # numbers of values and misses; sum, least and most of the values
 FINE_NS = (
     2 * SECOND_NS
-)  # shorter buckets are made from rows, longer ones from tens, at a hundredth of the cost
+)  # shorter buckets are made from rows; others from ten-second summaries, at a hundredth of the cost
 
 
 @dataclass(frozen=True)
 class Buckets:
-    """A register in buckets of equal length; each list has one entry per bucket.
+    """A register's values in time buckets of equal length; each list has one entry per bucket.
 
-    A bucket starts at `begin + number * step`, in ns. Without values, `least`, `mean` and `most` are None;
-    `missed` is above 0 if the register was polled, else 0.
+    Bucket i starts at `begin + i * step`, in ns. In a bucket without values, `least`, `mean` and `most` are
+    None, and `missed` is above 0 if the register was polled, else 0.
 
-    All values are of one quantity, the newest in the range; `unit` is its unit, if recorded. `left_out` lists
-    the units of excluded rows: they were recorded while the name belonged to another register.
+    All values have the register's newest quantity in the range; `unit` is its unit, if recorded. `left_out`
+    lists the units of excluded rows, which were recorded while the name belonged to another register.
     """
 
     begin: int  # UTC in ns
     step: int  # in ns
-    n: list[int]  # values
-    missed: list[int]  # misses
+    n: list[int]  # number of values
+    missed: list[int]  # number of misses
     least: list[float | None]
     mean: list[float | None]
     most: list[float | None]
@@ -50,7 +50,7 @@ class Buckets:
 
 @dataclass(frozen=True)
 class Grid:
-    """Buckets of equal length that cover a range."""
+    """The times of buckets of equal length that cover a range."""
 
     begin: int  # in ns
     step: int
@@ -62,11 +62,11 @@ class Grid:
 
     @property
     def is_of_tens(self) -> bool:
-        """True if every edge is a multiple of ten seconds."""
+        """True if every bucket starts and ends at a multiple of ten seconds."""
         return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
 
     def bucket_of(self, time: int) -> tuple[int, int, int]:
-        """Return the number, start and end of the bucket of `time`; the number is -1 outside the grid."""
+        """Return index, start and end of the bucket of `time`; outside the grid the index is -1."""
         if time < self.begin:
             return -1, _BEFORE_ALL, self.begin
         if time >= self.end:
@@ -76,10 +76,10 @@ class Grid:
 
 
 def grid_of(begin: int, end: int, points: int) -> Grid:
-    """Return at most `points` buckets that cover the range; from 2 s on, of whole tens of seconds or more.
+    """Return a grid of at most `points` buckets that cover the range from `begin` to `end`, in ns.
 
-    The first bucket may start before `begin`. Raises ValueError for an empty range, or for points outside 1
-    to 100000.
+    Buckets that would take 2 s or more are rounded up to 10 s or a multiple of it. The first of these may
+    start before `begin`. Raises ValueError for an empty range, or for points outside 1 to 100000.
     """
     if not 1 <= points <= MOST_POINTS:
         raise ValueError(f"invalid points = {points}: write 1 to {MOST_POINTS}")
@@ -91,19 +91,19 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
     for step in _handy_steps(least):
         first = begin // step * step
         needed = -(-(end - first) // step)
-        if needed <= max(points, 2):  # a range shorter than a bucket may cross an edge
+        if needed <= max(points, 2):  # with points = 1, a range may still cross the start of a second bucket
             return Grid(first, step, needed)
     raise AssertionError("steps grow for ever")
 
 
 def _handy_steps(least: int) -> Iterator[int]:
-    """Yield round steps, of tens of seconds up to days, from `least` on."""
+    """Yield round bucket lengths in ns, from 10 s to any number of days, that are at least `least`."""
     yield from (seconds * SECOND_NS for seconds in STEPS_S if seconds * SECOND_NS >= least)
     yield from (days * 86400 * SECOND_NS for days in count(max(2, least // (86400 * SECOND_NS))))
 
 
 class Accumulator:
-    """Gathers one register's values in the buckets of a grid."""
+    """Sums up one register's values and misses in each bucket of a grid."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -112,7 +112,7 @@ class Accumulator:
         self._least, self._most = [math.inf] * grid.points, [-math.inf] * grid.points
 
     def add(self, bucket: int, n: int, missed: int, total: float, least: float, most: float) -> None:
-        """Add `n` values, with their sum, least and most, and `missed` misses to a bucket."""
+        """Add `n` values, with their sum, least and most, and `missed` misses to the bucket at this index."""
         self._missed[bucket] += missed
         if n:
             self._n[bucket] += n
@@ -123,7 +123,7 @@ class Accumulator:
     def add_rows(self, times: Iterable[int], values: Iterable[float], valid: Iterable[int]) -> None:
         """Add rows with times in ns; an invalid row is a miss. Rows outside the grid are skipped.
 
-        Successive rows are mostly in the same bucket, so they are summed before they are added.
+        Successive rows are mostly in the same bucket, so a run of such rows is summed before it is added.
         """
         grid, bucket, begin, end = self._grid, -1, 0, 0
         n, missed, total, least, most = _EMPTY
@@ -171,7 +171,7 @@ def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
 
 
 class UnitBuckets:
-    """The buckets of one register, by unit if rows state their own unit, as a hub's rows do."""
+    """The buckets of one register, separate for each unit that rows state, as the rows of a fleet's hub do."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid

@@ -1,4 +1,4 @@
-"""Compact closed segments: `python -m multidrop.history.compact FOLDER --below NUMBER`, a process of its own.
+"""Compact closed segments in a separate process: `python -m multidrop.history.compact FOLDER --below NUMBER`.
 
 The process may be killed at any moment and started again. A new file gets its final name when it is complete
 and on the disk; the files that it replaces are removed after that.
@@ -23,7 +23,7 @@ from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.segments import FileLock, segments_of
 
-MEMORY = "100MB"  # limit for DuckDB; the process takes about 80 MB more
+MEMORY = "100MB"  # limit for DuckDB; the whole process takes about 80 MB more
 WITH_UNITS = """
 create temp view with_units as select recorded.*, unit from recorded left join units using (drive, register)
 """
@@ -36,11 +36,11 @@ from {} group by all order by drive, register, time
 """
 MERGED = "select * exclude filename from {} order by drive, register, time"
 MERGED_ROWS = "select * exclude filename from {} order by drive, time"
-MOST_MERGED = 200_000_000  # bytes of files of rows that are merged into one
+MOST_MERGED = 200_000_000  # limit in bytes for the rows files that are merged into one file
 
 
 def main(words: list[str] | None = None) -> int:
-    """Compact a folder, unless another process is doing so; return 0 in both cases."""
+    """Compact a folder, unless another process is compacting it; return 0 in both cases."""
     parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
@@ -59,9 +59,10 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
-    """Convert segments below this number to Parquet, and merge the tens of each past hour and day.
+    """Convert segments with numbers under `below` to Parquet, and merge the tens of each past hour and day.
 
-    With `merge_rows`, also merge the rows of each past hour, and make tens for files of rows that lack them.
+    "Tens" are ten-second summaries, as in the package's docstring. With `merge_rows`, also merge the rows of
+    each past hour, and compute tens that are missing for files in `rows/`.
     """
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
@@ -83,7 +84,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove a killed process's leftovers: incomplete files, and files that others replace."""
+    """Remove what a killed process left: incomplete files, and files that newer files replace."""
     for directory in (folder / "rows", folder / "tens"):
         for path in directory.glob(".*.part"):
             path.unlink()
@@ -106,8 +107,8 @@ def _is_whole(path: Path) -> bool:
 
 
 def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
-    """Remove a compacted segment; keep a damaged one for repair."""
-    with suppress(FileNotFoundError):  # removed because of its age
+    """Remove a compacted segment, or move it to `damaged/` if it is damaged."""
+    with suppress(FileNotFoundError):  # the segment was already removed because of its age
         if is_damaged and path.stat().st_size:
             path.replace(folder / "damaged" / path.name)
         else:
@@ -123,7 +124,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
             metadata = dict(reader.metadata)
             if reader.truncated:
                 damage.append(f"{path} ends within a batch: its last {reader.truncated} bytes were skipped")
-        except FileNotFoundError:  # removed because of its age
+        except FileNotFoundError:  # the segment was removed because of its age
             return
         except ValueError as error:
             damage.append(str(error))
@@ -151,7 +152,7 @@ def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
 
 
 def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | None = None) -> None:
-    """Write a Parquet file, which gets its final name when it is on the disk."""
+    """Write a query's rows into a Parquet file, which gets its final name when it is on the disk."""
     part = path.with_name(f".{path.name}.part")
     copy_out(database, query, part, metadata)
     _on_disk(part)
@@ -161,7 +162,7 @@ def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | Non
 
 def _on_disk(path: Path) -> None:
     is_windows = sys.platform == "win32"
-    if is_windows and path.is_dir():  # Windows cannot open folders, and needs no flush of their entries
+    if is_windows and path.is_dir():  # Windows cannot open folders, and does not need to flush them
         return
     file = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)
     try:
@@ -171,16 +172,17 @@ def _on_disk(path: Path) -> None:
 
 
 def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
-    """Return the numbers of segments whose rows are in no file of tens."""
+    """Return the numbers of all segments that none of these files of ten-second summaries covers."""
     found = {number for number, _ in segments_of(folder / STEM)}
     found |= {file.first for file in parquet_files(folder / "rows")}
     return found - {number for file in tens for number in range(file.first, file.last + 1)}
 
 
 def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
-    """Return the groups of files to merge: one for each past hour or day (`seconds`).
+    """Return the groups of files to merge: one group for each past period of `seconds`, an hour or a day.
 
-    A group is not merged while a segment within it has no tens, because the merged file would hide that.
+    A group is left out while a segment within it lacks tens: the merged file would hide that they are
+    missing.
     """
     runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
     return [
@@ -200,7 +202,7 @@ def _merge(database: Database, folder: Path, run: list[HistoryFile]) -> None:
 
 
 def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
-    """Yield groups of neighbouring files that may be merged: each group has at most MOST_MERGED bytes."""
+    """Yield groups of two or more neighbouring files that can be merged into at most MOST_MERGED bytes."""
     part: list[HistoryFile] = []
     size = 0
     for file in run:
@@ -216,7 +218,7 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
 
 
 def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> None:
-    """Merge these files into one, with the metadata of the last."""
+    """Merge these rows files into one file, which gets the metadata of the last of them."""
     begin, end = min(file.begin for file in part), max(file.end for file in part)
     name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
     with database.cursor() as cursor:
@@ -228,7 +230,7 @@ def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> No
 
 
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
-    """Make tens for files of rows that have none."""
+    """Write the ten-second summaries of those of these rows files that have none in `tens/`."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:
@@ -239,10 +241,9 @@ def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> Non
 def be_low() -> None:
     """Lower this process's priority, if the system allows it.
 
-    Otherwise this process would inherit SCHED_RR from a recorder that uses it, and delay the recorder's
-    polling.
+    A recorder may use SCHED_RR. This process would inherit that, and delay the recorder's polling.
     """
-    with suppress(OSError, AttributeError):  # Windows and macOS have no such call
+    with suppress(OSError, AttributeError):  # Windows and macOS lack the function
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with suppress(OSError):
         os.nice(19)

@@ -16,7 +16,7 @@ from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
 
-MOST_INSERTED = 60_000  # rows at a time: with names as text they take 70 bytes each
+MOST_INSERTED = 60_000  # rows per insert; each takes 70 bytes, as its names are text
 TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
@@ -43,9 +43,10 @@ def connect(memory: str, spill: Path | None = None) -> Any:
 
 
 class Database:
-    """A database in memory, opened on first use: that takes 20 ms of processor time.
+    """A database in memory; opened on first use, because opening takes 20 ms of CPU time.
 
-    Data that does not fit into memory goes to the folder `spill`, or to a temporary folder if that is None.
+    Data that does not fit into memory goes to the folder `spill`, or to a temporary folder if `spill` is
+    None.
     """
 
     def __init__(self, memory: str, spill: Path | None = None) -> None:
@@ -76,7 +77,7 @@ class Database:
 
 
 class ArrowStream:
-    """Batches as an Arrow stream for DuckDB, which requests a new stream for each query."""
+    """Batches as an Arrow stream for DuckDB. DuckDB requests a new stream for each query."""
 
     def __init__(self, batches: Iterable[Rows]) -> None:
         self._arrays = [rows.arrow() for rows in batches]
@@ -122,7 +123,7 @@ def copy_out(
     metadata: Metadata | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write a query's rows into a Parquet file; return their number."""
+    """Write a query's rows into a Parquet file; return the number of rows."""
     form = FORM
     if metadata is not None:
         form += f", kv_metadata {{{METADATA_KEY}: {quoted(json.dumps(metadata, ensure_ascii=False))}}}"
@@ -131,7 +132,7 @@ def copy_out(
 
 
 def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Rows]:
-    """Yield the rows that result from a query for the columns of a recording."""
+    """Yield the rows of a query whose columns are those of a recording."""
     import nanoarrow
 
     for array in nanoarrow.c_array_stream(database.sql(query, params=dict(values))):
@@ -146,7 +147,7 @@ def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Ro
 
 
 def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
-    """Return the metadata stored in a Parquet file of a history."""
+    """Return the recording's metadata from a Parquet file of a history."""
     query = f"select decode(value) from parquet_kv_metadata({quoted(str(path))}) where decode(key) = $key"
     found = database.execute(query, {"key": METADATA_KEY}).fetchone()
     metadata: dict[str, Any] = json.loads(found[0]) if found else {}
@@ -154,7 +155,7 @@ def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
 
 
 def texts_of_metadata(database: Any, paths: Iterable[Path]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each distinct metadata text of these Parquet files, with the files that contain it."""
+    """Yield each distinct metadata text in these Parquet files, with the names of the files that contain it."""
     query = f"""select decode(value), list(file_name) from parquet_kv_metadata({_list(paths)})
         where decode(key) = $key group by value"""
     yield from database.execute(query, {"key": METADATA_KEY}).fetchall()
@@ -165,12 +166,12 @@ def quoted(text: str) -> str:
 
 
 def files_of(paths: Iterable[Path]) -> str:
-    """Return the SQL of a table of Parquet files."""
+    """Return the SQL expression that reads these Parquet files as one table."""
     return f"read_parquet({_list(paths)})"
 
 
 def with_units(paths: Iterable[Path]) -> str:
-    """Return the SQL of a table of Parquet files with their names; `unit` is null if a file lacks it."""
+    """Return the SQL that reads Parquet files as one table, with file names; a missing `unit` is null."""
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
     return f"(select * from {files} union all by name select null::varchar as unit where false)"
 

@@ -20,7 +20,7 @@ _NAME = re.compile(r"(\d{8,})(?:-(\d{8,}))?\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parq
 
 
 class HistoryFile(NamedTuple):
-    """A Parquet file: its first and last segment, and UTC in s before and after all its rows."""
+    """A Parquet file: its path, its first and last segment, and a time span in s UTC that has all its rows."""
 
     path: Path
     first: int
@@ -34,7 +34,7 @@ class HistoryFile(NamedTuple):
 
 
 def file_name(first: int, last: int, least_ns: int, most_ns: int) -> str:
-    """Return the name of a Parquet file of segments `first` to `last` and times `least_ns` to `most_ns`."""
+    """Return the file name for segments `first` to `last` with row times from `least_ns` to `most_ns`."""
     numbers = f"{first:08d}" if first == last else f"{first:08d}-{last:08d}"
     begin, end = least_ns // SECOND_NS, -(-most_ns // SECOND_NS)
     return f"{numbers}.{_text(begin)}-{_text(end)}.parquet"
@@ -49,20 +49,20 @@ def _second(text: str) -> int:
 
 
 def parquet_files(directory: Path) -> list[HistoryFile]:
-    """Return a directory's Parquet files, the oldest first; [] without a directory."""
+    """Return a directory's Parquet files, the oldest first; [] if the directory does not exist."""
     found = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for path in directory.iterdir():
             if match := _NAME.fullmatch(path.name):
                 first, last, begin, end = match.groups()
-                with suppress(ValueError):  # the name has no valid date
+                with suppress(ValueError):  # skip a file without valid dates in its name
                     file = HistoryFile(path, int(first), int(last or first), _second(begin), _second(end))
                     found.append(file)
     return sorted(found, key=lambda file: (file.first, -file.last))
 
 
 def widest(files: list[HistoryFile]) -> list[HistoryFile]:
-    """Return the files whose range of segments is not inside another file's range, in order."""
+    """Return the files whose range of segments is not part of another file's range, in order of segments."""
     found: list[HistoryFile] = []
     for file in files:
         if not found or file.first > found[-1].last:
@@ -74,7 +74,7 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 class Listing:
     """The current files of a history; each row is in one file."""
 
-    segments: dict[int, Path] = field(default_factory=dict)  # by number: those that are not in `rows`
+    segments: dict[int, Path] = field(default_factory=dict)  # by number: segments not compacted into `rows` yet
     rows: dict[int, HistoryFile] = field(default_factory=dict)
     tens: list[HistoryFile] = field(default_factory=list)
 

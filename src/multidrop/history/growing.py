@@ -1,4 +1,4 @@
-"""A segment that is not compacted yet: the rows and tens of requested series."""
+"""Read a segment that is not compacted yet: the rows and ten-second summaries ("tens") of requested series."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
 MOST_TENS = 4096  # series whose tens are cached; limited because queries may name unknown series
 
-Ten = list[float]  # values, misses, their sum, least, most
+Ten = list[float]  # numbers of values and misses; sum, least and most of the values
 
 
 class SeriesTens:
-    """The tens of one series, computed from all batches with numbers below `past`."""
+    """The ten-second summaries of one series, computed from all batches with numbers below `past`."""
 
     __slots__ = ("by_number", "past")
 
@@ -46,7 +46,7 @@ class SeriesTens:
 
 
 class IndexedBatch(NamedTuple):
-    """A batch's place, and the times in it."""
+    """A batch's place in the file, and the least and greatest time of its rows."""
 
     place: BatchPlace
     least: int
@@ -54,9 +54,9 @@ class IndexedBatch(NamedTuple):
 
 
 class GrowingSegment:
-    """A segment, read as far as it is written. If reading stopped at damage, `damage` describes it.
+    """A segment, read as far as it is written. If reading stopped at damage, `damage` describes the damage.
 
-    Raises as ArrowsTail does.
+    Raises ValueError if the file is not a recording, and OSError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,12 +70,12 @@ class GrowingSegment:
         self.damage: str | None = None
 
     def hold(self) -> None:
-        """Keep the segment open until the matching call of `let_go`."""
+        """Keep the file open until the matching call of `let_go`."""
         with self._changing:
             self._holders += 1
 
     def let_go(self) -> None:
-        """End a `hold`; the last one closes the segment."""
+        """End one `hold`, and close the file if no other `hold` remains."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -83,13 +83,13 @@ class GrowingSegment:
 
     @property
     def bounds(self) -> tuple[int, int]:
-        """The least and the greatest time in it, in ns; (0, 0) without rows."""
+        """The least and the greatest time of the segment's rows, in ns UTC; (0, 0) without rows."""
         least = min((batch.least for batch in self._batches), default=0)
         return least, max((batch.most for batch in self._batches), default=0)
 
     @property
     def left_out(self) -> int:
-        """Bytes of an incomplete batch at the end."""
+        """The number of bytes of an incomplete batch at the segment's end."""
         return self._tail.left_out
 
     def read_new(self) -> None:
@@ -109,7 +109,7 @@ class GrowingSegment:
     def rows_of(
         self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
     ) -> list[Row]:
-        """Return a batch's rows of the series, or of all, with begin <= time < end."""
+        """Return a batch's rows of these series (None: of all) with begin <= time < end, in ns."""
         columns = self._tail.again(batch.place)
         wanted = None if series is None else _codes(columns.drives, columns.registers, series)
         return list(_rows(columns, wanted, begin, end))
@@ -127,14 +127,14 @@ class GrowingSegment:
             found[series].add_rows(rows.times, rows.values, rows.valid)
 
     def _batches_between(self, begin: int, end: int) -> range:
-        """Return the batch numbers from the first to the last batch that may have rows of this range."""
+        """Return the numbers from the first to the last batch that may have rows in this time range."""
         found = [
             number for number, batch in enumerate(self._batches) if batch.least < end and begin <= batch.most
         ]
         return range(found[0], found[-1] + 1) if found else range(0)
 
     def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
-        """Yield a batch's rows of the series."""
+        """Yield the rows of these series in the batch with this number."""
         columns = self._tail.again(self._batches[number].place)
         for at in _places(columns, _codes(columns.drives, columns.registers, series)):
             name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]
@@ -151,7 +151,7 @@ class GrowingSegment:
                     into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
 
     def _update_tens(self) -> None:
-        """Add each batch to the tens of the series that do not include it yet."""
+        """Add new batches to the ten-second summaries of every requested series."""
         end = len(self._batches)
         for number in range(min((tens.past for tens in self._tens.values()), default=end), end):
             behind = frozenset(series for series, tens in self._tens.items() if tens.past <= number)
@@ -169,7 +169,7 @@ def _is_valid(columns: RecordedColumns, at: int) -> bool:
 def _codes(
     drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]
 ) -> frozenset[tuple[int, int]]:
-    """Return the codes of drive and register of each series."""
+    """Return each series' pair of codes: the indexes of its drive and register in these names."""
     known = {drive for drive, _ in series}
     return frozenset(
         (drive_code, code)
@@ -181,7 +181,7 @@ def _codes(
 
 
 def _places(columns: RecordedColumns, wanted: frozenset[tuple[int, int]] | None) -> Sequence[int]:
-    """Return the indexes of the rows of the wanted codes; None means all rows."""
+    """Return the indexes of the rows whose codes of drive and register are wanted; None means all rows."""
     if wanted is None:
         return range(len(columns.time))
     return find_codes(columns.drive, columns.register, wanted)
@@ -205,8 +205,8 @@ def _rows(
             )
 
 
-MOST_KEPT = 200_000  # cached rows of a segment: 4 MB
-MOST_SERIES = 4096  # cached series, including requested ones without rows
+MOST_KEPT = 200_000  # limit of cached rows per segment: 4 MB
+MOST_SERIES = 4096  # limit of cached series, including requested series without rows
 
 
 class SeriesRow(NamedTuple):
@@ -221,7 +221,7 @@ class SeriesRows:
     """Rows of one series from a range of batches."""
 
     def __init__(self, first: int) -> None:
-        self.first = self.past = first  # numbers of the first batch and of the one after the last
+        self.first = self.past = first  # batch numbers: the first, and the one after the last
         self.times = array("q")
         self.values = array("d")
         self.valid = bytearray()
@@ -235,7 +235,7 @@ class SeriesRows:
 class KeptSeries:
     """Caches the rows of recently requested series, so that a live plot reads each batch once.
 
-    `read` returns the rows of given series in a batch.
+    `read` returns the rows of the given series in the batch with the given number.
     """
 
     def __init__(self, read: Callable[[int, frozenset[Series]], Iterable[SeriesRow]]) -> None:
@@ -262,6 +262,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the cached rows if these batches continue them, else an empty entry."""
+        """Return the series' cached rows if they reach up to the first of these batches, else an empty entry."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

@@ -1,4 +1,4 @@
-"""History: months of rows from a folder that may still grow."""
+"""Read a history: months of rows from a folder to which another process may still write."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class History:
 
     @property
     def damage(self) -> list[str]:
-        """Sentences about the damaged segments that were found so far."""
+        """Sentences that describe the damaged segments found so far."""
         return list(self._sources.damage.values())
 
     def metadata(self) -> Metadata:
@@ -88,7 +88,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> HistoryRows:
-        """Return the rows of the series, or of all, with begin <= time < end; None means unlimited.
+        """Return the rows of the series (None: of all) with begin <= time < end (None: no limit).
 
         The rows come in the order of recording. If, in a part of the range, a name belonged to another
         register (with another unit or other names of its numbers), the rows from that part are in a separate
@@ -107,7 +107,7 @@ class History:
     def rows_of(
         self, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Iterator[Rows]:
-        """Yield the rows that `read` describes, for parsed series and times in ns."""
+        """Yield the rows that `read` returns, for parsed series and times in ns."""
         found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
         given = 0  # number of the last segment that was yielded
         for number in sorted({*found.segments, *found.rows}):
@@ -117,7 +117,7 @@ class History:
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
-                except Replaced:  # raised before the first row was yielded: another file has the rows now
+                except Replaced:  # before the segment's first row was yielded: another file has its rows now
                     found = self._sources.listing()
                     self._check_merged(number, found)
             else:
@@ -125,14 +125,14 @@ class History:
             given = found.rows[number].last if number in found.rows else number
 
     def _check_merged(self, number: int, found: Listing) -> None:
-        """Raise OSError if this segment was merged with segments that were yielded already."""
+        """Raise OSError if this segment was merged with segments whose rows were already yielded."""
         if any(file.first < number <= file.last for file in found.rows.values()):
             raise OSError(f"{self.folder}: files were merged while they were read: read them again")
 
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Listing:
-        """Add all current segments to `parting`; return their listing."""
+        """Add the quantities of all listed segments to `parting`; return the listing."""
         known = self._sources.known(found, begin, end)
         new = parting.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
@@ -219,7 +219,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> Iterator[bytes]:
-        """Yield the rows that `read` returns as a .csv recording with a column `unit`, in pieces of text."""
+        """Yield the rows of `read` as pieces of a .csv file with a column `unit`."""
         rows = self.read(series, begin, end)
         units = units_of(rows.metadata)
         lines = (lines_with_units(batch, units) for batch in rows)
@@ -232,10 +232,10 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> int:
-        """Write the rows of `read` into a new .csv, .parquet or .arrows file; return their number.
+        """Write the rows of `read` into a new .csv, .parquet or .arrows file; return the number of rows.
 
-        Parquet is written by duckdb, not in order, or else by pyarrow. Raises as `open_writer` does, and
-        leaves no file then.
+        Parquet is written by duckdb, with rows in any order, or by pyarrow if duckdb is missing. Raises the
+        errors of `open_writer`, and then leaves no file.
         """
         rows, target = self.read(series, begin, end), Path(path)
         if target.suffix.lower() == ".parquet":
@@ -268,7 +268,7 @@ class History:
             of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
             return write_parquet(self._sources, target, batches, files, *of)
 
-        self._sources.cursor().close()  # raises if DuckDB is missing, before a file is created
+        self._sources.cursor().close()  # raises MissingDuckDB before a file is created
         new_file(target).close()
         try:
             return self._sources.again(write)
@@ -294,7 +294,7 @@ class HistoryRows(RecordingReader):
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:
-    """Return a segment's rows with registers renamed to the columns of their quantities."""
+    """Return a segment's rows; registers with an earlier quantity get the names of their own columns."""
     columns = {other.series: other.column for other in others}
     if not columns:
         return rows

@@ -1,7 +1,6 @@
-"""Quantities: the units of a series' values, from the metadata of their segments. Pure.
+"""Quantities: what the values of a series measure, from the metadata of their segments. Pure.
 
-From one segment to the next, a name may be given to another drive or family. Values of two quantities are
-never combined.
+In a new segment, a name may belong to another drive or family. Values of two quantities are never combined.
 """
 
 from __future__ import annotations
@@ -15,13 +14,13 @@ RAW, NAMED = "raw count", "names"
 
 
 class Quantity(NamedTuple):
-    """The unit of values, which may be "", or the names of their numbers."""
+    """The unit of values ("" for none), or, for an enumeration, the names of its numbers."""
 
     unit: str
     names: tuple[tuple[str, object], ...] = ()
 
 
-Known = Mapping[Series, Sequence[Quantity]]  # quantities in a file by series, the oldest first
+Known = Mapping[Series, Sequence[Quantity]]  # each series' quantities in one file, the oldest first
 
 
 def quantities_of(metadata: object) -> dict[Series, Quantity]:
@@ -40,7 +39,7 @@ def known_by(metadata: object) -> Known:
 
 
 def units_of(metadata: object) -> dict[Series, str]:
-    """Return each series' text for the column `unit` of Parquet files, as in a fleet's messages."""
+    """Return each series' text in the column `unit` of Parquet files; a fleet's messages have the same texts."""
     found = {}
     drives = _table(_table(metadata).get("drives"))
     for (drive, register), quantity in quantities_of(metadata).items():
@@ -62,7 +61,7 @@ def _quantity(about: Mapping[str, Any]) -> Quantity:
 
 
 def description_of(quantity: Quantity) -> dict[str, Any]:
-    """Return the metadata of a register with this quantity."""
+    """Return the metadata that describes a register with this quantity."""
     if quantity.unit == RAW:
         return {"unit": "", "step": None}
     if quantity.unit == NAMED:
@@ -78,18 +77,18 @@ def _number(text: object) -> object:
 
 
 class OtherColumn(NamedTuple):
-    """The column for rows in a file that are of another quantity than the series' newest one."""
+    """A column for rows of one file whose quantity is not the series' newest quantity."""
 
     series: Series
-    unit: str | None  # of the rows; None: all rows of the file
+    unit: str | None  # only rows with this unit are in the column; None: all rows of the file
     column: str
 
 
 class Parting:
-    """The newest quantity of each series, and its earlier ones, which buckets leave out.
+    """The newest quantity of each series, and its earlier quantities, whose values buckets exclude.
 
-    When rows are read, values of an earlier quantity get a column of their own, such as "load [A]". `series`
-    None means all series that the segments describe.
+    In rows, values of an earlier quantity get a column of their own, such as "load [A]". `series` None means
+    all series that the segments describe.
     """
 
     def __init__(self, known: Mapping[int, Known], series: Iterable[Series] | None = None) -> None:
@@ -101,7 +100,7 @@ class Parting:
         self.learn(known)
 
     def learn(self, known: Mapping[int, Known]) -> None:
-        """Add the quantities of further segments; existing columns keep their quantity."""
+        """Add the quantities of further segments. The quantity of an existing column does not change."""
         before: Known | None = None
         for number in sorted(known.keys() - self._known.keys(), reverse=True):
             self._known[number] = found = known[number]
@@ -123,11 +122,11 @@ class Parting:
             self._columns[series, quantity] = f"{series[1]} [{words}]"
 
     def unknown_of(self, numbers: Iterable[int]) -> list[int]:
-        """Return the numbers of segments that were not added yet."""
+        """Return those of these segment numbers whose quantities were not added yet."""
         return [number for number in numbers if number not in self._known]
 
     def renamed(self, number: int) -> list[OtherColumn]:
-        """Return the columns for this segment's values that are not of the newest quantity."""
+        """Return the columns for those values of this segment whose quantity is not the newest one."""
         known = self._known.get(number, {})
         return [
             OtherColumn(series, None if len(known[series]) == 1 else quantity.unit, column)
@@ -136,7 +135,7 @@ class Parting:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata, completed by a description of each column that it lacks or contradicts."""
+        """Return the metadata with a right description of each column, also of those it lacks or contradicts."""
         columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = quantities_of(metadata)
@@ -150,15 +149,15 @@ class Parting:
         return {**metadata, "drives": drives} if drives else dict(metadata)
 
     def unit_of(self, series: Series) -> str | None:
-        """Return the unit of a series' values; None if no segment has it."""
+        """Return the unit of a series' newest quantity; None if no segment states it."""
         return self.newest[series].unit if series in self.newest else None
 
     def series_of(self, number: int) -> tuple[Series, ...]:
-        """Return the series whose values in this segment are of the newest quantity."""
+        """Return the series whose values in this segment have the series' newest quantity."""
         return tuple(one for one in self._series or () if self._is_newest(one, number))
 
     def is_whole(self, first: int, last: int) -> bool:
-        """Return True if all series have their newest quantity in these segments."""
+        """Return True if all series have their newest quantity in the segments `first` to `last`."""
         return not self.left_out or all(
             self._is_newest(one, number) for one in self.left_out for number in range(first, last + 1)
         )

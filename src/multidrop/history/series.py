@@ -26,7 +26,7 @@ def parsed_series(series: str | Iterable[str] | None) -> list[Series] | None:
 
 
 def ns_of(moment: Moment) -> int:
-    """Return a moment as UTC in ns."""
+    """Convert a moment (UTC in ns, or a datetime with a time zone) to UTC in ns."""
     if isinstance(moment, datetime):
         if moment.tzinfo is None:
             raise ValueError(f"{moment} has no time zone: write datetime(..., tzinfo=UTC)")

@@ -1,4 +1,4 @@
-"""Read the files of a history while they may be replaced: open segments, and Parquet by DuckDB."""
+"""Read the files of a history, which compaction may replace meanwhile: segments, and Parquet with DuckDB."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from multidrop.polling.batch import Rows
 from multidrop.recording.format import Metadata
 
 T = TypeVar("T")
-ALWAYS = -(2**63), 2**63 - 1  # ns
+ALWAYS = -(2**63), 2**63 - 1  # ns: a range that includes every time
 MEMORY = "200MB"  # limit for DuckDB
 MOST_TRIES = 50  # attempts to read files that are being replaced; a slow reader may need many
-MOST_GROWING = 4  # segments whose index is cached
-FILES_AT_ONCE = 200  # per query of metadata; a text may take 100 kB
+MOST_GROWING = 4  # number of segments whose index is cached
+FILES_AT_ONCE = 200  # files per query of metadata; a file's metadata may take 100 kB
 
 
 class Replaced(Exception):
-    """A listed file is gone: its rows are in another file now, or were removed because of their age."""
+    """A listed file no longer exists: compaction moved its rows to another file, or it was removed for age."""
 
 
 class Sources:
@@ -45,10 +45,10 @@ class Sources:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.damage: dict[int, str] = {}  # sentences by segment
+        self.damage: dict[int, str] = {}  # key: segment number; value: a sentence
         self._growing: dict[int, GrowingSegment] = {}
         self._bounds: dict[int, tuple[int, int]] = {}  # first and last time of each closed segment
-        self._known: dict[int, Known] = {}  # quantities in segments
+        self._known: dict[int, Known] = {}  # quantities by segment number
         self._changing = threading.Lock()
         self._database = Database(MEMORY)
 
@@ -68,16 +68,16 @@ class Sources:
 
     @contextmanager
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
-        """Yield a segment, read as far as it is written, and keep it open during the block.
+        """Yield a segment, read up to its current end, and keep its file open during the `with` block.
 
-        Yield None if it has no rows in this range, or cannot be read. Raises Replaced.
+        Yield None if the segment has no rows in this range or cannot be read. Raises Replaced.
         """
         segment: GrowingSegment | None = None
         with self._changing:
             least, most = self._bounds.get(number, ALWAYS)
             if least < end and begin <= most:
                 segment = self._held(number, found.segments[number])
-            if segment and number < max(found.segments):  # closed: it grows no further
+            if segment and number < max(found.segments):  # closed: its bounds are final
                 self._bounds[number] = segment.bounds
                 if segment.left_out:
                     left_out = (
@@ -92,14 +92,14 @@ class Sources:
                 segment.let_go()
 
     def _held(self, number: int, path: Path) -> GrowingSegment | None:
-        """Return a segment, which the caller must `let_go`. The indexes of the newest segments are cached."""
+        """Return a segment, on which the caller must call `let_go`; cache the indexes of the newest segments."""
         segment = self._growing.get(number)
         if segment is None:
             try:
                 segment = GrowingSegment(path)
             except FileNotFoundError:
                 raise Replaced from None
-            except ValueError as error:  # the head is not written yet, or was lost in a power cut
+            except ValueError as error:  # the file's head is not written yet, or was lost in a power cut
                 if path.exists() and path.stat().st_size:
                     self.damage[number] = str(error)
                 return None
@@ -114,7 +114,7 @@ class Sources:
         return segment
 
     def known(self, found: Listing, begin: int, end: int) -> dict[int, Known]:
-        """Return the quantities of each segment that may have rows of this range. Raises Replaced."""
+        """Return the quantities of each segment that may have rows in this range. Raises Replaced."""
         files = {number: file for number, file in found.rows.items() if file.may_have(begin, end)}
         unread = [file for number, file in files.items() if number not in self._known]
         for at in range(0, len(unread), FILES_AT_ONCE):
@@ -143,7 +143,7 @@ class Sources:
             return self._database.cursor()
 
     def again(self, act: Callable[[Listing], T]) -> T:
-        """Return act(listing); call it again if files were replaced in between."""
+        """Return act(listing). If it raises Replaced, call it again with a new listing."""
         for _ in range(MOST_TRIES):
             try:
                 return act(self.listing())
@@ -163,7 +163,7 @@ def _parsed(text: str) -> object:
 
 @contextmanager
 def while_there(files: Sequence[HistoryFile]) -> Iterator[None]:
-    """Raise Replaced if the block fails because one of the files is gone."""
+    """Raise Replaced if the `with` block fails and one of these files no longer exists."""
     try:
         yield
     except Exception as failure:
@@ -196,10 +196,10 @@ def rows_of_file(
     end: int,
     renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the series' rows (None: all), in the order of requests. Raises Replaced, before the first row."""
+    """Yield the series' rows (None: all), ordered by request time. Raises Replaced, only before the first row."""
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
-        # Sorting reads the whole file before the first rows: after Replaced, no row is yielded twice.
+        # Sorting reads the whole file before the first row is yielded, so Replaced is never raised after it.
         query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
@@ -212,10 +212,10 @@ def gather_files(
     grid: Grid,
     described: Container[Series],
 ) -> None:
-    """Add the rows, or the tens, of the files to the buckets. Raises Replaced.
+    """Add the rows, or the ten-second summaries, in these files to the buckets. Raises Replaced.
 
-    The units stated in rows are read only if the metadata does not describe all series: this takes twice as
-    long.
+    The units that rows state are read only if the metadata does not describe all series, because reading
+    them doubles the time.
     """
     condition, values = _condition(list(into))
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
@@ -232,7 +232,7 @@ def gather_files(
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return each file's quantities, from the units that its rows state. Raises Replaced."""
+    """Return the quantities by first segment of each file, from the units that rows state. Raises Replaced."""
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
     known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
@@ -244,7 +244,7 @@ def units_in_rows(
 
 
 def metadata_of(sources: Sources, file: HistoryFile) -> Metadata:
-    """Return the metadata that a file's segment had. Raises Replaced."""
+    """Return the metadata of a file's segment. Raises Replaced."""
     with sources.cursor() as cursor, while_there([file]):
         return kept_metadata(cursor, file.path)
 
@@ -259,9 +259,9 @@ def write_parquet(
     metadata: Metadata,
     renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write batches, and the files' rows of the series and range; return their number. Raises Replaced.
+    """Write batches, and the files' rows of these series in this range; return the number of rows.
 
-    `renamed` maps the first segment of a file to the columns that `rows_of_file` takes.
+    `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Raises Replaced.
     """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))
@@ -278,7 +278,7 @@ def write_parquet(
 
 
 def _columns(renamed: Iterable[OtherColumn]) -> str:
-    """Return the SQL behind `select *` that renames registers to these columns."""
+    """Return the SQL to append to `select *`: it renames registers to these columns."""
     whens = " ".join(
         f"when drive = {quoted(drive)} and register = {quoted(register)}"
         f"{'' if unit is None else f' and unit = {quoted(unit)}'} then {quoted(name)}"
@@ -288,7 +288,7 @@ def _columns(renamed: Iterable[OtherColumn]) -> str:
 
 
 def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
-    """Return the SQL behind a where clause that selects the series, and its values."""
+    """Return an SQL where clause that selects these series, and the values of its parameters."""
     if series is None:
         return "", {}
     drives, registers = ({pair[at]: None for pair in series} for at in (0, 1))
@@ -297,7 +297,7 @@ def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
     marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
     others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
     condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
-    if len(drives) * len(registers) > len(series):  # an exact condition is slower, and seldom needed
+    if len(drives) * len(registers) > len(series):  # not every drive with every register: add the slower, exact condition
         pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
         condition += f" and (drive, register) in ({pairs})"
     return condition, values

@@ -1,4 +1,4 @@
-"""HistoryWriter: records rows into a folder on its own thread, so that a slow disk delays no polling."""
+"""HistoryWriter: records rows into a folder on its own thread, so that a slow disk cannot delay polling."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from multidrop.recording.format import Metadata
 from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock
 
-MOST_WAITING = 250_000  # unwritten rows (12 MB), if the disk is slow; further ones are dropped
-WRITING_S = 0.4  # between writes; each makes a batch, and more batches slow down queries
+MOST_WAITING = 250_000  # limit of unwritten rows (12 MB); while the disk is slow, further rows are dropped
+WRITING_S = 0.4  # between writes; each write makes a batch, and many small batches slow down queries
 TENDING_S = 60.0  # between removals of old files
-HANGING_S = 5.0  # after which a write that hangs is reported
+HANGING_S = 5.0  # a write that takes longer is reported
 ENDING_S = 10.0  # how long `close` waits for the disk
 
 _log = logging.getLogger("multidrop.history")
 
 
 class HistoryState(NamedTuple):
-    """The state of a recording: rows written and lost so far, and the current problem or None."""
+    """The state of a HistoryWriter: rows written, rows lost, and the present problem or None."""
 
     rows: int
     dropped: int
@@ -40,12 +40,12 @@ class HistoryWriter:
     """Records batches into the history in a folder, which is created: `poller.on_batch(writer.take)`.
 
     A new segment starts every `rotate` s. If duckdb is installed, a process of low priority compacts closed
-    segments. Files older than `keep` s are removed; then the oldest ones, as long as all take more than
-    `most` bytes.
+    segments. Files older than `keep` s are removed. Then the oldest files are removed while all files
+    together take more than `most` bytes.
 
-    A full or failing disk delays no polling: rows are dropped and counted in `state()`, with the reason, and
-    writing is tried again each second. Raises ValueError while another process records there, OSError if the
-    folder cannot be written, and TypeError for metadata that JSON cannot hold.
+    A full or failing disk does not delay polling. Rows are dropped, `state()` has their number and the
+    reason, and writing is tried again each second. Raises ValueError while another process records into the
+    folder, OSError if the folder cannot be written, and TypeError for metadata that JSON cannot hold.
     """
 
     def __init__(
@@ -67,13 +67,13 @@ class HistoryWriter:
         self._waiting_rows = 0
         self._ended: list[
             tuple[list[GatheredRows], Metadata]
-        ] = []  # rows, and the metadata that replaces theirs
+        ] = []  # rows of ended segments, and the metadata of the segment after each
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None
         self._again_ns = 0
         self._tended_ns: int | None = None
-        self._busy_since_ns: int | None = None  # start of the current disk access; None: idle
+        self._busy_since_ns: int | None = None  # start of the disk access in progress; None: idle
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="multidrop history", daemon=True)
         self._thread.start()
@@ -84,7 +84,7 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows for the writing thread. Takes microseconds, and never raises because of the disk."""
+        """Copy the batch's rows for the writing thread. Takes microseconds; never raises because of the disk."""
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)
@@ -93,13 +93,13 @@ class HistoryWriter:
             self._waiting_rows += len(batch)
 
     def begin(self, metadata: Metadata) -> None:
-        """Start a new segment with the metadata of a changed plant. Earlier rows stay in the old segment."""
+        """Start a new segment with the metadata of a changed plant. Earlier rows stay in the last one."""
         with self._changing:
             self._ended.append((self._waiting, metadata))
             self._waiting = []
 
     def state(self) -> HistoryState:
-        """Return the rows written and lost so far, and the current problem."""
+        """Return the rows written and lost so far, and the present problem."""
         return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
 
     def _hang(self) -> str:
@@ -114,7 +114,7 @@ class HistoryWriter:
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Write the waiting rows and end; wait at most 10 s for the disk."""
+        """Write the waiting rows and end the thread; wait at most 10 s for the disk."""
         self._over.set()
         self._thread.join(ENDING_S)
 
@@ -160,7 +160,7 @@ class HistoryWriter:
                 _log.error("nothing is recorded: %s", failure)
             self._trouble = str(failure)
             self._rotate()
-            self._tended_ns = None  # removing old files may free space
+            self._tended_ns = None  # remove old files at the next turn: this may free space
             return
         if self._trouble:
             _log.warning("rows are recorded again; %d were lost so far", self._dropped)
@@ -192,7 +192,7 @@ class HistoryWriter:
 
 
 class Compactor:
-    """A child process that compacts closed segments; started again when there are new ones."""
+    """Runs a child process that compacts closed segments, and again when more segments are closed."""
 
     PAUSE_S = 60.0  # after a failure
 
@@ -204,7 +204,7 @@ class Compactor:
         self.is_possible = importlib.util.find_spec("duckdb") is not None
 
     def tend(self, below: int) -> None:
-        """Collect a finished child; start one if segments below this number are not compacted yet."""
+        """Collect a finished child; start a child if segments with numbers under `below` are not compacted."""
         if self._child and self._child.poll() is not None:
             self._note(self._child)
             self._child = None
@@ -237,7 +237,7 @@ class Compactor:
         self._not_before_ns = clock.now_ns() + round(self.PAUSE_S * 1e9)
 
     def end(self) -> None:
-        """Kill the child, which is safe at any moment."""
+        """Kill the child. This is safe at any moment, because compaction can be interrupted at each step."""
         if self._child:
             self._child.kill()
             self._child.communicate()

@@ -6,9 +6,9 @@
 | `.csv`     | text; metadata in `NAME.csv.json` | every whole line is there  |
 | `.parquet` | Parquet, needs pyarrow            | the file cannot be read    |
 
-The table is about crashes of the process. Once `write` has returned, the operating system has the whole
-batch, and only a power cut in the next seconds loses it. A file without its head, which is written first,
-cannot be read.
+The last column describes a crash of the writing process. Once `write` has returned, the operating system has
+the whole batch, and only a power cut in the next seconds loses it. The file's head is written first; without
+it, the file cannot be read.
 
 All three have the same columns, and one row for every sample or miss:
 
@@ -62,7 +62,7 @@ FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix:
 def open_writer(
     path: str | os.PathLike[str], metadata: Metadata, *, overwrite: bool = False
 ) -> RecordingWriter:
-    """Return the writer of a new recording. With `overwrite`, first remove an existing recording at `path`.
+    """Create a recording, and return its writer. With `overwrite`, replace an existing recording at `path`.
 
     Raises FileExistsError if there is a file at `path`, ValueError for another suffix, TypeError for
     metadata that JSON cannot hold, and RecordingError if the file cannot be written.
@@ -78,9 +78,10 @@ def open_writer(
 
 
 def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
-    """Open a recording, finished or not: `open_recording("run.arrows").to_pandas()`, or batch after batch.
+    """Return a reader of a recording, also while it is written: `open_recording("run.arrows").to_pandas()`.
 
-    Raises ValueError for any other file, TypeError if `path` is not a path, and OSError.
+    Iterating over the reader yields batches. Raises ValueError for a file that is not a recording, TypeError
+    if `path` is not a path, and OSError.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"open_recording takes a file such as 'run.arrows', not {path!r}")
@@ -91,8 +92,8 @@ def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
 def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> int:
     """Write all rows and metadata of the recording `source` to `target`; return the number of rows.
 
-    Needs memory for a few batches only. Raises as open_recording and open_writer do, and then leaves no
-    target.
+    Needs memory for a few batches only. Raises the errors of open_recording and open_writer; after an error
+    there is no file at `target`.
     """
     _format(Path(target))
     reader = open_recording(source)
@@ -103,7 +104,7 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> i
         with writer:
             for batch in reader:
                 writer.write(batch)
-    except BaseException:  # Ctrl-C as well: half a recording would look complete
+    except BaseException:  # Ctrl-C as well: an incomplete recording would look complete
         writer.discard()
         raise
     return writer.rows
@@ -118,7 +119,7 @@ def repair(path: str | os.PathLike[str]) -> int:
 
 
 def _format(path: Path) -> Any:
-    """Return the module of the format, which has a `writer` and a `reader`."""
+    """Return the module for the path's suffix; it has a `writer` and a `reader`."""
     module = FORMATS.get(path.suffix.lower())
     if not module:
         raise ValueError(f"{path}: a recording's name must end in {', '.join(FORMATS)}")

@@ -1,6 +1,6 @@
-"""Decode the batches of an Arrow IPC stream into rows with their names spelled out.
+"""Decode the batches of an Arrow IPC stream into rows with texts in place of dictionary codes.
 
-All numbers in them are checked: a damaged batch raises an error.
+All numbers in the batches are checked: a damaged batch raises an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import RecordedRows
 
-MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch; limits what a small file can expand to
+MOST_SPELLED = 1 << 28  # limit in bytes for one column's texts in a batch: a small file could expand to gigabytes
 Buffers = tuple[Any, ...]
 
 
@@ -36,18 +36,18 @@ class RecordedColumns(NamedTuple):
     uncertainty_ns: memoryview  # 0 for a miss
     drive: memoryview
     register: memoryview
-    value: memoryview  # undefined for a miss
+    value: memoryview  # any number for a miss
     status: memoryview
-    valid: bytes | None  # a bit for each row, 0 for a miss; None: no row is a miss
+    valid: bytes | None  # one bit per row, 0 for a miss; None: no row is a miss
     drives: tuple[str, ...]
     registers: tuple[str, ...]
     statuses: tuple[str, ...]
 
 
 class BatchDecoder:
-    """Decodes one file's batches in their order, by the dictionaries that came before each.
+    """Decodes one file's batches in their order; each batch uses the dictionaries that precede it in the file.
 
-    `columns` has each column with the id of its dictionary, or None.
+    `columns` lists the file's columns, each with the id of its dictionary or None.
     """
 
     def __init__(self, columns: Sequence[tuple[FileColumn, int | None]]) -> None:
@@ -56,9 +56,9 @@ class BatchDecoder:
         self._names: dict[int, Names] = {}
 
     def decode(self, message: IpcMessage, header: FlatTable, body: memoryview) -> RecordedRows | None:
-        """Return the rows of a batch, None for a dictionary.
+        """Return the rows of a batch; return None after storing a dictionary.
 
-        Raises ValueError, RuntimeError or struct.error if it is damaged.
+        Raises ValueError, RuntimeError or struct.error if the message is damaged.
         """
         if message.kind == DICTIONARY_BATCH:
             self._learn(header, body)
@@ -75,14 +75,14 @@ class BatchDecoder:
 
     @property
     def known(self) -> dict[int, Names]:
-        """The dictionaries so far. The mapping is replaced on each change, never modified."""
+        """The dictionaries decoded so far, by id. Each change makes a new mapping, so callers may keep one."""
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
         """Return a batch's columns with codes in place of names; the codes are checked.
 
-        `names_of` are the dictionaries `known` before the batch. Raises as `decode` does, and for files of
-        earlier versions, whose names have no codes.
+        `names_of` are the dictionaries that `known` had before the batch. Raises the errors of `decode`, and
+        ValueError for files of earlier versions, whose names have no codes.
         """
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
         left = iter(buffers)
@@ -132,7 +132,7 @@ class BatchDecoder:
         return valid, *data
 
     def _learn(self, header: FlatTable, body: memoryview) -> None:
-        """Replace or extend a dictionary, as this message says."""
+        """Replace a dictionary, or extend it if the message is a delta."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
             raise ValueError("there are names of no column")
@@ -154,8 +154,8 @@ class BatchDecoder:
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
     """Return a batch's number of rows and its `count` buffers.
 
-    The buffers are copies because they are passed to the C core. A view that is still held by the traceback
-    of a damaged batch would crash the interpreter when it is collected.
+    The buffers are copies, because they are passed to the C core. A memoryview that the traceback of a
+    damaged batch still holds would crash the interpreter when it is collected.
     """
     if batch.table(3):
         raise ValueError("its batches are compressed, which only pyarrow and polars read")
@@ -168,16 +168,16 @@ def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[by
 
 
 def _check_filled(column: FileColumn, bits: bytes, rows: int) -> None:
-    """Raise ValueError unless a column without nulls has a value in each row."""
+    """Raise ValueError if a row lacks a value in this column, which must not have nulls."""
     filled = (1 << rows) - 1
     if int.from_bytes(bits, "little") & filled != filled:
         raise ValueError(f"there is a row without a {column.name.decode()}")
 
 
 def _check_text(offsets: bytes, text: bytes) -> None:
-    """Raise ValueError unless each row's text is UTF-8: Arrow libraries rely on it."""
+    """Raise ValueError unless each row's text is valid UTF-8, because Arrow libraries do not check this."""
     if str(text, "utf-8").isascii():
         return
     for at in memoryview(offsets)[: len(offsets) // 4 * 4].cast("i"):
-        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # within a character
+        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # the text starts within a character
             raise ValueError("its text is not UTF-8")

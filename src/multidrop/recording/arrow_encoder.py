@@ -1,7 +1,7 @@
 """Encode rows as record batches of an Arrow IPC stream, with names as dictionaries.
 
-A dictionary precedes the first batch that needs it. When it has changed, it is written again as a whole,
-because polars and nanoarrow read no deltas. A dictionary and its batch are appended to the file together.
+A dictionary precedes the first batch that needs it. A changed dictionary is written again as a whole, because
+polars and nanoarrow cannot read deltas. A dictionary and its batch are appended to the file in one write.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from multidrop.recording.arrow_ipc import (
 from multidrop.recording.rows import texts_of
 
 VERSION = ("<h", 4)  # version of the Arrow format: V5
-LONGEST_TEXTS = (1 << 31) - 1  # bytes of a dictionary
+LONGEST_TEXTS = (1 << 31) - 1  # limit in bytes for a dictionary's texts
 DRIVE, REGISTER, STATUS = CODED  # ids of the dictionaries
-MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # codes of each dictionary
+MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # number of codes, by dictionary
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer
-Codes = dict[int, tuple[Column, Names]]  # codes and their names, by dictionary
+Codes = dict[int, tuple[Column, Names]]  # by dictionary id: the rows' codes, and the names
 
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:
-    """Return the first message of a file: its schema and metadata."""
+    """Return the first message of a file, with the schema and the metadata."""
     return b"".join(_message(SCHEMA, schema_table(metadata), []))
 
 
@@ -50,7 +50,7 @@ class Encoder:
     def __init__(self) -> None:
         self._statuses = CodeTable(STATUSES)
         self._codes: dict[int, dict[str, int]] = {number: {} for number in CODED}
-        self._dictionaries: dict[int, Names] = {}  # dictionaries as they are in the file
+        self._dictionaries: dict[int, Names] = {}  # by id: the latest dictionaries in the file
 
     def encode(self, batch: Rows) -> bytes:
         """Return a record batch of the rows, preceded by the dictionaries that the file lacks.
@@ -78,15 +78,15 @@ class Encoder:
 
 
 class _CodedRows(NamedTuple):
-    """Rows of one record batch."""
+    """The columns of one record batch, with codes in place of names."""
 
     length: int
-    columns: tuple[tuple[bytes, Column], ...]  # validity bitmap (empty: no nulls) and data of each column
+    columns: tuple[tuple[bytes, Column], ...]  # each column's validity bitmap (b"": no nulls) and data
     names: dict[int, Names]  # by dictionary id
 
 
 def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_CodedRows]:
-    """Yield the rows in one piece, or in several if a column has more names than codes."""
+    """Yield the rows as one batch, or as several if a column has more names than there are codes."""
     codes = source.codes(begin, end)
     if codes is None:
         middle = begin + (end - begin) // 16 * 8  # a multiple of 8 rows: bitmaps start at a whole byte
@@ -107,7 +107,7 @@ def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_
 
 
 def _bitmap(bits: memoryview | None, begin: int, end: int) -> bytes:
-    """Return the rows' bits, or b"" if all are set."""
+    """Return the validity bits of the rows `begin` to `end`, or b"" if all bits are set."""
     if bits is None:
         return b""
     rows = end - begin
@@ -116,7 +116,7 @@ def _bitmap(bits: memoryview | None, begin: int, end: int) -> bytes:
 
 
 class _BatchCodes:
-    """Codes of a polled batch, whose drives and registers the C core has already numbered."""
+    """The codes of a polled batch. The C core has already numbered its drives and registers."""
 
     def __init__(self, batch: Batch, statuses: CodeTable) -> None:
         columns = self._columns = batch.columns()
@@ -142,7 +142,7 @@ class _BatchCodes:
 
 
 class _RowCodes:
-    """Codes of rows that were read from a recording, as text."""
+    """The codes of rows whose names are text, such as rows read from another recording."""
 
     def __init__(self, rows: Rows, known: dict[int, dict[str, int]]) -> None:
         children = list(rows.arrow().view().children)

@@ -1,4 +1,4 @@
-"""The messages of an Arrow IPC stream.
+"""Parse and build the messages of an Arrow IPC stream.
 
 All numbers in the file are checked: a damaged file raises an error and causes no crash. Field numbers are
 those of Arrow's format/Message.fbs and format/Schema.fbs.
@@ -19,7 +19,7 @@ SCHEMA, DICTIONARY_BATCH, RECORD_BATCH = 1, 2, 3  # IpcMessage.header_type
 
 
 class FlatTable:
-    """A flatbuffer's table; fields are read by number, and an absent one is 0 or empty."""
+    """A flatbuffer's table. Fields are read by number; an absent field is 0 or empty."""
 
     def __init__(self, data: bytes, at: int) -> None:
         self._data = data
@@ -39,7 +39,7 @@ class FlatTable:
         return [FlatTable(self._data, at + self._read("<I", at)) for at in range(start, start + 4 * count, 4)]
 
     def pairs(self, field: int) -> list[tuple[int, int]]:
-        """Return a vector of structs of two int64."""
+        """Return the field's vector of structs of two int64 each."""
         start, count = self._vector(field, 16)
         return list(struct.iter_unpack("<qq", self._data[start : start + 16 * count]))
 
@@ -71,7 +71,7 @@ class FlatTable:
 
 @dataclass(frozen=True)
 class IpcMessage:
-    """One whole message: its header, and the start and end of its body in the file."""
+    """One complete message: its header, and the positions in the file where its body starts and ends."""
 
     kind: int
     header: FlatTable | None
@@ -80,7 +80,7 @@ class IpcMessage:
 
 
 def messages(file: BinaryIO, size: int, start: int = 0) -> Iterator[IpcMessage]:
-    """Yield the messages from `start` to `size`, up to the first that is truncated or invalid."""
+    """Yield the messages between the positions `start` and `size`; stop at a truncated or invalid message."""
     end = start
     while message := _message(file, end, size):
         yield message
@@ -110,17 +110,17 @@ def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
 
 
 Table = dict[int, Any]
-_OFFSET = ("<I", 0)  # placeholder, filled in later
+_OFFSET = ("<I", 0)  # placeholder of an offset, filled in later
 
 
 class Structs(bytes):
-    """A vector of structs, which take 16 bytes each."""
+    """A vector of structs of 16 bytes each."""
 
 
 def build(root: Table) -> bytes:
     """Return the flatbuffer of this table."""
     out = bytearray(4)
-    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # where each table's offset belongs
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # positions of placeholders, and the tables whose offsets belong there
     while waiting:
         place, thing = waiting.popleft()
         if isinstance(thing, dict):
@@ -134,12 +134,12 @@ def build(root: Table) -> bytes:
 
 
 def _align(out: bytearray, size: int, ahead: int = 0) -> None:
-    """Pad so that the position `ahead` bytes later is aligned."""
+    """Append padding, so that the position `ahead` bytes after the end is a multiple of `size`."""
     out += bytes(-(len(out) + ahead) % size)
 
 
 def _put_table(out: bytearray, table: Table, waiting: deque[tuple[int, Any]]) -> int:
-    """Append the vtable and then the table, larger fields first, so that all fields are aligned."""
+    """Append the vtable and the table; return the table's position. Larger fields come first, for alignment."""
     fields = {number: value if isinstance(value, tuple) else _OFFSET for number, value in table.items()}
     in_order = sorted(fields, key=lambda number: -struct.calcsize(fields[number][0]))
     slots = [0] * (max(table, default=-1) + 1)
@@ -179,34 +179,34 @@ def _put_vector(out: bytearray, data: bytes) -> int:
 
 INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
 SINGLE, DOUBLE, NANOSECONDS = 1, 2, 3
-BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # buffers of a column in a batch, by type
+BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # number of buffers of a column in a batch, by type
 
 
 class FileColumn(NamedTuple):
-    """A column: name, type, the type's first field (bits, precision or unit), and the bits of its codes."""
+    """A column: its name, type, the first field of the type (bits, precision or unit), and code width."""
 
     name: bytes
     kind: int
     detail: int = 0
-    code_bits: int = 0  # bits of the unsigned codes of its dictionary; 0: no dictionary
+    code_bits: int = 0  # width of the unsigned dictionary codes in bits; 0: no dictionary
     nullable: bool = False
 
     @property
     def buffers(self) -> int:
-        """The number of the column's buffers in a batch; codes have two, like all numbers."""
+        """The number of the column's buffers in a batch; a column of codes has two, like one of numbers."""
         return 2 if self.code_bits else BUFFERS[self.kind]
 
 
 COLUMNS = (
     FileColumn(b"time", TIMESTAMP, NANOSECONDS),
     FileColumn(b"monotonic_ns", INT, 64),
-    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up: it stays an upper bound
+    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up, so that it remains an upper bound
     FileColumn(b"drive", UTF8, code_bits=16),
     FileColumn(b"register", UTF8, code_bits=16),
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
     FileColumn(b"status", UTF8, code_bits=8),
 )
-COLUMNS_BEFORE = (  # in versions up to 0.1, and if other programs write our batches
+COLUMNS_BEFORE = (  # in files of versions up to 0.1, and of other programs that write our batches
     *COLUMNS[:2],
     FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
     *(FileColumn(name, UTF8) for name in (b"drive", b"register")),

@@ -1,7 +1,7 @@
-"""Recordings as an Arrow IPC stream (.arrows), in which every whole batch outlives a crash.
+"""Recordings as an Arrow IPC stream (.arrows): every complete batch is readable after a crash.
 
-The stream has no end marker; Arrow allows this. So the file is complete after every batch, and a recording in
-progress can be read like a finished one.
+The stream has no end marker, which Arrow permits. So the file is valid after every batch, and a recording in
+progress is read like a finished recording.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ class ArrowsWriter(AppendingWriter):
     def write(self, batch: Rows) -> None:
         try:
             self._append(self._encoder.encode(batch))
-        except BaseException:  # a signal handler may raise too
+        except BaseException:  # a signal handler may raise any exception
             self._encoder.forget_dictionaries()
             raise
         self.rows += len(batch)
 
 
 class ArrowsReader(RecordingReader):
-    """Reads all complete messages; skips a truncated message at the end."""
+    """Reads all complete messages of a file, and skips a truncated message at its end."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -65,7 +65,7 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                elif message.kind == DICTIONARY_BATCH:  # other libraries fail if its batch is missing
+                elif message.kind == DICTIONARY_BATCH:  # without its batch it is skipped: other libraries cannot read it
                     continue
                 self._whole = message.end
         if not self._whole:
@@ -91,7 +91,7 @@ class ArrowsReader(RecordingReader):
 
     @property
     def columns(self) -> list[tuple[FileColumn, int | None]]:
-        """The columns of the file, each with its dictionary's id."""
+        """The columns of the file, each with the id of its dictionary or None."""
         return self._columns
 
     def _read_schema(self, message: IpcMessage) -> Metadata:
@@ -109,7 +109,7 @@ class ArrowsReader(RecordingReader):
 
 
 def _column(field: FlatTable) -> FileColumn:
-    """Return a column as the file describes it; `code_bits` is -1 if its codes are not as we write them."""
+    """Return a column as the file describes it; `code_bits` is -1 for codes that this library never writes."""
     detail, coded = field.table(3), field.table(4)
     index = coded.table(1) if coded else None
     is_unsigned = index is not None and not index.number(1, "<?")
@@ -118,13 +118,13 @@ def _column(field: FlatTable) -> FileColumn:
 
 
 def _dictionary(field: FlatTable) -> int | None:
-    """Return the id of a column's dictionary."""
+    """Return the id of a column's dictionary, or None if it has none."""
     coded = field.table(4)
     return coded.number(0, "<q") if coded else None
 
 
 def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
-    """Return the columns of this or an earlier version if they match this description, else None."""
+    """Return the columns of the version, present or earlier, that has exactly these columns, or None."""
     for known in (COLUMNS, COLUMNS_BEFORE):
         if found == tuple(column._replace(nullable=False) for column in known):
             return known
@@ -135,21 +135,21 @@ writer, reader = ArrowsWriter, ArrowsReader
 
 
 class BatchPlace(NamedTuple):
-    """A batch's place in the file, and the names of its codes."""
+    """A batch's position in the file, and the dictionaries that its codes refer to."""
 
     message: IpcMessage
     names: dict[int, Names]
 
 
 class RecordedBatch(NamedTuple):
-    """A batch and its place."""
+    """A batch's columns, and its position in the file."""
 
     columns: RecordedColumns
     place: BatchPlace
 
 
 class ArrowsTail:
-    """Reads each whole batch of a growing file once, even if the file is removed while it is open.
+    """Reads each complete batch of a growing file once, even if the file is removed while it is open.
 
     Raises ValueError for a file that is not a recording, and OSError.
     """
@@ -171,7 +171,7 @@ class ArrowsTail:
 
     @property
     def left_out(self) -> int:
-        """Bytes of an incomplete batch at the end."""
+        """The number of bytes of an incomplete batch at the file's end."""
         return self._size() - self._end
 
     def new(self) -> Iterator[RecordedBatch]:
@@ -181,7 +181,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                if message.kind != RECORD_BATCH:  # read again with its batch: a full disk may cut both off
+                if message.kind != RECORD_BATCH:  # a dictionary is read again with its batch: after a write fails, both are cut off
                     self._decoder.decode(message, message.header, body)
                     continue
                 place = BatchPlace(message, self._decoder.known)
@@ -192,7 +192,7 @@ class ArrowsTail:
             yield batch
 
     def again(self, place: BatchPlace) -> RecordedColumns:
-        """Read again a batch that `new` has yielded. Raises ValueError if it is damaged."""
+        """Return the columns of a batch that `new` yielded before. Raises ValueError if it is damaged."""
         assert place.message.header
         return self._decoder.columns(place.message.header, self._body(place.message), place.names)
 

@@ -1,4 +1,4 @@
-"""Recordings as text (.csv), one row a sample, with the metadata beside it (.csv.json)."""
+"""Recordings as text (.csv) with one line per sample or miss, and the metadata in a second file (.csv.json)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class CsvWriter(AppendingWriter):
         try:
             with writing(path):
                 _write_whole(metadata_path(path), described + "\n")
-            self._append(HEADER.encode())  # last, so that a file with a header always has its metadata
+            self._append(HEADER.encode())  # after the metadata: a .csv with a header always has its .csv.json
         except OSError:
             self.discard()
             raise
@@ -53,7 +53,7 @@ class CsvWriter(AppendingWriter):
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Create the file atomically: it is never incomplete."""
+    """Create the file with this text atomically, so that a crash leaves no incomplete file."""
     part = path.with_name(path.name + ".part")
     try:
         part.write_text(text, encoding="utf-8")
@@ -129,12 +129,12 @@ def _parse(cells: list[str]) -> Row:
 
 
 def lines_of(rows: Rows) -> bytes:
-    """Return the rows as lines of text."""
+    """Return the rows as lines of a .csv file."""
     return "".join(map(_line, rows)).encode()
 
 
 def lines_with_units(rows: Rows, units: Mapping[tuple[str, str], str]) -> bytes:
-    """Return the rows as lines of text, each with the unit of its drive's register."""
+    """Return the rows as lines of a .csv file with a last column `unit`; `units` is by drive and register."""
     return "".join(
         f"{_line(row)[:-1]},{_quote(units.get((row.drive, row.register), ''))}\n" for row in rows
     ).encode()

@@ -1,4 +1,4 @@
-"""The interface of the writer and the reader of every format, and their failures."""
+"""The base classes of all formats' writers and readers, and the errors that they raise."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from multidrop.polling.batch import Rows, schema, shown_span
 from multidrop.polling.tables import ArrowTable, WideRows
 
 Metadata = Mapping[str, Any]
-MOST_SHOWN = 16 << 20  # bytes of a file that a repr reads
+MOST_SHOWN = 16 << 20  # limit in bytes for files that a repr reads
 METADATA_KEY = "multidrop"  # key in an Arrow schema's metadata
 
 
 class RecordingError(OSError):
     """A recording cannot be written: the disk is full or read-only, or a library is missing.
 
-    `rows` is the number of rows that were written before and can be read.
+    `rows` is the number of rows that were written before the error, and that can be read.
     """
 
     def __init__(self, path: Path, reason: str, rows: int = 0) -> None:
@@ -35,7 +35,7 @@ class RecordingError(OSError):
 
 @contextmanager
 def writing(path: Path, rows: int = 0) -> Iterator[None]:
-    """Convert an OSError of the block into a RecordingError; `rows` rows of the file can be read."""
+    """Convert an OSError in the `with` block to a RecordingError with `rows`, the number of readable rows."""
     try:
         yield
     except RecordingExists:
@@ -57,18 +57,18 @@ class RecordingWriter(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the recording. Raises RecordingError."""
+        """Finish and close the recording's file. Raises RecordingError."""
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files of the recording."""
+        """The paths of all files of the recording."""
         return (self.path,)
 
     def discard(self) -> None:
         """Close the recording and remove its files."""
         with suppress(OSError):
             self.close()
-        for path in filter(Path.is_file, self.files):  # never remove a device
+        for path in filter(Path.is_file, self.files):  # never remove a device or pipe
             with suppress(OSError):
                 path.unlink()
 
@@ -96,7 +96,7 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-_REASONS = {  # replace libraries' error messages, which describe their internals
+_REASONS = {  # by exception type: our words for libraries' messages, which describe internals
     UnicodeDecodeError: "its text is not UTF-8",
     struct.error: "its lengths do not fit together",
     RuntimeError: "its lengths do not fit together",  # raised by nanoarrow
@@ -106,11 +106,11 @@ _REASONS = {  # replace libraries' error messages, which describe their internal
 class RecordingReader(ArrowTable):
     """A recording with the rows that it had when it was opened; may be iterated over more than once.
 
-    Tables of pandas or polars and the wide form hold all rows in memory. An Arrow library accepts the reader
-    itself, such as `pyarrow.table(reader)`.
+    Tables of pandas or polars and the wide form hold all rows in memory. Arrow libraries accept the reader
+    itself: `pyarrow.table(reader)`.
 
-    `truncated` is the number of bytes at its end that are skipped: the writer was killed, or the disk was
-    full, before their batch was complete.
+    `truncated` is the number of skipped bytes at the end of the file. They are an incomplete batch: the
+    writer was killed, or the disk was full.
     """
 
     metadata: Metadata
@@ -121,7 +121,7 @@ class RecordingReader(ArrowTable):
 
     @abstractmethod
     def __iter__(self) -> Iterator[Rows]:
-        """Yield the rows, some thousands at a time. Raises ValueError if the file is damaged."""
+        """Yield batches of some thousand rows. Raises ValueError if the file is damaged."""
 
     def __repr__(self) -> str:
         try:
@@ -140,10 +140,10 @@ class RecordingReader(ArrowTable):
         return CArrayStream.from_c_arrays([rows.arrow() for rows in self], layout).__arrow_c_stream__()
 
     def wide(self, *columns: str) -> WideRows:
-        """Return a table with a column for each `drive.register`, or for the given ones, and a row per time.
+        """Return a table with a column per `drive.register` (all, or those in `columns`) and a row per time.
 
-        Only registers of one request share a row, and a miss is null: see `WideRows`. Raises ValueError for a
-        column that is not in the recording, or if the recording is damaged.
+        Only values that one request read share a row. A miss is null: see `WideRows`. Raises ValueError for
+        a column that is not in the recording, or if the recording is damaged.
         """
         return WideRows((row for rows in self for row in rows), columns, self._registers())
 
@@ -159,7 +159,7 @@ class RecordingReader(ArrowTable):
         ]
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
-        """Return a ValueError that states the damage and the number of readable rows."""
+        """Return a ValueError whose message has the damage and the number of readable rows."""
         reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
         return ValueError(f"{self.path} is damaged after row {rows}: {reason}")
 
@@ -167,7 +167,7 @@ class RecordingReader(ArrowTable):
         return ValueError(f"{path or self.path} is not a recording: {reason}")
 
     def _parse_metadata(self, text: bytes, path: Path | None = None) -> Metadata:
-        """Parse metadata of this file, or of the one at `path`. Raises ValueError if it is no JSON object."""
+        """Parse metadata of this file, or of the file at `path`. Raises ValueError if it is not a JSON object."""
         try:
             metadata = json.loads(text)
         except ValueError as error:
@@ -185,7 +185,7 @@ def dump_metadata(metadata: Metadata) -> str:
 
 
 class RecordingExists(FileExistsError, ValueError):
-    """There is a file at the path of a new recording."""
+    """A new recording cannot be created, because a file exists at its path."""
 
 
 def already_there(path: Path) -> RecordingExists:
@@ -205,7 +205,7 @@ def new_file(path: Path) -> FileIO:
 
 
 class AppendFile:
-    """A new file. Raises RecordingExists if the path exists. The methods, too, raise OSError."""
+    """A new file. Raises RecordingExists if a file exists at the path. All methods raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
@@ -213,10 +213,9 @@ class AppendFile:
         self._is_truncated = False  # the last piece is incomplete
 
     def append(self, piece: bytes | memoryview) -> None:
-        """Append the whole piece, or leave the file as it was if the piece does not fit.
+        """Append the whole piece. If this fails or a signal handler raises, restore the file's former length.
 
-        The same holds if a signal handler raises. If the file cannot be truncated immediately, it is
-        truncated before the next piece is appended.
+        If truncating fails too, the file is truncated before the next piece is appended.
         """
         if self._is_truncated:
             self._cut()

@@ -1,7 +1,7 @@
 """Recordings as Parquet (.parquet), the smallest format for archiving; needs pyarrow.
 
-A Parquet file can be read only after it has been closed, so a crash loses it. Record into .arrows, then
-convert.
+A Parquet file can be read only after it was closed, so a crash of the writer loses the whole file. Record
+into .arrows, then convert.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from multidrop.recording.format import (
 )
 from multidrop.recording.rows import RecordedRows
 
-GROUP_ROWS = 1 << 17  # rows that are gathered in memory
+GROUP_ROWS = 1 << 17  # rows per group; a group is gathered in memory
 TEXTS = ("drive", "register", "status")
-MOST_TEXT = 1 << 26  # bytes of a text column in GROUP_ROWS rows
-MOST_OF_GROUP = 1 << 29  # unpacked bytes of a group of rows
+MOST_TEXT = 1 << 26  # limit in bytes for the texts of one column in a group
+MOST_OF_GROUP = 1 << 29  # limit in bytes for an unpacked group of rows
 UNREADABLE = "it cannot be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
     "compression": "zstd",
@@ -109,7 +109,7 @@ class ParquetReader(RecordingReader):
         if found.types[: len(wanted)] != wanted.types or not (has_units or found.names == wanted.names):
             raise self._not_a_recording("it is a Parquet file with other columns")
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
-        if has_units and not self.metadata.get("drives"):  # rows of one register may have different units
+        if has_units and not self.metadata.get("drives"):  # written by a fleet's hub
             raise self._not_a_recording(
                 "it is a file of `multidrop hub`: read its folder with multidrop.History"
             )
@@ -147,7 +147,7 @@ class ParquetReader(RecordingReader):
                 )
 
     def _next(self, batches: Iterator[Any], rows: int) -> Any:
-        """Return the next batch, None after the last."""
+        """Return the next batch, or None after the last batch."""
         try:
             batch = next(batches, None)
             if batch is None:

@@ -11,7 +11,7 @@ from multidrop.polling.batch import Row, Rows, assemble, shown_span
 
 
 class RecordedRows(Rows):
-    """Rows held by a nanoarrow array of the schema."""
+    """Rows in a nanoarrow array with the schema of a recording."""
 
     def __init__(self, rows: Any) -> None:
         self._array = rows
@@ -42,7 +42,7 @@ def _values(column: Any) -> Iterable[Any]:
 
 
 def texts_of(column: Any) -> Iterator[str]:
-    """Yield each row's text of a column."""
+    """Yield the text in each row of a column."""
     ends, text = memoryview(column.buffer(1))[: column.length + 1], bytes(column.buffer(2))
     if text.isascii():  # usual case: decode all texts together
         letters = text.decode("ascii")
@@ -51,7 +51,7 @@ def texts_of(column: Any) -> Iterator[str]:
 
 
 def from_rows(rows: Sequence[Row]) -> RecordedRows:
-    """Return the same rows in Arrow's layout."""
+    """Convert rows to Arrow's layout."""
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = zip(*rows, strict=True)
     return RecordedRows(
         assemble(
@@ -72,7 +72,7 @@ def _filled(values: Sequence[Any]) -> list[Any]:
 
 
 def _bitmap(values: Sequence[object]) -> bytes:
-    """Return a bit for each value, least significant first: 0 for None."""
+    """Return a validity bitmap, least significant bit first: 0 for None, 1 for any other value."""
     bits = "".join("0" if value is None else "1" for value in reversed(values))
     return int(bits, 2).to_bytes((len(values) + 7) // 8, "little")
 

@@ -1,7 +1,7 @@
 """Recordings in segments: `run.arrows` becomes run.00000001.arrows, run.00000002.arrows, and so on.
 
-Each segment is a complete recording, as crash-safe as any other. Numbers only grow, also across restarts. The
-segment with the lower number is the older one, whatever the clock said.
+Each segment is a complete recording, as crash-safe as any other. Segment numbers only grow, also across
+restarts. So a segment with a lower number is older, even if the clock was set back.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # bytes; a longer unreadable end is damage, not a truncated batch, and is kept
+MOST_CUT = 1 << 24  # bytes; a longer unreadable end is kept, as damage rather than a truncated batch
 
 
 def segments_of(path: Path) -> list[tuple[int, Path]]:
@@ -31,13 +31,13 @@ def segments_of(path: Path) -> list[tuple[int, Path]]:
 
 
 class SegmentWriter(RecordingWriter):
-    """A recording that starts a new segment `every` s, on the monotonic clock.
+    """A recording that starts a new segment each `every` s of the monotonic clock.
 
-    A segment is created with its first rows. Whenever a segment starts, those that ended more than `keep` s
-    ago are removed; then the oldest ones, as long as all together take more than `most` bytes. The current
-    segment is never removed. All new segments have numbers above `after`. Raises ValueError if another
-    process records there or the name does not end in .arrows, TypeError for metadata that JSON cannot hold,
-    and RecordingError.
+    A segment's file is created with its first rows. Whenever a segment starts, segments that ended more than
+    `keep` s ago are removed. Then the oldest are removed while all together take more than `most` bytes. The
+    segment in progress is never removed. New segments have numbers above `after`. Raises ValueError if
+    another process records there or the name does not end in .arrows, TypeError for metadata that JSON
+    cannot hold, and RecordingError.
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class SegmentWriter(RecordingWriter):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The segments that this writer wrote and that still exist."""
+        """The paths of the segments that this writer wrote and that still exist."""
         return tuple(filter(Path.exists, self._written))
 
     @property
     def open_number(self) -> int:
-        """The number of the current or next segment. All segments with lower numbers are closed."""
+        """The number of the open segment, or of the next one. All segments with lower numbers are closed."""
         return self.number if self._segment else self.number + 1
 
     def write(self, batch: Rows) -> None:
@@ -88,9 +88,9 @@ class SegmentWriter(RecordingWriter):
             self.rows += len(batch)
 
     def rotate(self, metadata: Metadata | None = None) -> None:
-        """End this segment; the next rows start a new one, with this metadata if given.
+        """Close the open segment, or remove it if it has no rows. The next rows start a new segment.
 
-        A segment without rows is removed.
+        The new segment has this metadata, or by default that of the last segment.
         """
         segment, self._segment = self._segment, None
         self._metadata = self._metadata if metadata is None else metadata
@@ -129,22 +129,22 @@ class SegmentWriter(RecordingWriter):
 
 
 def _cut_truncated(path: Path) -> None:
-    """Cut off the incomplete batch of a killed writer: other libraries refuse such a file."""
+    """Cut off an incomplete batch of a killed writer, because other libraries cannot read such a file."""
     with suppress(OSError, ValueError):  # not a recording: keep it
         truncated = ArrowsReader(path).truncated
         if 0 < truncated <= MOST_CUT:
             os.truncate(path, path.stat().st_size - truncated)
 
 
-AGES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "week": 604800.0}  # in s
-SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}  # in bytes
+AGES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "week": 604800.0}  # unit: length in s
+SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}  # unit: size in bytes
 
 
 class StoredFile(NamedTuple):
-    """A file of rows whose number grows with the time of recording."""
+    """A file of a recording in segments, for deciding which files to remove."""
 
     path: Path
-    number: int  # of the last segment in it
+    number: int  # segment number, of the last segment if the file has several
     end: float  # time of its newest row, in s since 1970
     size: int  # in bytes
 
@@ -154,11 +154,11 @@ def outlived(
 ) -> list[StoredFile]:
     """Return the files to remove: those that are older than `keep` s, and the oldest beyond `most`.
 
-    `now` is in s since 1970. Files of up to `most` bytes in all are kept. None means unlimited. The oldest
-    file is the one with the lowest number, whatever the clock said.
+    `now` is in s since 1970. `most` limits the bytes of all kept files together. None means unlimited. The
+    oldest file is the one with the lowest number, even if the clock was set back.
 
-    A file's age is the sum of the intervals between the ends of all later files, up to `now`. An interval
-    longer than `keep` is skipped: a jump of the clock, or a pause in recording, must not empty a history.
+    A file's age is the sum of the intervals between its end, the ends of all later files, and `now`. An
+    interval longer than `keep` is skipped: a clock jump or a pause in recording must not remove every file.
     """
     in_order = sorted(files, key=lambda file: file.number)
     ages = {} if keep is None else _ages(in_order, now, keep)
@@ -174,7 +174,7 @@ def outlived(
 
 
 def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
-    """Return each number's age in s, not counting intervals that are negative or longer than `longest`."""
+    """Return each file's age in s by number, without intervals that are negative or longer than `longest`."""
     ends: dict[int, float] = {}
     for file in files:
         ends[file.number] = min(file.end, ends.get(file.number, file.end))  # a copy may have a later time
@@ -188,7 +188,7 @@ def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, 
 
 
 def parse_age(text: str) -> float:
-    """Return the seconds of an age such as "30 days". Raises ValueError for other texts."""
+    """Return the seconds in an age such as "30 days". Raises ValueError for other texts."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:(s|min|h)|(day|week)s?)", str(text).strip(), re.ASCII)
     seconds = float(match[1]) * AGES[match[2] or match[3]] if match else 0.0
     if not 1.0 <= seconds <= 36525 * AGES["day"]:
@@ -199,7 +199,7 @@ def parse_age(text: str) -> float:
 
 
 def parse_size(text: str) -> int:
-    """Return the bytes of a size such as "20 GB". Raises ValueError for other texts."""
+    """Return the bytes in a size such as "20 GB". Raises ValueError for other texts."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(kB|MB|GB|TB)", str(text).strip(), re.ASCII)
     size = round(float(match[1]) * SIZES[match[2]]) if match else 0
     if not SIZES["kB"] <= size <= 10**18:
@@ -211,7 +211,7 @@ _CLOSED_IN_CHILDREN = getattr(os, "O_CLOEXEC", 0) or getattr(os, "O_NOINHERIT", 
 
 
 class FileLock:
-    """A lock, held until `close` or the end of the process. Its file stays: removing it would be a race.
+    """A file lock, held until `close` or the end of the process. The file stays: removing it would be a race.
 
     Raises BlockingIOError while another process holds it, and OSError if the file cannot be created.
     """

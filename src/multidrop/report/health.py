@@ -1,4 +1,4 @@
-"""Draw the health of a line: rates, misses over time and against frequency, response delays."""
+"""Draw the health of a line: rates, misses over time, misses against output frequency, response delays."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # in a picture; all others are shown together
-LEAST_IN_BIN = 20  # values; with fewer, a share of misses is not significant
+MOST_REASONS = 6  # reasons for misses in a picture; all others are drawn as one
+LEAST_IN_BIN = 20  # values; with fewer values, a bin's share of misses is not significant
 BINS = 12  # number of bins of the output frequency
 FREQUENCY = "output_frequency"
 ROOM = 2.0  # length of an axis, as a multiple of the 99 % quantile of the delays
-SHORTEST_AXIS = 0.001  # s
+SHORTEST_AXIS = 0.001  # s, of the axis of delays
 SHADES = ("#B00020", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#0072B2", "#999999")
 
 
@@ -50,7 +50,7 @@ class DelaySeries:
 def delays(recording: Recording) -> list[DelaySeries]:
     """Return the delays of every drive that answered.
 
-    The first reply after a lost request is left out: it may answer the lost request, so its delay is unknown.
+    The first reply after a lost request is left out: it may answer the lost request, so its delay is not known.
     """
     found = []
     for drive in recording.drives:
@@ -67,7 +67,7 @@ def delays(recording: Recording) -> list[DelaySeries]:
 
 
 def _spans_loss(series: Series) -> Array:
-    """Return True for each value that may answer an earlier, lost request of the same register."""
+    """Return an array with True for each value that may be the reply to an earlier, lost request."""
     asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
     lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
     next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]
@@ -75,7 +75,9 @@ def _spans_loss(series: Series) -> Array:
 
 
 def _request_seconds(recording: Recording, drive: str) -> float | None:
-    """Return the s that a request and a reply's first character take; None without usable metadata."""
+    """Return the time in s that a request and the first character of its reply take on the wire.
+
+    Return None if the recording's metadata lack the drive's settings."""
     about = recording.about(drive)
     try:
         baudrate, format = about["settings"].split()
@@ -114,7 +116,7 @@ def draw_delays(found: Sequence[DelaySeries]) -> Figure:
 
 
 def draw_rates(recording: Recording) -> Figure:
-    """Draw values per second of the first MOST_DRIVES drives, and below misses per second by reason."""
+    """Draw values per second of the first MOST_DRIVES drives; below, misses per second by reason."""
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
     bins = TimeBins(recording.begin, recording.end)
     for number, drive in enumerate(recording.drives[:MOST_DRIVES]):
@@ -152,10 +154,10 @@ def reasons_of(recording: Recording, drive: str) -> Counter[str]:
 
 
 def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
-    """Return output frequencies in Hz, and the drive's share of missed values near each.
+    """Return output frequencies in Hz, and the drive's share of missed values near each frequency.
 
-    The frequency at a miss is the last one that was read. Values that were not requested do not count. Return
-    None if there are no misses, or if the drive has no frequency or a constant one.
+    The frequency at a miss is the last frequency read before it. Values that were not requested do not count.
+    Return None if there are no misses, if the drive has no frequency register, or if its value is constant.
     """
     (frequency, *_) = (*recording.of(drive, FREQUENCY), None)
     reasons = [reason for reason in reasons_of(recording, drive) if not reason.startswith(UNASKED)]
@@ -180,7 +182,7 @@ def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
 
 
 def draw_miss_shares(recording: Recording) -> Figure | None:
-    """Draw misses against output frequency: noise that grows with speed shows as a slope."""
+    """Draw the share of misses against output frequency: a slope shows noise that grows with speed."""
     shares = {drive: miss_shares(recording, drive) for drive in recording.drives[:MOST_DRIVES]}
     if not any(shares.values()):
         return None
@@ -204,7 +206,7 @@ MOST_FIGURE = 1e9  # sanity limit of a plan's figures
 
 @dataclass(frozen=True, eq=False)
 class LineUse:
-    """A line's answered exchanges: the time of each, and the line time that it needed."""
+    """A line's answered exchanges: the time of each, and the time for which each needed the line."""
 
     line: str
     planned: Mapping[str, Any]
@@ -220,7 +222,7 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """Seconds to read everything once; None if a register has its own rate."""
+        """The time in s to read every register once; None if a register has its own rate, or without values."""
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None
@@ -240,7 +242,9 @@ def line_uses(recording: Recording) -> list[LineUse]:
 
 
 def _checked(planned: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plan with its figures as floats. Raises errors that `line_uses` catches."""
+    """Return the plan with its figures as floats.
+
+    Raises ValueError, KeyError, TypeError or AttributeError for a damaged plan; `line_uses` catches these."""
     drives = {
         name: {**drive, **{key: _figure(drive[key]) for key in _DRIVE_FIGURES}}
         for name, drive in planned["drives"].items()
@@ -284,8 +288,9 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
 
 
 def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
-    """Return each answered exchange's time and its seconds up to the reply's end; and the number of values.
+    """Return the answered exchanges of a drive, and the number of values in their replies.
 
+    The first array has the time of each exchange in ns UTC, the second its seconds up to the reply's end.
     Values with the same time were read by one exchange, whose registers may differ from the plan.
     """
     registers = [register for block in drive["blocks"] for register in block["registers"]]
@@ -306,7 +311,7 @@ def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tup
     framing = Framing[recording.about(name)["framing"].upper()]
     requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
     characters = np.array([_characters(framing, request) for request in requests])[which]
-    # Rows have the times of the request's start and of the reply's first character.
+    # Rows only have the times of the request's start and of the reply's first character.
     rest = (characters - 1) * drive["character_ms"] / 1e3
     return time, uncertainty / 1e9 + rest, len(times)
 
@@ -316,7 +321,7 @@ def _characters(framing: Framing, request: Message) -> int:
 
 
 def draw_utilisation(uses: Sequence[LineUse], recording: Recording) -> Figure:
-    """Draw each line's utilisation over time, with the planned one dashed."""
+    """Draw each line's utilisation over time, and its planned utilisation dashed."""
     figure, (axes,) = new_figure([2.2])
     bins = TimeBins(recording.begin, recording.end)
     for number, use in enumerate(uses):

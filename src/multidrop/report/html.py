@@ -26,7 +26,7 @@ from multidrop.report.load import Recording, Series
 from multidrop.report.style import MOST_DRIVES, png
 from multidrop.report.value_plot import FAULTS, plot
 
-SHORT = 32  # characters; a cell with up to so many is not wrapped
+SHORT = 32  # characters; a table cell with no more than these is not wrapped
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; }
@@ -45,12 +45,12 @@ div.wide { overflow-x: auto; }
 
 
 def plot_page(recording: Recording, figure: Figure) -> str:
-    """Return an HTML page with this picture of values."""
+    """Return an HTML page with this figure, a plot of the recording's values."""
     return _page(f"{recording.path.name}", [_about(recording), _image(figure, "values over time")])
 
 
 def report_page(recording: Recording) -> str:
-    """Return the report: use of the lines, rates, misses, delays, faults and values."""
+    """Return the report as HTML: use of the lines, rates, misses, delays, faults and values."""
     parts = [
         _about(recording),
         *_drives(recording),
@@ -93,7 +93,7 @@ def _utc(time_ns: int) -> str:
 
 
 def _counts(series: Sequence[Series]) -> tuple[int, int]:
-    """Count values and misses."""
+    """Return the numbers of values and of misses in these series."""
     misses = sum(int(one.missed.sum()) for one in series)
     return sum(len(one.time) for one in series) - misses, misses
 
@@ -229,7 +229,7 @@ def _escape(text: str) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table; a column whose head starts with # has numbers, aligned right."""
+    """Return an HTML table. A column whose head starts with # has numbers, which are aligned right."""
     kinds = [f' class="{_kind(column)}"' for column in zip(heads, *rows, strict=True)]
     head = "".join(
         f"<th{kind}>{_escape(text.removeprefix('#'))}</th>" for kind, text in zip(kinds, heads, strict=True)

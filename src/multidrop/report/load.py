@@ -16,11 +16,11 @@ from multidrop.polling.batch import ROW_COLUMNS
 from multidrop.recording import open_recording
 
 RAW = "raw count"  # unit of values without a known scale
-LARGEST = 1e150  # largest drawable value: axes compute products of values
-LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: dates beyond it cannot be computed
+LARGEST = 1e150  # larger values are not drawn: matplotlib computes products of values
+LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC; no dates can be computed for later times
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step is a pause, for example of a suspended process
-MOST_ROWS = 100_000_000  # these take 5 GB
-MOST_NAMES = 4096  # of drives, registers or statuses
+MOST_ROWS = 100_000_000  # of a recording: these take 5 GB of memory
+MOST_NAMES = 4096  # limit for the names of drives, of registers and of statuses
 LONGEST_NAME = 4096  # bytes
 LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
 Array = NDArray[Any]
@@ -37,7 +37,7 @@ class TimeSpan:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One register of one drive: for each time that it was due, a value, or NaN for a miss."""
+    """The rows of one register of one drive; `value` is NaN for a miss."""
 
     drive: str
     register: str
@@ -58,12 +58,12 @@ class Series:
 
     @cached_property
     def drawable(self) -> Array:
-        """The values, with NaN for misses and for those that are too large for a picture."""
+        """The values, with NaN for misses and for values too large for a picture."""
         return np.where(np.abs(self.value) < LARGEST, self.value, np.nan)
 
     @cached_property
     def pauses(self) -> Array:
-        """For each row except the last: True if a pause without values or misses follows."""
+        """For each row except the last: True if polling paused after it, so that neither values nor misses follow."""
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
@@ -75,12 +75,12 @@ class Series:
 
     @property
     def is_bits(self) -> bool:
-        """True if a count is a sum of named bits."""
+        """True if the register's raw value is a set of named bits."""
         return bool(self.names) and self.metadata.get("bits") is True
 
     @property
     def unit(self) -> str:
-        """The unit beside an axis; "raw count" if the scale is unknown."""
+        """The unit to write on an axis: "raw count" if the scale is unknown, "" for named states."""
         if self.names:
             return ""
         if "step" in self.metadata and self.metadata["step"] is None:
@@ -92,11 +92,11 @@ class Series:
         return Counter({self.statuses[number]: int(n) for number, n in zip(numbers, counts, strict=True)})
 
     def times_of(self, reason: str) -> Array:
-        """Return the times of the misses for this reason."""
+        """Return the times of the misses with this reason."""
         return np.asarray(self.time[self.missed & (self.status == self.statuses.index(reason))])
 
     def faults(self) -> list[TimeSpan]:
-        """Return the spans in which a fault register was not 0; a miss does not end a fault."""
+        """Return the time spans in which this fault register was not 0; a miss does not end a span."""
         there = ~self.missed
         time, value = self.time[there], self.value[there]
         if not len(time):
@@ -111,7 +111,7 @@ class Series:
         ]
 
     def name_of(self, value: float) -> str:
-        """Return the name of a count, the names of the bits that are set, or the number itself."""
+        """Return the name of a raw value, the names of its set bits, or a text with the number."""
         if not value.is_integer() or not 0 <= value < LARGEST_COUNT:
             return f"code {value:g}"
         number = int(value)
@@ -126,15 +126,15 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recording: its metadata, and its series in the order in which they first appear.
+    """A whole recording: its metadata, and its series in the order of their first rows.
 
-    Drives are in the order of their plant file.
+    Drives are in the order of the plant file.
     """
 
     path: Path
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
-    truncated: int  # skipped bytes at the recording's end
+    truncated: int  # number of skipped bytes at the recording's end
 
     @property
     def statuses(self) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ class Recording:
         return found
 
     def of(self, drive: str, register: str = "") -> tuple[Series, ...]:
-        """Return a drive's series, or that of one register."""
+        """Return all series of a drive, or only that of `register`."""
         of_drive = self._by_drive.get(drive, ())
         return tuple(series for series in of_drive if register in ("", series.register))
 
@@ -230,7 +230,7 @@ def load(path: str | Path) -> Recording:
 
 
 def _described(drives: object) -> dict[str, Any]:
-    """Return the metadata of drives and registers, without values that `Plant.metadata` never writes."""
+    """Return the metadata of drives and registers, without parts that `Plant.metadata` never writes."""
     found = {}
     for name, about in _tables(drives):
         registers = {register: _checked(table) for register, table in _tables(about.get("registers"))}
@@ -265,7 +265,7 @@ def _numbers(column: Any) -> Array:
 
 
 def _codes(column: Any, known: dict[str, int]) -> Array:
-    """Return the code of each row's text from `known`; new texts are added to `known`."""
+    """Return each row's text as its code in `known`; texts that `known` lacks are added to it."""
     ends = np.array(column.buffer(1))[: column.length + 1]
     lengths = np.diff(ends)
     if lengths.max(initial=0) > LONGEST_NAME:

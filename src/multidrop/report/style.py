@@ -23,7 +23,7 @@ TEXT = "#555555"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
 FEWEST_BINS, MOST_BINS = 10, 120  # limits of the number of bins on the time axis
-BIN_NS = 2_000_000_000  # width of a bin, if the number of bins is within these limits
+BIN_NS = 2_000_000_000  # width of a bin, unless the number of bins would exceed these limits
 SHORTEST_NS = 1_000_000_000  # least length of the time axis
 WIDTH = 11.0  # inches
 DPI = 110
@@ -33,7 +33,7 @@ _DATES: Any = dates  # matplotlib.dates has no type hints
 
 
 class TimeBins:
-    """The bins into which a picture divides the time of a recording; times are in ns UTC."""
+    """The bins into which a picture divides the time axis of a recording; times are in ns UTC."""
 
     def __init__(self, begin: int, end: int) -> None:
         bins = int(np.clip((end - begin) / BIN_NS, FEWEST_BINS, MOST_BINS))
@@ -42,7 +42,9 @@ class TimeBins:
         self.middles = days(((self._edges[1:] + self._edges[:-1]) / 2).astype(np.int64))
 
     def rates(self, time: Array, weights: Array | None = None) -> Array:
-        """Return for each bin the number of times in it, or the sum of their weights, per second."""
+        """Return for each bin the number of events per second, or the sum of their weights per second.
+
+        `time` has the time of each event."""
         return np.asarray(np.histogram(time, self._edges, weights=weights)[0] / self._seconds)
 
     def label(self, axes: Axes) -> None:
@@ -52,13 +54,13 @@ class TimeBins:
 
 
 def label(text: str) -> str:
-    """Return the name in a form that matplotlib neither reads as a formula nor leaves out of a legend."""
+    """Return the text with an escape where matplotlib would read a formula or omit the legend's entry."""
     shown = printable(text).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Return colour and dashes of the drive with this number, the same in every picture."""
+    """Return matplotlib's colour and dashes for a drive's lines, the same in every picture."""
     return {
         "color": COLOURS[number % len(COLOURS)],
         "linestyle": DASHES[number // len(COLOURS) % len(DASHES)],
@@ -66,7 +68,7 @@ def line_style(number: int) -> dict[str, Any]:
 
 
 def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[Axes]]:
-    """Make a figure of axes below each other with these heights in inches."""
+    """Return a figure and its axes, which are below each other and have these heights in inches."""
     figure = Figure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=list(heights), **details)[:, 0]
     for one in axes:
@@ -76,7 +78,7 @@ def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[A
     return figure, list(axes)
 
 
-MOST_COLUMNS = 6  # of a legend
+MOST_COLUMNS = 6  # limit for a legend
 
 
 def set_title(axes: Axes, text: str) -> None:
@@ -93,7 +95,7 @@ def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 
 def mark_times(axes: Axes, time: Array, height: float, apart: int, **details: Any) -> None:
-    """Draw a tick at each time. Ticks within the same `apart` ns would overlap, and are drawn as one."""
+    """Draw a tick at each time. Ticks in the same interval of `apart` ns would overlap: only one is drawn."""
     if len(time):
         time = np.unique(time // max(1, apart)) * max(1, apart)
         axes.plot(days(time), np.full(len(time), height), "|", **details)

@@ -1,4 +1,4 @@
-"""Draw a recording's values: a panel for each quantity, states as lanes, faults and misses marked."""
+"""Draw a recording's values: a panel per quantity, with states as lanes, and with faults and misses marked."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from multidrop.report.style import (
     set_title,
 )
 
-FIRST = (  # registers that precede the others if not all fit
+FIRST = (  # registers whose panels are drawn first if not all fit
     "output_frequency",
     "output_current",
     "motor_speed",
@@ -43,19 +43,19 @@ FIRST = (  # registers that precede the others if not all fit
     "heatsink_temperature",
 )
 MOST_PANELS = 8
-MOST_POINTS = 4000  # of a curve: more points cannot be seen
-FEW_POINTS = 200  # up to so many points, each is drawn as a dot
+MOST_POINTS = 4000  # per curve: more points cannot be seen
+FEW_POINTS = 200  # up to this number of points in a curve, each is drawn as a dot
 FAULTS = "fault"
 
 CURVES_INCHES = 1.9
 
 
 class Panel(NamedTuple):
-    """A quantity with a panel of its own, because amperes and per cent cannot share an axis."""
+    """A register name and unit that have their own panel, because amperes and per cent cannot share an axis."""
 
     register: str
     unit: str
-    has_names: bool  # the counts have names, so they are states
+    has_names: bool  # the raw values have names, so they are states
 
     @property
     def title(self) -> str:
@@ -68,8 +68,8 @@ class Content:
 
     panel: Panel
     series: list[Series]
-    lanes: list[Lane]  # none: curves
-    hidden: int  # number of lanes without room
+    lanes: list[Lane]  # empty: the panel has curves
+    hidden: int  # number of lanes for which there is no room
 
     @property
     def inches(self) -> float:
@@ -79,7 +79,7 @@ class Content:
 def plot(
     recording: Recording, drives: Sequence[str] = (), registers: Sequence[str] = ()
 ) -> tuple[Figure, list[str]]:
-    """Return the picture, and the names of registers and drives for which it had no room.
+    """Return a picture of these drives and registers (default: all), and the names that had no room in it.
 
     Raises ValueError for unknown names, and if there is no value to draw.
     """
@@ -120,7 +120,7 @@ def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[
 
 
 def _faults(chosen: Sequence[Series], *, is_alone: bool) -> list[Series]:
-    """Return the fault series of drives that had faults, or all if there are no other series."""
+    """Return the fault series of drives that had faults; all fault series if only those were chosen."""
     polled = [series for series in chosen if series.register == FAULTS]
     return [series for series in polled if series.faults()] or (polled if is_alone else [])
 
@@ -168,7 +168,7 @@ def _draw(axes: Axes, content: Content, recording: Recording) -> None:
 def _add_drives(
     figure: Figure, contents: Sequence[Content], recording: Recording, *, has_misses: bool
 ) -> None:
-    """Add a legend of the drives that have curves, and of the mark of a miss."""
+    """Add a legend with the drives that have curves, and with the mark of a miss."""
     curves = {series.drive for content in contents for series in content.series if not series.names}
     handles = [
         Line2D([], [], label=label(name), **line_style(number))
@@ -194,7 +194,7 @@ def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: 
 
 
 def _fit(axes: Axes, series: Sequence[Series]) -> None:
-    """Scale the y axis: whole numbers for counts, room around a constant value; include 0 if it is near."""
+    """Scale the y axis: whole numbers for raw counts, room around a constant value, and 0 if it is near."""
     drawn = np.concatenate([one.drawable for one in series])
     seen = drawn[~np.isnan(drawn)]
     if not len(seen):
@@ -222,7 +222,7 @@ def _mark_misses(axes: Axes, series: Sequence[Series], recording: Recording) -> 
 
 
 def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
-    """Draw a row for each drive, and its faults as bars with their names."""
+    """Draw a row per drive with the drive's faults as bars, which have the faults' names."""
     set_title(axes, "faults" if any(one.faults() for one in series) else "faults: none")
     for row, one in enumerate(series):
         for span in one.faults():
@@ -235,7 +235,7 @@ def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
 
 
 def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
-    """Shade each drive's faults: across the panel if it has the drive's curve, else across its lanes."""
+    """Shade the times of each drive's faults: across a panel with the drive's curve, or across its lanes."""
     shade: dict[str, Any] = {"color": FAULT, "alpha": 0.08, "lw": 0}
     for one in faults:
         rows = [row for row, lane in enumerate(content.lanes) if lane.drive == one.drive]
@@ -248,13 +248,13 @@ def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
 
 
 def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]:
-    """Return the points with a miss at the start of each pause, which interrupts the line."""
+    """Return the points with NaN inserted at the start of each pause, which interrupts the drawn line."""
     at = np.searchsorted(time, begins, side="right")
     return np.insert(time, at, begins + 1), np.insert(value, at, np.nan)
 
 
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:
-    """Return at most MOST_POINTS points: the smallest and the largest of each stretch, and its misses."""
+    """Return at most MOST_POINTS points: the least and greatest value of each stretch, and its misses."""
     pieces = MOST_POINTS // 2
     if len(time) <= MOST_POINTS:
         return time, value
@@ -272,28 +272,28 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
 COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
 HATCHES = ("", "////", "....")  # patterns, for when the colours are used up
 MOST_LANES = 64  # per panel
-NARROWEST = 1 / 1500  # part of the time axis: the least width of a state
-LETTER = 1 / 140  # part of the time axis: the width of a letter
+NARROWEST = 1 / 1500  # least width of a state, as a fraction of the time axis
+LETTER = 1 / 140  # width of a letter, as a fraction of the time axis
 LANE_INCHES = 0.24
-MOST_TEXTS = 50  # labels with one name in one lane
+MOST_TEXTS = 50  # limit of labels with the same name in one lane
 
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """The states of a drive's register, or of one of its bits, and their times."""
+    """The successive states of a drive's register, or of one bit of it, and their times."""
 
     drive: str
     title: str
     is_bit: bool  # the state is on or off
-    time: Array  # of the rows, ns UTC
+    time: Array  # of each row, ns UTC
     missed: Array
-    state: tuple[str, ...]  # of each run of equal rows
-    begin: Array  # of each state, ns UTC
+    state: tuple[str, ...]  # name of each state: one for each run of equal rows
+    begin: Array  # start of each state, ns UTC
     end: Array
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return a panel's lanes, and how many had no room. Bits that were never set are left out first."""
+    """Return a panel's lanes, and the number of lanes without room. Lanes of bits that are never set go first."""
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found
@@ -322,7 +322,7 @@ def _lanes(series: Series) -> Iterable[Lane]:
 
 
 def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], str]) -> Lane:
-    """Cut the rows into runs of one value; a state lasts until the next row, or until a pause."""
+    """Return a lane with a state for each run of equal values; it lasts until the next state or a pause."""
     time = series.time
     differs = (value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1]))
     cuts = np.flatnonzero(differs | series.pauses)
@@ -349,7 +349,7 @@ def lanes_inches(lanes: Sequence[Lane]) -> float:
 
 
 def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
-    """Draw each lane as a row of bars, one per state. Names that fit into no bar go into a legend."""
+    """Draw each lane as a row of bars, one per state. Names of states that fit into no bar go into a legend."""
     names = dict.fromkeys(state for lane in lanes if not lane.is_bit for state in lane.state)
     styles = {name: _style(number) for number, name in enumerate(names)}
     span = max(recording.end - recording.begin, 1)
@@ -379,7 +379,7 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
 
 
 def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
-    """Write a name at the start of a bar, readable even if the bar is shorter."""
+    """Write a name at the start of a bar; it stays readable if the bar is shorter than the name."""
     box = {"facecolor": "white", "alpha": 0.75, "pad": 0.8, "linewidth": 0}
     place: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
     axes.annotate(text, (at, row), fontsize=7.5, clip_on=True, bbox=box, **place)
@@ -391,7 +391,7 @@ def _style(number: int) -> dict[str, Any]:
 
 
 def _longest_first(lane: Lane) -> list[str]:
-    """Return the states, longest first: drawn in this order, long states do not cover short ones."""
+    """Return the lane's states, the longest first, so that long states do not cover short ones when drawn."""
     lasting = dict.fromkeys(lane.state, 0)
     for name, length in zip(lane.state, (lane.end - lane.begin).tolist(), strict=True):
         lasting[name] += length
@@ -399,7 +399,7 @@ def _longest_first(lane: Lane) -> list[str]:
 
 
 def _merged(lane: Lane, name: str, span: int) -> tuple[Array, Array]:
-    """Return the starts and ends of this state, without gaps too narrow to see."""
+    """Return the starts and ends of a lane's bars for this state; gaps too narrow to see are closed."""
     of = np.array([state == name for state in lane.state])
     begin, end = lane.begin[of], lane.end[of]
     apart = np.concatenate([[True], begin[1:] - end[:-1] > span * NARROWEST / 2])
