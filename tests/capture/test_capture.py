@@ -23,7 +23,7 @@ from multidrop.recording import RecordingError
 READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
 
 
-# ---- Wireshark reads ours ----
+# ---- Wireshark reads our captures ----
 
 
 def registers(data: bytes) -> list[int]:
@@ -91,7 +91,7 @@ def test_a_line_is_an_interface_with_its_name(tmp_path: Path) -> None:
     }
 
 
-# ---- we read ours, and others' ----
+# ---- our reader, with captures of ours and of other programs ----
 
 
 def test_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_noise_is_read_as_noise(tmp_path: Path) -> None:
 
 
 def hexdump(packets: Iterable[bytes]) -> str:
-    """Return what text2pcap reads: one packet a line, each a millisecond after the other."""
+    """Return input for text2pcap: one packet per line, with time stamps 1 ms apart."""
     return "".join(
         f"2026-11-21T09:30:00.{number:03}Z 0000 {packet.hex(' ')}\n" for number, packet in enumerate(packets)
     )

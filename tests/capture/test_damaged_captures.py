@@ -52,7 +52,7 @@ def test_a_capture_of_something_else_is_one_sentence(tmp_path: Path, content: by
 
 
 def described(*options: tuple[int, bytes]) -> bytes:
-    """A pcapng file with one interface, described so, and no packet."""
+    """Return a pcapng file without packets, and with one interface that has these options."""
     fields = b"".join(
         struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4) for code, value in options
     )
@@ -78,7 +78,7 @@ def block(kind: int, body: bytes) -> bytes:
 
 
 def packet(interface: int, content: bytes, stated: int | None = None) -> bytes:
-    """An enhanced packet block; `stated` is the length in its header."""
+    """Return an enhanced packet block; its header states the length `stated`, or by default the right one."""
     length = len(content) if stated is None else stated
     return block(6, struct.pack("<5I", interface, 0, 0, length, length) + content + bytes(-len(content) % 4))
 
@@ -95,9 +95,9 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         (SECTION + struct.pack("<III", 1, 7, 7), " is damaged: what begins at byte 28 is no packet"),
         (SECTION + block(1, bytes(4)), " is damaged: what begins at byte 28 is no packet"),
         (described((9, b"\x0a")), ": byte 28: its clock is finer than a nanosecond"),
-        (described() + packet(1, READ), NO_PACKET),  # of an interface that is not there
-        (described() + packet(0, READ, stated=9), NO_PACKET),  # longer than its block
-        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its two lengths differ
+        (described() + packet(1, READ), NO_PACKET),  # the file has no interface 1
+        (described() + packet(0, READ, stated=9), NO_PACKET),  # the stated length exceeds the block
+        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its lengths at both ends differ
         (described() + SECTION, ": byte 48: only the first section can be read"),
         (described() + BIG_ENDIAN_SECTION, ": byte 48: sections of both byte orders cannot be read"),
         (
@@ -131,7 +131,7 @@ def test_a_capture_cut_within_an_interface_is_read_up_to_it(tmp_path: Path) -> N
     "tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"]
 )
 def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes) -> None:
-    """An exported frame follows tags that describe it; this packet has no frame after them."""
+    """Tags describe an exported frame, and precede it; this packet ends within or after its tags."""
     path = tmp_path / "a.pcapng"
     interface = block(1, struct.pack("<HHI", 252, 0, 0))
     path.write_bytes(SECTION + interface + packet(0, tags) + packet(0, b"\0\0\0\0" + READ))
@@ -145,7 +145,7 @@ def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes
 def test_a_capture_may_exceed_the_room_of_a_stream(
     tmp_path: Path, format: str, content: bytes, count: int
 ) -> None:
-    """More packets than there is room for, or more bytes."""
+    """The capture has more packets, or more bytes, than the buffer between reader and decoder can hold."""
     path = tmp_path / f"a.{format}"
     if format == "pcapng":
         path.write_bytes(described() + packet(0, content) * count)
@@ -194,12 +194,12 @@ def test_pieces_of_a_file_are_one_capture(
         assert capture.truncated == len(OTHER_BLOCK) - 3
 
 
-OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # of statistics
+OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # statistics
 
 
 @pytest.mark.slow
 def test_a_capture_truncated_during_reading_is_a_sentence(tmp_path: Path) -> None:
-    """In a separate process: if the file were mapped, reading past its new end would kill the process."""
+    """A separate process reads it: if the file were mapped, reading past its new end would kill the process."""
     path = write(tmp_path / "it.pcapng", RTU * 20)
     code = (
         "import os, sys\nfrom multidrop.capture import Capture, CaptureError\n"

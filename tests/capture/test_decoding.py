@@ -40,7 +40,7 @@ def plant(directory: Path, model: str, framing: str) -> Plant:
     return load_plant(path)
 
 
-EXCHANGES = [  # model, framing, the printed request and its reply, what that says
+EXCHANGES = [  # model, framing, request and reply as documents print them, register and value
     ("innovert-ibd", "rtu", "01 06 20 01 13 88 DE 9C", "frequency", 50),
     ("innovert-ibd", "rtu", "01 06 00 6B 00 C8 F9 80", "acceleration_time", 20),
     ("innovert-ibd", "ascii", "0106200113883D", "frequency", 50),
@@ -112,7 +112,7 @@ def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> 
 
 @pytest.mark.long
 def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> None:
-    """Every register of one table, and then some of another."""
+    """All 65536 holding registers are read, and then some input registers."""
     ends = {3: 65500, 4: 10_000}
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         for function, end in ends.items():
@@ -144,18 +144,18 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
 def test_more_requests_than_are_cached_are_decoded(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:
-    """Three quarters of 16384 places are taken; long before, two requests come to want the same."""
+    """The decoder's hash table of requests has 16384 places, and is full at three quarters of them."""
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
     replies = (Message(each.address, 3, each.start, 1, data) if data else None for each in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
-    told = asked if data else asked[:-1]  # whether the last one was answered is unknown
+    told = asked if data else asked[:-1]  # it is unknown whether the last request was answered
     assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
         (f"address {record.address}", f"holding_register_{record.start}", *end) for record in told
     ]
 
 
 def test_an_oversized_request_has_rows_for_a_reply_s_registers(tmp_path: Path) -> None:
-    """Noise or a mistaken master asks for all there is, of every kind."""
+    """Noise, or a faulty master, may request all registers of a kind; a reply has at most 125 registers."""
     path = tmp_path / "a.pcapng"
     with CaptureWriter(path) as capture:
         for time, function in enumerate((3, 4, 1, 2, 3)):
@@ -179,7 +179,7 @@ def test_an_oversized_request_has_rows_for_a_reply_s_registers(tmp_path: Path) -
 def test_more_rows_than_a_batch_can_hold_are_more_batches(
     tmp_path: Path, reply: Message | None, end: tuple[float | None, str]
 ) -> None:
-    """The rows of an exchange are never parted."""
+    """All rows of an exchange are in the same batch."""
     count = 700 if reply else 701
     path = frames_of(tmp_path / "a.pcapng", [(Message(1, 3, 0, 100), reply)] * count)
     with Capture(path) as capture:

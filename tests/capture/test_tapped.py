@@ -39,7 +39,7 @@ NEVER_ON_THE_LINE = {str(each) for each in (Status.NOT_ASKED, Status.LATE_ANSWER
 
 
 class RoughWire(LateWire):
-    """Noise comes before replies and behind them; they are damaged, cut, lost, doubled, or late."""
+    """At random, adds noise before and after replies, and damages, truncates, loses, doubles or delays them."""
 
     def __init__(self, seed: int) -> None:
         super().__init__([EncodedDrive(drive) for drive in fast_drives()], unpaced=True)
@@ -57,7 +57,7 @@ class RoughWire(LateWire):
 
 
 class EchoingWire(RoughWire):
-    """The same line behind an adapter that echoes each request."""
+    """A RoughWire behind an adapter that echoes each request."""
 
     _echo = b""
 
@@ -85,7 +85,7 @@ def echoing_wires() -> list[Wire]:
 def captured(
     capture: Path, make: Callable[[], list[Wire]], drives: list[PolledDrive], enough: Counter[str]
 ) -> tuple[list[Row], list[Row]]:
-    """Return a poll's rows when it has so many rows of each status, and what its capture says."""
+    """Poll until there are `enough` rows of each status; return the polled rows, and those of the capture."""
     with served(make) as (path,):
         known = plant(line(path, *drives, name="hall-1"))
         poller = Poller(known)
@@ -106,7 +106,7 @@ def captured(
 
 
 def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return rows without the clock that captures do not have, by the time of the request."""
+    """Return the rows of requests that were sent, by request time, without the monotonic clock."""
     found: dict[int, list[tuple[object, ...]]] = {}
     for row in rows:
         if row.status not in NEVER_ON_THE_LINE:
@@ -115,18 +115,18 @@ def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
     return {time: sorted(found[time], key=str) for time in found}
 
 
-IN_DOUBT_NS = 100_000_000  # no reply was waited for so long
+IN_DOUBT_NS = 100_000_000  # longer than any time-out: the value may answer an earlier request
 
 
 def by_time(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Without values that may answer an earlier question: the time of that is theirs."""
+    """Return `by_exchange` without values that may answer an earlier request, whose time they then have."""
     return by_exchange([row for row in rows if (row.uncertainty_ns or 0) < IN_DOUBT_NS])
 
 
 def check(rows: list[Row], decoded: list[Row]) -> None:
-    """The same exchanges, but for the last one: it may have been under way when the poll ended.
+    """Check that the capture has the poll's exchanges, except the last one, which may be incomplete.
 
-    Only the capture has requests that probe for an echo or for late replies, and their repetitions.
+    Probes for an echo or for late replies, and repeated requests, are only in the capture.
     """
     recorded = list(by_time(rows).items())
     read = by_exchange(decoded)
@@ -161,7 +161,7 @@ def test_a_capture_of_all_variants_decodes_to_the_recording(mixed: Mixed) -> Non
 
 @pytest.mark.long
 def test_wireshark_reads_the_capture(mixed: Mixed) -> None:
-    """Each value of an RTU drive: address, registers and times of the request, and the reply's registers."""
+    """Check address, registers and times of each request to an RTU drive, and the registers of each reply."""
     packets = tshark(mixed.capture)
     by_time = {each["frame.time_epoch"]: (number, each) for number, each in enumerate(packets, 1)}
     replies = {each["modbus.request_frame"]: each for each in packets if each["modbus.request_frame"]}
@@ -229,7 +229,7 @@ def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Pa
 
 
 def test_uncollected_bytes_are_counted() -> None:
-    """Noise that goes on for as long as there is room, and longer."""
+    """Noise fills the tap's buffer until 4000 bytes are lost."""
     driver, tap, told = LineDriver(), Tap(), 0
     peer = Peer(least_timeout=0.02, most_timeout=0.2)
     driver.begin(Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3))
@@ -247,7 +247,7 @@ def test_uncollected_bytes_are_counted() -> None:
 
 
 def test_a_capture_has_the_noise_around_a_reply() -> None:
-    """More than the line keeps: noise, the reply, and noise again in one piece with that."""
+    """950 bytes of noise precede the reply, and 400 follow it in the same piece: more than the line keeps."""
     driver, tap = LineDriver(), Tap()
     peer = Peer(least_timeout=0.02, most_timeout=0.2)
     driver.begin(Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3))
@@ -261,7 +261,7 @@ def test_a_capture_has_the_noise_around_a_reply() -> None:
 
 
 def times_of(packets: bytes) -> list[int]:
-    """The times of enhanced packet blocks."""
+    """Return the time stamps of enhanced packet blocks."""
     found = []
     while packets:
         _, size, _, high, low = struct.unpack_from("<5I", packets)
@@ -287,7 +287,7 @@ def test_frames_have_the_times_of_their_exchange_after_clock_changes() -> None:
         assert driver.completion.raw == GOOD
         asked.append(driver.found.first_ns + ahead_ns)
     driver.now += 5 * MS
-    driver.receive(b"\xff")  # of no exchange
+    driver.receive(b"\xff")  # outside of any exchange
     found = times_of(b"".join(tap.take(WRAPPINGS, 0, 5 * HOUR_NS)))
     assert found == [*asked, driver.now + 5 * HOUR_NS]
 
@@ -305,7 +305,7 @@ class Flight:
         self.recorder = FlightRecorder(directory, ["hall-1"], **details)
 
     def pass_(self, seconds: float, *troubles: str) -> None:
-        """One byte a second on the line, then trouble."""
+        """Let `seconds` pass with one byte per second on the line, then report these anomalies."""
         for _ in range(round(seconds)):
             self.seconds += 1
             time_ns = round(self.seconds * 1e9)
@@ -395,7 +395,7 @@ def test_a_directory_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None
         FlightRecorder(tmp_path / "file" / "flights", [])
 
 
-# ---- what counts as trouble ----
+# ---- what counts as an anomaly ----
 
 
 ASK = Message(1, 3, 2, 1)
@@ -403,7 +403,7 @@ GOOD = bytes.fromhex("01 03 02 13 88 B5 12")  # Delixi, part 2
 
 
 class Watched:
-    """A drive on a line that is driven at a time that the test sets, and the watch over it."""
+    """A drive, its line with a clock that the test sets, and the line's AnomalyWatch."""
 
     def __init__(self) -> None:
         self.line = LineDriver()
@@ -421,7 +421,9 @@ class Watched:
         return self.port
 
     def told(self, reply: bytes) -> list[str]:
-        """Return the anomalies of one exchange, after any answer that might still come late."""
+        """Carry out an exchange with this reply; return its anomalies.
+
+        It starts 1 s after the last one, when no late reply to that is possible."""
         self.line.now += 1000 * MS
         self.line.begin(self._exchange)
         self.line.wait_until_write()
@@ -437,7 +439,7 @@ def test_damaged_and_late_replies_are_anomalies() -> None:
     assert pump.told(GOOD[:-1]) == ["hall-1: pump-1: reply cut short"]
     assert pump.told(GOOD[:-1] + b"\0") == ["hall-1: pump-1: bad checksum"]
     assert pump.told(GOOD[:-1] + b"\0") == ["hall-1: pump-1: bad checksum"]
-    assert pump.told(bytes.fromhex("01 83 03 01 31")) == []  # it only refuses
+    assert pump.told(bytes.fromhex("01 83 03 01 31")) == []  # an exception reply is not an anomaly
     assert list(pump.watch.check()) == []
     assert pump.told(b"") == []
     pump.line.receive(GOOD)
@@ -446,7 +448,7 @@ def test_damaged_and_late_replies_are_anomalies() -> None:
 
 def test_a_drive_that_falls_silent_is_one_anomaly() -> None:
     pump = Watched()
-    assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # it was never there
+    assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # it has never answered
     assert pump.told(GOOD) == []
     assert [pump.told(b"") for _ in range(5)] == [[], [], ["hall-1: pump-1: fell silent"], [], []]
     assert pump.told(GOOD) == []

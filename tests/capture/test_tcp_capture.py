@@ -39,9 +39,9 @@ def test_unit_id_0_of_modbus_tcp_is_not_a_broadcast() -> None:
 
 @pytest.fixture
 def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path, list[Row]]:
-    """A plant file, the capture of its poll with a silent drive, and the poll's rows.
+    """Return a plant file, the capture of its poll with one silent drive, and the poll's rows.
 
-    No reply is late, however busy the machine: the drive that is there has all the time.
+    No reply is late, even on a busy machine, because the other drive has a long time-out.
     """
     monkeypatch.setattr(InnovertIBD, "response_timeout", PATIENCE)
     monkeypatch.setattr(InnovertIBD, "answering_time", PATIENCE)

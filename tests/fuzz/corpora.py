@@ -1,4 +1,4 @@
-"""The fuzzers' corpora: corpus/PARSER.txt has one input a line, its name and its bytes in hex."""
+"""The fuzzers' corpora: each line of corpus/PARSER.txt is an input, with its name and its bytes in hex."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ FOLDER = Path(__file__).resolve().parent / "corpus"
 
 
 def load(parser: str) -> dict[str, bytes]:
-    """Return a parser's inputs by name; none if it has no corpus yet."""
+    """Return the inputs in a parser's corpus, by name; {} if the parser has no corpus yet."""
     path = FOLDER / f"{parser}.txt"
     if not path.exists():
         return {}
@@ -17,13 +17,13 @@ def load(parser: str) -> dict[str, bytes]:
 
 
 def save(parser: str, inputs: dict[str, bytes]) -> None:
-    """Replace a parser's inputs."""
+    """Replace a parser's corpus by these inputs."""
     lines = (f"{name} {data.hex()}\n" for name, data in sorted(inputs.items()))
     (FOLDER / f"{parser}.txt").write_text("".join(lines), "ascii")
 
 
 def unpack(parser: str, folder: Path) -> None:
-    """Write a parser's inputs into a new folder, one file each, as libFuzzer reads them."""
+    """Write each input of a parser's corpus into a file of a new folder, as libFuzzer needs them."""
     folder.mkdir()
     for name, data in load(parser).items():
         (folder / name).write_bytes(data)

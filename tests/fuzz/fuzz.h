@@ -1,7 +1,7 @@
-/* Shared by the C fuzz harnesses: the place of a line's bytes within an input, and assertions.
+/* Shared by the C fuzz harnesses: assertions, and the position of line bytes (frames or noise) in an input.
  *
- * A harness has LLVMFuzzerTestOneInput and find_wire; mutator.c mutates inputs and repairs frames at that
- * place. Without that, inputs would not pass byte counts and checksums. */
+ * A harness defines LLVMFuzzerTestOneInput and find_wire. mutator.c mutates inputs and repairs the frame at the
+ * position that find_wire returns: otherwise most mutants would have wrong byte counts and checksums. */
 #ifndef FUZZ_H
 #define FUZZ_H
 
@@ -15,23 +15,23 @@
 #define must(truth) \
     ((truth) ? (void)0 : (fprintf(stderr, "%s:%d: not so: %s\n", __FILE__, __LINE__, #truth), abort()))
 
-/* Bytes on a line, within an input. */
+/* The position of bytes in an input that the harness passes to the core as if they came on a line. */
 struct wire {
     size_t at, len;
-    size_t length_at;           /* of the byte that has their length; SIZE_MAX: none has */
-    int is_fixed;               /* their number must not change */
+    size_t length_at;           /* position of the byte that holds `len`; SIZE_MAX: there is none */
+    int is_fixed;               /* `len` must not change */
     int framing;                /* -1: any */
-    int is_reply;               /* to `request` */
+    int is_reply;               /* the bytes should be a reply to `request` */
     struct md_message request;
 };
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-/* Find a place in the input with bytes of a line; 0: none. The harness may repair the bytes around it,
- * such as lengths. */
+/* Select line bytes in the input by `seed`; return 0 if there are none. May repair bytes around them, such as
+ * lengths. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire);
 
-/* Return a copy that ends with its memory, so that sanitizers see over-reads; free() it. */
+/* Return a copy in memory of exactly this size, so that sanitizers detect over-reads. The caller frees it. */
 static inline uint8_t *exact_copy(const uint8_t *bytes, size_t len)
 {
     uint8_t *copy = malloc(len ? len : 1);
@@ -40,7 +40,7 @@ static inline uint8_t *exact_copy(const uint8_t *bytes, size_t len)
     return len ? memcpy(copy, bytes, len) : copy;
 }
 
-/* framing, address, function, start, count, first two of the request's data: nine bytes */
+/* A request in an input: framing, address, function, start, count, and the first two bytes of its data. */
 enum { REQUEST_BYTES = 9 };
 
 static inline int framing_of(uint8_t byte)

@@ -1,7 +1,7 @@
-/* Hostile capture files, through the reader of packets, the splitter and the decoder, as columns.
+/* Pass hostile capture files through the reader of packets, the splitter and the decoder to columns.
  *
- * An input is a byte (which kind of file, what is known of it), a byte (how little room there is), and
- * the file's packets: pcap without its header, or pcapng. */
+ * An input is a byte with the kind of file, link type and clock, a byte with the size of buffers, and the file's
+ * packets: pcap without its header, or pcapng. */
 #include "fuzz.h"
 
 enum { HEADER = 2, MOST = 4096, ROWS = 64, PLACES = 16, CHANNELS = 2, PCAP_RECORD = 16, PCAPNG_HEAD = 28,
@@ -12,7 +12,7 @@ struct reader {
     struct md_channel channels[CHANNELS];
     struct md_decoder decoders[CHANNELS];
     struct md_known known[CHANNELS][PLACES];
-    uint64_t rows, bytes; /* made; split */
+    uint64_t rows, bytes; /* numbers of decoded rows, and of bytes that the splitter used */
 };
 
 static const struct md_field fields[] = {{.at = 0, .multiplier = 1, .divisor = 1},
@@ -50,7 +50,7 @@ static void decode(struct reader *reader, int i)
              (status[row] == 0 || uncertainty[row] == 0));
 }
 
-/* Every byte is part of a frame or counted as junk, and rows come of exchanges alone. */
+/* Check that every byte is part of a frame or counted as junk, and that only exchanges give rows. */
 static void check_counts(const struct reader *reader)
 {
     uint64_t junk = 0, frames = 0, exchanges = 0;
@@ -86,7 +86,7 @@ static void read_all(struct reader *reader)
             is_stuck &= stream->len == before;
         }
         if (is_stuck)
-            return; /* a packet longer than the room, which is larger but for here */
+            return; /* a packet exceeds the buffer, which the library makes larger than any packet */
     }
     must((state == MD_UNPACKED) == (capture->at == capture->len));
     must(state == MD_UNPACKED || state == MD_CUT || state == MD_NONSENSE ||
@@ -130,13 +130,13 @@ static void put_number(uint8_t *at, int is_big_endian, uint32_t value)
         at[i] = (uint8_t)(value >> 8 * (is_big_endian ? 3 - i : i));
 }
 
-/* Where a frame may lie in a packet of this link type, behind its head. */
+/* Return the position of the frame in a packet of this link type, after the packet's own header. */
 static size_t frame_in(const uint8_t *packet, size_t len, int link)
 {
-    if (link == 0) /* RTAC */
+    if (link == 0) /* RTAC serial */
         return len < RTAC_HEAD ? len : RTAC_HEAD;
     size_t at = 0;
-    while (link == 1 && at + 4 <= len) { /* tags */
+    while (link == 1 && at + 4 <= len) { /* exported PDU: skip its tags */
         size_t tag = (size_t)(packet[at] << 8 | packet[at + 1]),
             size = (size_t)(packet[at + 2] << 8 | packet[at + 3]);
         at += 4 + (tag ? size : 0);
@@ -146,7 +146,7 @@ static size_t frame_in(const uint8_t *packet, size_t len, int link)
     return at < len ? at : len;
 }
 
-/* Mends the packets' lengths on its way; a frame keeps its length. */
+/* Also repairs the lengths of the packets before the selected one. The frame's length is fixed. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     if (size < HEADER)

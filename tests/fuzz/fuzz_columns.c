@@ -1,4 +1,4 @@
-/* Hostile replies and declarations for the makers of columns, and codes for their names.
+/* Hostile replies and field declarations for the decoder of values, and hostile codes for the speller of names.
  *
  * An input is a header (result, room, and so on), four fields of a block, and the reply's data. */
 #include "fuzz.h"
@@ -17,7 +17,7 @@ static const struct {
     [MD_BCD32] = {4, 0, 0, 1}, [MD_F16] = {2, 0, 1, 0},
 };
 
-/* An independent implementation of values: byte by byte and digit by digit. */
+/* Return a value as an independent implementation decodes it: byte by byte and digit by digit. */
 static double expected(const uint8_t *data, size_t len, size_t at, int wire)
 {
     if (wire == MD_BIT)
@@ -73,7 +73,7 @@ static double expected(const uint8_t *data, size_t len, size_t at, int wire)
     return (double)value;
 }
 
-/* The same with all that a field can have more. */
+/* Return the same for a field with addend, scale register, invalid values and bit range. */
 static double expected_with(const uint8_t *data, size_t len, const struct md_field *field,
                             const struct md_extra *extra)
 {
@@ -176,7 +176,7 @@ static void check_rows(const uint8_t *head, const struct md_block *block,
     free(rows.reg), free(rows.status), free(rows.value), free(rows.valid);
 }
 
-/* The names of the codes in sequence; a code without a name, or names without room, are errors. */
+/* Check that md_spell() joins the names of codes, and returns -1 for an unknown code or a full buffer. */
 static void check_spelling(const uint8_t *head, const uint8_t *text, size_t len)
 {
     int32_t offsets[5] = {0};
@@ -224,7 +224,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     uint8_t *exact = exact_copy(bytes, len);
     for (int wire = -1; wire <= 256; wire++) {
         if (wire > 0 && (wire & 0x3F) > MD_BCD32 + 1)
-            continue; /* no such format, like the one before */
+            continue; /* unknown formats all behave alike: one is enough */
         for (size_t at = 0; at <= 8 * len + 1; at++)
             must(is_same(md_value(exact, len, at, wire), expected(exact, len, at, wire)));
     }
@@ -244,7 +244,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* Replies' data have no checksum. */
+/* An input has no frames to repair: the data of a reply have no checksum. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     (void)data, (void)size, (void)seed, (void)wire;

@@ -1,6 +1,6 @@
-/* Hostile bytes for the parsers of frames, as a request and as the reply to a request.
+/* Parse hostile bytes as a request, and as the reply to a request.
  *
- * An input is two requests (see request_of) and the bytes that came. */
+ * An input is two requests (see request_of) and the received bytes. */
 #include "fuzz.h"
 
 enum { HEADER = 2 * REQUEST_BYTES, MOST_RECEIVED = 600 };
@@ -15,7 +15,7 @@ static int parse_request(int framing, const uint8_t *bytes, size_t len, const st
     return md_parse_request(framing, bytes, len, out);
 }
 
-/* Parse byte by byte: the result is "incomplete" until it is final. Return it. */
+/* Parse each prefix: check that the result is MD_INCOMPLETE until it is final. Return the final result. */
 static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size_t len,
                           const struct md_message *request)
 {
@@ -26,7 +26,7 @@ static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size
         int used = parse(framing, exact, have, request, &out);
         free(exact);
         must(used <= (int)have);
-        must(used <= 0 || used == (int)have || used == decided); /* accepted with its last byte, not later */
+        must(used <= 0 || used == (int)have || used == decided); /* a frame is accepted with its last byte, not later */
         must(decided == MD_INCOMPLETE || used == decided || (used < 0 && decided < 0));
         must(used != MD_BAD_REQUEST && used >= MD_BAD_ECHO);
         decided = used;
@@ -34,7 +34,7 @@ static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size
     return decided;
 }
 
-/* An accepted request, built again, gives the same bytes, if its fields are within bounds. */
+/* Check that an accepted request, built again, gives the same bytes, if its fields are within bounds. */
 static void check_request(int framing, const uint8_t *bytes, size_t len)
 {
     struct md_message found;
@@ -53,7 +53,7 @@ static void check_request(int framing, const uint8_t *bytes, size_t len)
          (md_reply_length(framing, &found) > 0) == (found.address > 0 || framing == MD_TCP));
 }
 
-/* A reply that is accepted answers the question, and no other that it could not be mistaken for. */
+/* Check that an accepted reply matches its request, and an `other` one only if both look alike. */
 static void check_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                         const struct md_message *other)
 {
@@ -67,17 +67,17 @@ static void check_reply(int framing, const uint8_t *bytes, size_t len, const str
     must(found.address == request->address && found.function == request->function);
     must(found.exception || used == md_reply_length(framing, request));
     if (md_build_request(framing, request, asked, sizeof asked) < 0)
-        return; /* replies to impossible requests may be wrong */
+        return; /* for requests that cannot be built, replies are not checked further */
     int length = md_build_reply(framing, &found, built, sizeof built);
     must(length == used);
     if (framing == MD_DELIXI && (found.exception || found.function == 3))
-        return; /* a refusal's other digits have no meaning; a state is shown as data too */
+        return; /* other digits of a refusal have no meaning; a drive's state is also stored as data */
     if (framing != MD_DELIXI && found.exception && found.function == 8)
-        return; /* 89H is accepted for 88H */
-    if (framing == MD_TCP && found.exception) /* its length field may be wrong */
+        return; /* an exception to function 08 may have code 89H instead of 88H */
+    if (framing == MD_TCP && found.exception) /* the length field of an exception reply may be wrong */
         memcpy(built + 4, bytes + 4, 2);
     must(memcmp(built, bytes, (size_t)used) == 0);
-    if (md_parse_reply(framing, bytes, len, other, &again) > 0) /* line.c waits before it asks that */
+    if (md_parse_reply(framing, bytes, len, other, &again) > 0) /* line.c waits before such a request */
         must(request->address == other->address &&
              (framing == MD_DELIXI || request->function == other->function));
 }
@@ -104,7 +104,7 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
     wire->len = size - HEADER;
     wire->framing = framing_of(data[0]);
     wire->is_reply = seed & 1;
-    if (seed & 2 && wire->is_reply) /* a request that can be answered, and another much like it */
+    if (seed & 2 && wire->is_reply) /* make both requests valid, with the same function */
         for (size_t at = 0; at < HEADER; at += REQUEST_BYTES) {
             data[at] = data[0];
             data[at + 1] = data[1];
@@ -112,7 +112,7 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
                 : functions[(seed >> 4) % sizeof functions];
             data[at + 5] = 0;
             data[at + 6] %= 126;
-            if (data[at + 2] == 5) { /* a coil is on or off */
+            if (data[at + 2] == 5) { /* a coil's data are FF00 or 0000 */
                 data[at + 7] = seed & 4 ? 0xFF : 0;
                 data[at + 8] = 0;
             }

@@ -1,9 +1,9 @@
-/* A line as a state machine, fed with any bytes at any time in any order.
+/* Feed the state machine of a line with any bytes at any time in any order.
  *
- * An input is a header (adapter, delays) and steps: exchanges begin, time passes, the port takes bytes or
- * fails, noise comes, and the drives' own answers come at once, late, in pieces, damaged, doubled, or
- * not at all. Every drive answers with a number that is the question's alone, so that an answer taken
- * for another's is seen. A clock of 1 ns a character makes all times small. */
+ * An input is a header (adapter, time-outs) and steps: an exchange starts, time passes, the port takes bytes or
+ * fails, noise comes, or a drive's reply comes: immediately, late, in pieces, damaged, doubled, or never. Each
+ * reply has the number of its exchange as its value, so that a reply taken for another exchange's is detected.
+ * A character takes 1 ns, so that all times are small. */
 #include "fuzz.h"
 
 #include <errno.h>
@@ -15,30 +15,30 @@ enum step { BEGIN, PASS, WAKE, TAKE, NOISE_COMES, ANSWER_COMES, PIECE_COMES, POR
 
 /* A pending reply of a drive. */
 struct answer {
-    int exchange;     /* its number */
-    int64_t until_ns; /* so long it may come late */
+    int exchange;     /* number of the exchange; 0: this entry is free */
+    int64_t until_ns; /* the latest time at which the reply may come */
     size_t len, at;
     uint8_t bytes[MD_MOST_FRAME];
 };
 
 struct scene {
     struct md_line line;
-    struct md_completion *done; /* there while the exchange is under way, and no longer */
+    struct md_completion *done; /* freed when the exchange ends, so that later accesses are detected */
     struct md_drive drives[DRIVES];
     struct md_history histories[DRIVES];
     struct md_exchange exchange;
     int is_under_way, has_asked, adapter_echoes, is_spoiled;
-    int number; /* of the exchange */
-    int64_t now, begun, ends; /* by then it must be over */
-    int64_t last_heard, silence; /* the line's last activity, and the silence demanded after it */
-    /* bytes heard: before the exchange, before its request was sent, and after */
+    int number; /* number of the exchange */
+    int64_t now, begun, ends; /* present time; start of the exchange, and the time by which it must have ended */
+    int64_t last_heard, silence; /* last activity on the line, and the silence required after it */
+    /* numbers of received bytes: before the exchange, before its request was sent, and after that */
     size_t left_over, before, after;
     struct answer answers[ANSWERS];
     uint64_t exchanges[DRIVES];
-    int16_t origin[HEARD]; /* of each byte after the request: the number of the exchange that it answers */
+    int16_t origin[HEARD]; /* for each byte after the request: number of the exchange whose reply it belongs to */
     uint8_t heard[HEARD];
     struct md_tap tap;
-    /* how often each byte went over the line, as the tap has it, and indeed */
+    /* how often each byte value went over the line: according to the tap, and in fact */
     uint32_t told[256], passed[256];
 };
 
@@ -71,7 +71,7 @@ static int is_read(const struct md_message *request)
     return request->function <= 0x04;
 }
 
-/* These bytes came from the drive as its answer to this very question, at least in part. */
+/* Check that at least one of these bytes is from the drive's reply to the present exchange. */
 static void check_origin(const uint8_t *raw, size_t len)
 {
     int is_own = 0;
@@ -95,7 +95,7 @@ static void check_completion(void)
     const struct md_exchange *exchange = &scene.exchange;
     size_t used = done->result > 0 ? (size_t)done->result : 0;
     must(done->begun_ns == scene.begun && done->raw_len <= sizeof done->raw);
-    /* Every byte is part of the reply, or counted; bytes that came while the request left may be its echo. */
+    /* Every byte is part of the reply or counted. Bytes received while the request was sent may be its echo. */
     must(done->stale + done->skipped + used == scene.left_over + scene.before + scene.after);
     must(done->skipped + used >= scene.after && done->skipped + used <= scene.after + scene.line.tx_len);
     must((done->sent_ns != 0) == scene.has_asked || done->result == MD_LINE_LOST);
@@ -115,7 +115,7 @@ static void check_completion(void)
         must(exchange->request.address == 0 && scene.after == 0);
     else
         must((done->result >= MD_EXPIRED || done->result == MD_MAYBE_ECHO) && done->reply.address == 0);
-    if (done->result == MD_NO_REPLY) /* no byte, or the request's echo; other drives' replies do not count */
+    if (done->result == MD_NO_REPLY) /* `raw` is empty or the request's echo, without replies of other drives */
         must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
 }
 
@@ -145,7 +145,7 @@ static uint32_t number(const uint8_t *at)
     return at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
 }
 
-/* The tap has every byte sent or received, in whole packets. */
+/* Check that the tap has every sent and received byte, in complete packets. */
 static void check_tap(void)
 {
     enum { LEN_AT = 20, BYTES_AT = 28 };
@@ -202,7 +202,7 @@ static void hear(const uint8_t *bytes, size_t len, int origin)
     check_line();
 }
 
-/* What it wants, asked again for as long as it wants to look at an empty port; ends exchanges. */
+/* Return what the line wants to do next. Reads of the port find it empty; an exchange that is done ends. */
 static int want(void)
 {
     int wanted = MD_DONE;
@@ -219,11 +219,11 @@ static int want(void)
             end();
         return wanted;
     }
-    must(wanted == MD_DONE); /* it reads the empty port forever */
+    must(wanted == MD_DONE); /* fails: the line reads the empty port forever */
     return wanted;
 }
 
-/* The longest that an exchange may last, once its request can leave. */
+/* Return the longest time in ns that an exchange may take once its request can be sent. */
 static int64_t longest(void)
 {
     const struct md_exchange *exchange = &scene.exchange;
@@ -243,7 +243,7 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
                                           .silence_ns = silence,
                                           .turnaround_ns = turnaround,
                                               .drive = &scene.drives[drive_of(&request)]};
-    if (scene.number % 2) { /* as its maker does; else the line builds it */
+    if (scene.number % 2) { /* build the frame in advance, as planning does; otherwise the line builds it */
         uint8_t *frame = scene.exchange.frame;
         int len = md_build_request(scene.exchange.framing, &request, frame, MD_KEPT_FRAME);
         scene.exchange.frame_len = (uint8_t)(len > 0 ? len : 0);
@@ -263,7 +263,7 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
     want();
 }
 
-/* The request is out: its drive makes up an answer that no other question has. */
+/* The request was sent: add the drive's pending reply, whose value is the number of the exchange. */
 static void ask(void)
 {
     const struct md_message *request = &scene.exchange.request;
@@ -318,7 +318,8 @@ static void take(size_t most)
         want();
 }
 
-/* Up to `most` bytes of an answer, `flip` of them damaged. Nothing comes after its drive's last chance. */
+/* Receive up to `most` bytes of a pending reply, one of them damaged by `flip` unless it is 0. A reply that
+ * would come after its `until_ns` is dropped. */
 static void let_answer(unsigned which, size_t most, uint8_t flip)
 {
     struct answer *answer = NULL;
@@ -351,10 +352,10 @@ static void fail(int error)
         must(md_line_want(&scene.line, scene.now) == MD_DONE);
         end();
     }
-    memset(scene.answers, 0, sizeof scene.answers); /* the exchange in flight is lost with the port */
+    memset(scene.answers, 0, sizeof scene.answers); /* pending replies are lost with the port */
 }
 
-/* One step; how many bytes of the input it took, 0 at the end. */
+/* Make one step; return the number of its bytes in the input, 0 at the end. */
 static size_t act(const uint8_t *step, size_t left)
 {
     static const uint8_t flood[FLOOD]; /* more than half of a line's buffer */
@@ -382,7 +383,7 @@ static size_t act(const uint8_t *step, size_t left)
     case NOISE_COMES:
         len = left < 2 ? 0 : step[1] < left - 2 ? step[1] : left - 2;
         for (size_t i = 0; i < len; i++)
-            scene.is_spoiled |= step[2 + i] < 0xF8; /* it may be a frame, or a part of one */
+            scene.is_spoiled |= step[2 + i] < 0xF8; /* the noise may be a frame, or a part of it */
         hear(step + 2, len, NOISE);
         if (len == 0 && scene.after + FLOOD < HEARD)
             hear(flood, FLOOD, NOISE);
@@ -422,7 +423,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     for (size_t at = HEADER; at < size; at += used)
         if ((used = act(data + at, size - at)) == 0)
             break;
-    for (int steps = 0; want() != MD_DONE; steps++) { /* and no further byte comes */
+    for (int steps = 0; want() != MD_DONE; steps++) { /* without further bytes, the exchange must end */
         must(steps < 16);
         if (md_line_want(&scene.line, scene.now) == MD_WRITE)
             take(MD_MOST_FRAME);
@@ -432,7 +433,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* Noise that may be a frame; as the reply to the request that was the last to begin before it. */
+/* Select noise, which becomes a frame: a request, or the reply to the last exchange that started before it. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t found = 0, at = HEADER, used = 0;
@@ -453,7 +454,7 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
             break;
         size_t len = data[at + 1] < size - at - 2 ? data[at + 1] : size - at - 2;
         used = 2 + len;
-        if (found++ && (seed >> 8) % found) /* each is as likely as another */
+        if (found++ && (seed >> 8) % found) /* select each with equal probability */
             continue;
         *wire = (struct wire){.at = at + 2, .len = len, .length_at = at + 1, .framing = framing,
                               .is_reply = framing >= 0 && (seed & 3), .request = request};

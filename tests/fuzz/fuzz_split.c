@@ -1,6 +1,6 @@
-/* The splitter with hostile bytes of a line, in pieces.
+/* Split hostile bytes of a line, which come in pieces, into frames.
  *
- * An input is pieces: a byte with its side and pause, one with its length, and its bytes. */
+ * An input is pieces: each has a byte with its side and pause, a byte with its length, and its bytes. */
 #include "fuzz.h"
 
 enum { MOST = 4096, HEAD = 2 };
@@ -24,7 +24,7 @@ static void close_ear(struct ear *ear)
     free(ear->stream.pieces);
 }
 
-/* Spans have no gaps, and frames are valid. */
+/* Get the next span; return 0 without one. Check that spans have no gaps, and that frames are valid. */
 static int next(struct ear *ear, struct md_span *span)
 {
     memset(span, 0xAA, sizeof *span);
@@ -51,7 +51,7 @@ static int next(struct ear *ear, struct md_span *span)
     return 1;
 }
 
-/* The next frame and where it begins in all that was stream; junk is passed over. */
+/* Get the next frame, and its position since the start of the stream; skip junk. Return 0 without a frame. */
 static int next_frame(struct ear *ear, struct md_span *span, size_t *at)
 {
     while (next(ear, span))
@@ -62,7 +62,7 @@ static int next_frame(struct ear *ear, struct md_span *span, size_t *at)
     return 0;
 }
 
-/* The piece at `at`: its bytes come after its head. */
+/* Return the piece whose head is at `at` in the input; `len` bytes follow its head. */
 static struct md_piece piece_of(const uint8_t *data, size_t size, size_t at, size_t *len)
 {
     static const uint8_t sides[] = {MD_EITHER_SIDE, MD_EITHER_SIDE, MD_EITHER_SIDE, MD_EITHER_SIDE,
@@ -73,7 +73,7 @@ static struct md_piece piece_of(const uint8_t *data, size_t size, size_t at, siz
                              .is_after_pause = data[at] >> 3 & 1};
 }
 
-/* However much is forgotten on the way, the frames are those that are found when all is there. */
+/* Check that a stream that forgets its past after each piece gives the same frames as the whole stream. */
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
     if (size > MOST)
@@ -106,13 +106,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
              parts.stream.count <= parts.stream.len);
     }
     must(!next_frame(&whole, &expected, &whole_at));
-    must(whole.passed == total && parts.passed == total); /* skipped bytes were reported too */
+    must(whole.passed == total && parts.passed == total); /* all bytes were reported, junk too */
     close_ear(&whole);
     close_ear(&parts);
     return 0;
 }
 
-/* One of the pieces; often as the reply to the request that the piece before it may be. */
+/* Select a piece; often as the reply to the piece before it, which may be a request. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t len = 0, count = 0, before = 0, before_len = 0;

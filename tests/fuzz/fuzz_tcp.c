@@ -1,7 +1,7 @@
-/* A connection of Modbus TCP, fed with any bytes in any pieces at any time.
+/* Feed a Modbus TCP connection with any bytes in any pieces at any time.
  *
- * An input is a header (ids matched or not, time-outs) and steps: exchanges begin, time passes, bytes come.
- * A reply is always part of what came on this connection, and where ids are matched has its request's. */
+ * An input is a header (match transaction ids or not, time-outs) and steps: an exchange starts, time passes, or
+ * bytes come. An accepted reply must have come on this connection, with the request's id if ids are matched. */
 #include "fuzz.h"
 
 #include <errno.h>
@@ -18,7 +18,7 @@ struct scene {
     struct md_exchange exchange;
     int is_under_way;
     int64_t now;
-    uint8_t heard[2 * MOST]; /* since the connection was made */
+    uint8_t heard[2 * MOST]; /* bytes received since the connection was made */
     size_t len;
 };
 
@@ -103,7 +103,7 @@ static void hear(const uint8_t *bytes, size_t len)
     }
 }
 
-/* One step; how many bytes of the input it took, 0 at the end. */
+/* Make one step; return the number of its bytes in the input, 0 at the end. */
 static size_t act(const uint8_t *step, size_t left)
 {
     size_t len;
@@ -151,7 +151,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         if (used == 0)
             break;
     }
-    for (int steps = 0; scene.is_under_way; steps++) { /* and no further byte comes */
+    for (int steps = 0; scene.is_under_way; steps++) { /* without further bytes, the exchange must end */
         must(steps < 16);
         scene.now = later(scene.now, scene.line.wake_ns);
         want();
@@ -159,7 +159,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* Bytes that come, as the reply to the request before them; its transaction is likely to be their own. */
+/* Select received bytes, as the reply to the request before them. Their transaction id is kept. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t found = 0, at = HEADER, used = 0;
@@ -178,7 +178,7 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
             break;
         size_t len = data[at + 1] < size - at - 2 ? data[at + 1] : size - at - 2;
         used = 2 + len;
-        if (found++ && (seed >> 8) % found) /* each is as likely as another */
+        if (found++ && (seed >> 8) % found) /* select each with equal probability */
             continue;
         if (len >= 2 && (seed & 12))
             md_put16(data + at + 2, begun);

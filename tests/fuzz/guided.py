@@ -1,4 +1,4 @@
-"""Fuzzes one of the Python readers, guided by coverage: `guided.py NAME CORPUS... [libFuzzer's options]`.
+"""Fuzz one of the Python readers, guided by coverage: `guided.py NAME CORPUS... [libFuzzer's options]`.
 
 Needs atheris, which is libFuzzer for Python.
 """
@@ -30,7 +30,7 @@ import multidrop.sim.faulty_wire
 import multidrop.toml_check
 from multidrop.capture import decoding
 
-PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # of each reader's own; to instrument all takes seconds
+PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # by reader: packages to instrument; all would take seconds
     "plant": (multidrop.families.files,),
     "family": (multidrop.families.files,),
     "import": (multidrop.families.files, multidrop.importers),
@@ -39,7 +39,7 @@ PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # of each reader's own; t
     "parquet": (multidrop.recording,),
     "pcap": (multidrop.capture,),
 }
-MODULES = (  # and of several
+MODULES = (  # modules that several readers use: always instrumented
     multidrop.plant.model,
     multidrop.toml_check,
     multidrop.families.registry,
@@ -54,7 +54,7 @@ MODULES = (  # and of several
 
 
 def instrument(module: types.ModuleType) -> None:
-    """Let the fuzzer see which lines of this module's functions are run."""
+    """Make the coverage of this module's functions visible to the fuzzer."""
     owners = [module, *(each for each in vars(module).values() if isinstance(each, type))]
     for owner in owners:
         for function in list(vars(owner).values()):
@@ -64,7 +64,7 @@ def instrument(module: types.ModuleType) -> None:
 
 def main() -> None:
     name, *arguments = sys.argv[1:]
-    decoding.ROWS = 2048  # of a batch: less to fill, and more batches; one request may ask for 2000
+    decoding.ROWS = 2048  # limit of a batch, so that inputs fill several; one request may ask for 2000
     for package in PACKAGES.get(name, ()):
         for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
             instrument(importlib.import_module(found.name))
@@ -72,7 +72,7 @@ def main() -> None:
         instrument(module)
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         one = partial(read, name, folder=Path(folder))
-        again = f"{sys.executable} {__file__} {name}"  # how it starts itself, to merge
+        again = f"{sys.executable} {__file__} {name}"  # libFuzzer's command to start itself for a merge
         atheris.Setup([again, *arguments], lambda data: one(data))
         atheris.Fuzz()
 

@@ -18,16 +18,16 @@ OPTIONS = ("-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}")
 def command(
     name: str, program: Path, companion: str, *compiler: str, core: Sequence[Path] | None = None
 ) -> list[str]:
-    """Return the command that compiles harness, companion (mutator.c, replay.c) and the pure core.
+    """Return the command that compiles a harness, its companion (mutator.c or replay.c) and the pure core.
 
-    `core` may be what `compiled` returned for the same compiler, for many harnesses.
+    `core` may be the objects that `compiled` returned for the same compiler, to share them among harnesses.
     """
     parts = [HERE / f"fuzz_{name}.c", HERE / companion, *(_core() if core is None else core)]
     return [*compiler, *OPTIONS, *map(str, parts), "-lm", "-o", str(program)]
 
 
 def compiled(folder: Path, *compiler: str) -> list[Path]:
-    """Compile the pure core into a folder; return its objects."""
+    """Compile the pure C files of the core into a folder; return the object files."""
     subprocess.run([*compiler, *OPTIONS, "-c", *map(str, _core())], cwd=folder, check=True)
     return sorted(folder.glob("*.o"))
 

@@ -1,4 +1,4 @@
-"""Feed arbitrary bytes of a Modbus TCP client: each request gets one answer of the right shape."""
+"""Pass arbitrary bytes to the Modbus TCP server: each request gets one answer of the right shape."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_
 from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
-MOST = 260  # bytes of a frame
+MOST = 260  # limit for a frame in bytes
 UNITS = {1: InvtCHE(1, name="mill"), 2: ErmanERG220(2, name="well")}
 REFUSED = 0x80
 
 
 class FakeClient:
-    """A client as the server knows it."""
+    """The attributes of a client that the server uses."""
 
     is_full = False
     address = "127.0.0.1"
@@ -38,7 +38,7 @@ def loop() -> ControlledLoop:
 
 
 def read_requests(path: Path) -> None:
-    """Take requests out of a stream, its first byte the size of the pieces that it comes in."""
+    """Parse and answer the requests in a stream, whose first byte is the size of the pieces in which it comes."""
     data = path.read_bytes()
     size, stream = (data[:1] or b"\1")[0] % 64 + 1, data[1:]
     found = list(taken(stream, size))
@@ -47,7 +47,7 @@ def read_requests(path: Path) -> None:
 
 
 def taken(stream: bytes, size: int) -> list[MbapRequest]:
-    """Return the requests of a stream, up to the first garbage."""
+    """Return the requests in a stream that comes in pieces of `size` bytes, up to the first garbage."""
     buffer, found = bytearray(), []
     for at in range(0, len(stream), size):
         buffer += stream[at : at + size]
@@ -60,7 +60,7 @@ def taken(stream: bytes, size: int) -> list[MbapRequest]:
 
 
 def plain(stream: bytes) -> list[MbapRequest]:
-    """Return the same by the guide's words, from the whole stream at once."""
+    """Return the same requests, parsed from the whole stream by an independent parser."""
     found = []
     while len(stream) >= 8:
         transaction, protocol, length, unit, function = struct.unpack(">HHHBB", stream[:8])
@@ -73,7 +73,7 @@ def plain(stream: bytes) -> list[MbapRequest]:
 
 @cache
 def served() -> tuple[ModbusServer, FakeCommands]:
-    """Return a server whose drives have every second of their values."""
+    """Return a server whose drives have values for every second register only."""
     hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
     plant = plant_of(*(("hall", drive) for drive in UNITS.values()))
     hub.values = {
@@ -86,7 +86,7 @@ def served() -> tuple[ModbusServer, FakeCommands]:
 
 
 async def answered(requests: list[MbapRequest]) -> None:
-    """Let a server answer the requests."""
+    """Let a server answer the requests, and check the answers and the resulting commands."""
     server, commands = served()
     commands.written.clear()
     commands.stopped.clear()

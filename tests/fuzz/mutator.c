@@ -1,15 +1,15 @@
 /* The mutator of all C harnesses: mutates, then repairs lengths, byte counts and checksums of frames.
  *
- * A frame keeps what the mutation made of it but for what a receiver checks first; and of that too a
- * part is sometimes left wrong, so that what comes behind a single mistake is met as well. */
+ * It repairs only the fields that a receiver checks first, so that mutated frames pass these checks. Sometimes it
+ * leaves one of these fields wrong, to test the handling of a frame with a single mistake. */
 #include "fuzz.h"
 
-enum { MOST_BODY = 260 }; /* a little more than any frame may have */
+enum { MOST_BODY = 260 }; /* slightly more than any frame's body */
 
 size_t LLVMFuzzerMutate(uint8_t *data, size_t size, size_t most);
 size_t LLVMFuzzerCustomMutator(uint8_t *data, size_t size, size_t most, unsigned seed);
 
-/* Some random bits, a few at a time. */
+/* Return a pseudo-random number less than `below`. */
 static unsigned draw(unsigned *seed, unsigned below)
 {
     *seed = *seed * 1664525u + 1013904223u;
@@ -27,7 +27,7 @@ static int hex_digit(uint8_t character)
            : character >= 'A' && character <= 'F' ? character - 'A' + 10 : -1;
 }
 
-/* The body that lies in these bytes: unhexed where they are a frame of text. */
+/* Extract the body (address, function, data) from a frame in any framing; return its length. */
 static size_t take_body(const uint8_t *bytes, size_t len, int framing, uint8_t body[MOST_BODY])
 {
     size_t have = 0;
@@ -58,7 +58,7 @@ static void put16(uint8_t *at, unsigned value)
     at[1] = (uint8_t)value;
 }
 
-/* Length of the body of a request with this function, and what in it depends on that. */
+/* Repair the count and byte count in a request's body; return its length, which depends on the function. */
 static size_t mend_request(uint8_t *body, size_t have)
 {
     if (body[1] != 0x0F && body[1] != 0x10)
@@ -71,7 +71,7 @@ static size_t mend_request(uint8_t *body, size_t have)
     return 7 + data;
 }
 
-/* The same of a reply; to a request that is known, or to any. */
+/* Do the same in a reply's body; if the request is known, also repair the fields that repeat it. */
 static size_t mend_reply(uint8_t *body, size_t have, const struct md_message *request)
 {
     if (body[1] & 0x80) {
@@ -142,7 +142,7 @@ static uint8_t sum_of(const uint8_t *body, size_t len)
     return (uint8_t)sum;
 }
 
-/* The serial-line guide's own algorithm, bit by bit: none of ours is trusted here. */
+/* The bitwise algorithm of the Modbus serial-line guide, independent of the core's. */
 static uint16_t crc_of(const uint8_t *body, size_t len)
 {
     unsigned crc = 0xFFFF;
@@ -182,7 +182,7 @@ static size_t close_frame(int framing, uint8_t *body, size_t len, uint8_t *frame
     return (size_t)(at - frame);
 }
 
-/* Put the frame in the place of what lies there; the input's new size. */
+/* Replace the line bytes by the frame, if there is room; return the input's new size. */
 static size_t replace(uint8_t *data, size_t size, size_t most, const struct wire *wire,
                       const uint8_t *frame, size_t len)
 {
@@ -208,8 +208,8 @@ static size_t repair(uint8_t *data, size_t size, size_t most, unsigned seed)
         framing = draw(&seed, 2) ? MD_ASCII : MD_DELIXI;
     if (framing < 0)
         framing = draw(&seed, 6) ? MD_RTU : draw(&seed, 2) ? MD_ASCII : MD_DELIXI;
-    size_t junk = draw(&seed, 8) || framing == MD_TCP ? 0 : draw(&seed, 4); /* a stream has none */
-    if (junk < wire.len && !wire.is_fixed) { /* it stays in front of the frame */
+    size_t junk = draw(&seed, 8) || framing == MD_TCP ? 0 : draw(&seed, 4); /* bytes before the frame */
+    if (junk < wire.len && !wire.is_fixed) { /* keep them */
         wire.at += junk;
         wire.len -= junk;
     } else
@@ -218,7 +218,7 @@ static size_t repair(uint8_t *data, size_t size, size_t most, unsigned seed)
     size_t len = framing == MD_DELIXI ? mend_delixi(body, &wire, &seed)
         : mend_modbus(body, have, &wire, &seed);
     len = close_frame(framing, body, len, frame);
-    if (framing == MD_TCP) /* its transaction stays */
+    if (framing == MD_TCP) /* keep the transaction id */
         put16(frame, wire.len < 2 ? 0 : md_get16(data + wire.at));
     if (is_rare(&seed))
         frame[draw(&seed, (unsigned)len)] ^= (uint8_t)(1u << draw(&seed, 8));

@@ -60,7 +60,7 @@ address = 3
 
 @contextmanager
 def refused(kind: type[ValueError], path: Path) -> Iterator[None]:
-    """One error is allowed, and each of its sentences names the file."""
+    """Allow the block to raise this kind of error, and check that each of its lines names the file."""
     mistakes: list[ValueError] = []
     try:
         yield
@@ -82,7 +82,7 @@ def read_plant(path: Path) -> None:
 
 
 def read_family(path: Path) -> None:
-    """Read a family's file; what follows a line with a zero byte is its CSV file."""
+    """Read a family's TOML file and its CSV file, which follows in the input after a line with a zero byte."""
     toml, _, csv = path.read_bytes().partition(b"\n\0\n")
     path.write_bytes(toml)
     path.with_suffix(".csv").write_bytes(csv)
@@ -97,7 +97,7 @@ def read_family(path: Path) -> None:
 
 
 def read_import(path: Path) -> None:
-    """Read a file of another program's; its first line is its suffix. What is imported is a family."""
+    """Import a file of another program, whose first line is its suffix, and load the imported families."""
     first, _, contents = path.read_bytes().partition(b"\n")
     suffix = first.decode(errors="replace")
     source = path.with_name(f"imported{suffix if suffix in SUFFIXES else '.csv'}")
@@ -155,7 +155,7 @@ def read_capture(path: Path) -> None:
 
 
 def read_samples(path: Path) -> None:
-    """Read a message of a fleet's samples; its errors need not name the file."""
+    """Read a message with samples of a fleet; errors need not name the file."""
     with suppress(MessageError):
         rows = unpack(path.read_bytes())
         assert rows.schema == ROWS
@@ -164,7 +164,7 @@ def read_samples(path: Path) -> None:
 
 
 def _pair(capture: Capture) -> None:
-    """Check that a report matches the spans, and that every byte of junk is counted."""
+    """Check that the counts of exchanges match the frames, and that every byte of junk is counted."""
     pairings: list[Pairing] = []
     splitters: list[Splitter] = []
     junk = exchanges = 0
@@ -185,7 +185,7 @@ def _pair(capture: Capture) -> None:
 
 
 def _comparable(batches: Iterable[Rows]) -> list[Row]:
-    """Return all rows; NaN is replaced by a status, because it equals no value."""
+    """Return all rows, with NaN moved into the status, because NaN does not equal itself."""
     rows = [row for batch in batches for row in batch]
     return [
         row._replace(value=None, status=f"nan {row.status}") if row.value != row.value else row
@@ -204,13 +204,13 @@ def _written_again(path: Path, suffix: str, metadata: Metadata, batches: list[Ro
 
 
 def _is_kept(found: Row, written: Row) -> bool:
-    """Tell whether a row came back from .arrows: its uncertainty is rounded up."""
+    """Return True if the rows are equal, except that .arrows rounds the uncertainty up."""
     bound, least = found.uncertainty_ns, written.uncertainty_ns
     is_near = bound is least if bound is None or least is None else 0 <= bound - least <= abs(least) / 2**23
     return is_near and found._replace(uncertainty_ns=0) == written._replace(uncertainty_ns=0)
 
 
-READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix, and who reads it
+READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # by reader: suffix of its file, and function
     "plant": (".toml", read_plant),
     "family": (".toml", read_family),
     "import": (".txt", read_import),
@@ -225,7 +225,7 @@ READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix,
 
 
 def read(name: str, data: bytes, folder: Path) -> None:
-    """Pass a file with these bytes to the reader."""
+    """Write these bytes into a file, and pass the file to the reader."""
     suffix, reader = READERS[name]
     path = folder / f"fuzzed{suffix}"
     path.write_bytes(data)

@@ -1,5 +1,5 @@
-/* Runs a packed corpus through a harness without libFuzzer: `replay corpus/PARSER.txt`. Each line of it is
- * an input's name and its bytes in hex. */
+/* Passes a packed corpus to a harness, without libFuzzer: `replay corpus/PARSER.txt`. Each line of the file is
+ * an input: its name, and its bytes in hex. */
 #include "fuzz.h"
 
 #include <ctype.h>
@@ -28,7 +28,7 @@ int main(int argc, char **argv)
             data[size++] = (uint8_t)(value_of(high) << 4 | value_of(low));
         }
         must(high == '\n');
-        fprintf(stderr, "%s\n", name); /* if the harness aborts, the last name is its input's */
+        fprintf(stderr, "%s\n", name); /* if the harness aborts, the last printed name is the failing input */
         uint8_t *exact = exact_copy(data, size);
         LLVMFuzzerTestOneInput(exact, size);
         free(exact);

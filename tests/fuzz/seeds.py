@@ -1,4 +1,4 @@
-"""Seeds of the fuzzers: frames from the documents, captures with them, and valid files.
+"""Make the fuzzers' seeds: frames from the manuals, captures of these frames, and valid files.
 
 python tests/fuzz/seeds.py DIRECTORY HARNESS...    write each harness's seeds to DIRECTORY/HARNESS-seeds
 """
@@ -27,13 +27,13 @@ from multidrop.recording import open_writer
 
 EXCHANGES = [each for each in PRINTED if each.request is not None]
 RTU = [exchange for exchange in EXCHANGES if exchange.framing is Framing.RTU]
-TCP = 15  # as fuzz.h has a framing in a byte
+TCP = 15  # Modbus TCP, in the framing byte of fuzz.h
 WAKE, TAKE, NOISE = 2, 3, 4  # steps of fuzz_line.c
 TIME = 1_700_000_000
 
 
 def asked(printed: Printed) -> bytes:
-    """The request as a harness has it."""
+    """Return the request in the format of `request_of` in fuzz.h."""
     message = printed.request or printed.says
     assert isinstance(message, Message)
     data = (message.data + bytes(2))[:2]
@@ -43,7 +43,7 @@ def asked(printed: Printed) -> bytes:
 
 
 def over_tcp(printed: Printed, transaction: int) -> Iterator[bytes]:
-    """The request as a harness has it, and both frames."""
+    """Yield the request in the format of `request_of`, and the frames of request and reply over Modbus TCP."""
     yield bytes([TCP]) + asked(printed)[1:]
     for frame in (printed.request_frame, printed.frame):
         yield struct.pack(">HHH", transaction, 0, len(frame) - 2) + frame[:-2]
@@ -72,7 +72,7 @@ def tcp() -> Iterator[bytes]:
             good, again = header + b"\0" + request + came(answered), b"\0" + request
             second, third = (struct.pack(">H", number) + answered[2:] for number in (2, 3))
             lying = second[:5] + bytes([second[5] + 1]) + second[6:]
-            for odd in (second[:-1], lying, second + b"\0\0"):  # and the exchange after it
+            for odd in (second[:-1], lying, second + b"\0\0"):  # a wrong reply, then another exchange
                 yield good + again + came(odd) + b"\2\2" + again + came(third)
 
 
@@ -97,7 +97,7 @@ def split() -> Iterator[bytes]:
 
 
 def rtac(printed: Printed) -> Iterator[bytes]:
-    """Packets with the header of RTAC serial (link type 250)."""
+    """Yield packets of the exchange's frames with the header of RTAC serial (link type 250)."""
     for event, raw in ((1, printed.request_frame), (2, printed.frame)):
         yield struct.pack(">IIBBH", TIME, 5000 * event, event, 0, 0) + raw
 
@@ -173,7 +173,7 @@ def captures() -> Iterator[bytes]:
 
 
 def requests() -> Iterator[bytes]:
-    """Yield what clients send: reads, writes, stops, others' functions, a broadcast, and no Modbus."""
+    """Yield streams of clients: reads, writes, stops, unknown functions, a broadcast, and no Modbus."""
     bodies = [
         *("01 03 30 00 00 02", "01 04 F0 00 00 0B", "02 01 00 00 00 04", "02 02 00 00 00 01"),
         *("01 06 20 00 13 88", "01 06 10 00 00 05", "01 06 F0 0A 00 01", "02 05 00 01 FF 00"),
@@ -190,7 +190,7 @@ def requests() -> Iterator[bytes]:
 
 
 def samples() -> Iterator[bytes]:
-    """Yield messages of a fleet: compressed ones, and one that pyarrow wrote without compression."""
+    """Yield messages with samples of a fleet: compressed, and one without compression from pyarrow."""
     for batch in (example(), counting(3)):
         buffer = RowBuffer()
         buffer.add(batch.columns())

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-# Binary operators have a space on both sides here, which tells them from pointers and signs.
+# In this code, only binary operators have a space on both sides; pointers and signs have not.
 SWAPS = {
     r" == ": (" != ",),
     r" != ": (" == ",),
@@ -48,21 +48,21 @@ NUMBER = re.compile(r"(?<![\w.])(?:0x[0-9A-Fa-f]+|[0-9][0-9_]*(?:\.[0-9]+)?)(?![
 FUNCTION = re.compile(r"^ *(?:def|class) (\w+)|^\w[\w \*]*?(\w+)\(", re.MULTILINE)
 
 
-Name = tuple[str, str, str, str, int]  # file, function, the lines before and after, and which of these
-Edit = tuple[int, int, str]  # from, to, what stands there instead
+Name = tuple[str, str, str, str, int]  # file, function, line before and after the edit, `nth` of equal edits
+Edit = tuple[int, int, str]  # start and end offset in the source, replacement
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A file with one edit. Its function and lines are its name: they outlive other changes."""
+    """A source file with one edit. Its name has no line number, so it stays valid if other code changes."""
 
     path: str
     function: str
     before: str
     after: str
-    nth: int  # of those in this function that read the same, from 1
-    number: int  # of the line
-    text: str  # the whole file's
+    nth: int  # among equal edits in this function, from 1
+    number: int  # line number
+    text: str  # text of the whole file
 
     @property
     def name(self) -> Name:
@@ -73,7 +73,7 @@ class Mutant:
 
 
 def mutants(path: str, source: str) -> list[Mutant]:
-    """All of a file's, in its order, none twice."""
+    """Return all mutants of a file, in the order of their lines, without duplicates."""
     language = _python if Path(path).suffix == ".py" else _c
     bare, special = language(source)
     found: dict[str, Mutant] = {}
@@ -89,7 +89,7 @@ def mutants(path: str, source: str) -> list[Mutant]:
 
 
 def _read(source: str, start: int, end: int, mutated: str) -> tuple[str, str, str]:
-    """The function, and the lines before and after, on one line each."""
+    """Return the edited function's name, and the edited lines before and after, each joined to one line."""
     first = source.rfind("\n", 0, start) + 1
     last = source.find("\n", end)
     before, after = source[first:last], mutated[first : last + len(mutated) - len(source)]
@@ -126,7 +126,7 @@ def _blank(source: str, spans: list[tuple[int, int]]) -> str:
 
 
 def _c(source: str) -> tuple[str, list[Edit]]:
-    """Return the source without its immutable parts, and the edits that need more context than a word."""
+    """Blank the parts of a C source that are not mutated; return that, and the edits of whole statements."""
     outside = r'/\*.*?\*/|"(?:\\.|[^"])*"|^#[^\n]*'
     bare = _blank(source, [match.span() for match in re.finditer(outside, source, re.DOTALL | re.MULTILINE)])
     return bare, [*_c_conditions(bare), *_c_statements(bare)]
@@ -142,7 +142,7 @@ def _c_conditions(bare: str) -> Iterator[Edit]:
 
 
 def _closing(bare: str, at: int) -> int:
-    """Return the end of the parenthesis that was opened before `at`."""
+    """Return the position of the parenthesis that closes the one opened before `at`."""
     depth = 1
     while depth:
         depth += {"(": 1, ")": -1}.get(bare[at], 0)
@@ -151,7 +151,7 @@ def _closing(bare: str, at: int) -> int:
 
 
 def _beginning(bare: str, at: int) -> int:
-    """Return the beginning of the condition that ends at `at`."""
+    """Return the start of the condition that ends at `at`."""
     depth = 0
     while True:
         before = bare[:at]
@@ -175,7 +175,7 @@ def _c_statements(bare: str) -> Iterator[Edit]:
 
 
 def _python(source: str) -> tuple[str, list[Edit]]:
-    """The same, of Python."""
+    """Blank the parts of a Python source that are not mutated; return that, and edits of whole expressions."""
     starts = [0]
     for line in source.split("\n"):
         starts.append(starts[-1] + len(line) + 1)

@@ -23,7 +23,7 @@ EXPLAINED = Path(__file__).with_name("explained.toml")
 
 
 def explained() -> dict[Name, str]:
-    """The reason why a mutant survives, by its name."""
+    """Return the reasons in explained.toml why mutants survive, by the mutant's name."""
     rows = tomllib.loads(EXPLAINED.read_text("utf-8"))["mutant"]
     return {
         (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)): row["why"]
@@ -32,7 +32,7 @@ def explained() -> dict[Name, str]:
 
 
 def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
-    """Yield each of the file's mutants with its end; None: it survives."""
+    """Yield each mutant of the file with the way it ended, such as "killed"; None: it survived."""
     source = (ROOT / path).read_text("utf-8")
     found = mutants(path, source)
     trees: SimpleQueue[Path] = SimpleQueue()
@@ -55,7 +55,9 @@ def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
 
 
 def report(path: str) -> int:
-    """Print the survivors and a line of figures; return the number of unexplained ones."""
+    """Print the unexplained survivors and a line of figures; return the number of failures.
+
+    A failure is a survivor that explained.toml does not list, or a listed mutant that did not survive."""
     reasons = {name: why for name, why in explained().items() if name[0] == path}
     alive: set[Name] = set()
     count: Counter[str] = Counter()

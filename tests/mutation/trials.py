@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 20  # s of the processor, however busy it is; the slowest trial takes eight
+PATIENCE = 20  # s of CPU time, so that other load does not count; the slowest trial takes 8 s
 CC = os.environ.get("CC", "cc")
 FLAGS = ["-std=c11", "-D_DEFAULT_SOURCE", "-w", "-Icsrc"]
 SANITIZED = [
@@ -28,7 +28,7 @@ SANITIZED = [
 ]
 MODULE = [*FLAGS, "-O2", "-fPIC", "-DPy_LIMITED_API=0x030b0000"]
 
-# An editable installation would find its own modules before those of the copy, as workers of xdist do.
+# Remove the import hook of an editable installation: it would import the original, not the copy under test.
 PYTEST = """
 import sys
 sys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]
@@ -37,11 +37,11 @@ import pytest
 sys.exit(pytest.main(sys.argv[1:]))
 """
 
-Trial = Callable[[Path, str], str | None]  # the end of a mutant of this file in a tree; None: it survives
+Trial = Callable[[Path, str], str | None]  # takes tree and file; None: the mutant survives
 
 
 def by_test_core(tree: Path, path: str) -> str | None:
-    """The C core's own test program, with its sanitizers."""
+    """Try a mutant with test_core.c, the C core's test program, under sanitizers."""
     if _status(tree, CC, *SANITIZED, "-c", path, "-o", f"checked/{Path(path).stem}.o"):
         return "no program"
     _must(tree, CC, *SANITIZED, *_objects(tree, "checked", "test_core"), "-lm", "-o", "test_core")
@@ -49,7 +49,7 @@ def by_test_core(tree: Path, path: str) -> str | None:
 
 
 def by_compiler(tree: Path, path: str) -> str | None:
-    """An equivalent mutant: the compiler emits the same code."""
+    """Return "same code" for an equivalent mutant: the compiler emits the same code as for the original."""
     compiled = f"{Path(path).stem}.o"
     _must(tree, CC, *MODULE, "-c", path, "-o", f"module/{compiled}")
     same = (tree / "module" / compiled).read_bytes() == (tree / "original" / compiled).read_bytes()
@@ -57,7 +57,7 @@ def by_compiler(tree: Path, path: str) -> str | None:
 
 
 def by_test_frame(tree: Path, path: str) -> str | None:
-    """The Python tests of frames and of a line; by_compiler has compiled the mutant for the module."""
+    """Try a mutant with the Python tests of frames and of a line; `by_compiler` has compiled it already."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
     return _pytest(
         tree, *(f"tests/core/test_{name}.py" for name in ("frame", "capture", "learning", "line", "tcp"))
@@ -77,7 +77,7 @@ TRIALS: dict[str, tuple[Trial, ...]] = {
 
 
 def core_names(tree: Path) -> list[str]:
-    """The names of the core's files."""
+    """Return the names of the C core's source files on Linux, without suffix."""
     text = (tree / "csrc" / "CMakeLists.txt").read_text()
     (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", text)
     _windows, system = re.findall(r"set\(SYSTEM ([^)]+)\)", text)
@@ -100,7 +100,7 @@ def _end(status: int) -> str | None:
 
 
 def _status(tree: Path, *command: str) -> int:
-    """Run a command that has only so much time to compute."""
+    """Return the exit status of a command, which is killed after PATIENCE seconds of CPU time."""
     return subprocess.run(
         command,
         cwd=tree,
@@ -117,7 +117,7 @@ def _must(tree: Path, *command: str) -> None:
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """The copy, with everything compiled that no mutant changes."""
+    """Yield a copy of the source tree, in which all C files are already compiled."""
     with tempfile.TemporaryDirectory() as directory:
         tree = Path(directory)
         for name in ("csrc", "src", "tests"):
@@ -137,7 +137,9 @@ def scratch() -> Iterator[Path]:
 
 
 def attempt(tree: Path, path: str, text: str) -> str | None:
-    """Try the file with this text; afterwards the tree is as before, except for build results."""
+    """Run the trials of a file with this text in place of its own; restore the file afterwards.
+
+    Return how the mutant ended, such as "killed", or None if it survives."""
     original = (tree / path).read_text()
     (tree / path).write_text(text)
     try:

@@ -50,7 +50,7 @@ def start_of(said: SampleFrame) -> int:
 
 
 def contradicts_itself(said: SampleFrame) -> bool:
-    """Return True for a multiple write whose byte count contradicts its count, or is above the limit."""
+    """Return True for a multiple write whose byte count does not match its register count or is too large."""
     function, count = said.function, count_of(said)
     return function in (0x0F, 0x10) and (
         said.octet(6) != data_bytes(function, count) or count > MOST[function]
@@ -237,7 +237,7 @@ class Difference:
 
 
 def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) -> None:
-    """Fail unless every difference has a rule and every rule a difference."""
+    """Fail unless a rule explains every difference, and every rule explains a difference."""
     rules = [rule for rule in rules if judge in rule.judges]
     stale = list(rules)
     for difference in differences:
@@ -251,7 +251,7 @@ def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) ->
 
 
 def compare(said: SampleFrame, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
-    """Return no difference if both reject the frame, or both decode it identically."""
+    """Return the differences: none if both reject the frame, or both decode it identically."""
     if (isinstance(ours, str) and isinstance(theirs, str)) or ours == theirs:
         return []
     return [Difference(said, ours, theirs)]
@@ -261,7 +261,7 @@ NUMBER = 3000  # frames in each comparison
 RTU, ASCII = Framing.RTU, Framing.ASCII
 framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 
-# ---- what we say ----
+# ---- our decoder ----
 
 
 def received(said: SampleFrame) -> tuple[int, Verdict]:
@@ -298,7 +298,7 @@ def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Libmodbus:
 
 @pytest.mark.long
 def test_requests_decode_as_in_libmodbus_server(libmodbus: Libmodbus) -> None:
-    """Check that its replies and registers change as our decoding of the request requires."""
+    """Check that the server's replies and registers match our decoding of each request."""
     requests = frames(1, RTU, NUMBER, replies=False)
     differences = []
     answers = 0

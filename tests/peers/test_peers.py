@@ -44,7 +44,7 @@ HELD = {
 
 
 class Server(NamedTuple):
-    """A running server: its port, and the framing that a serial one needs."""
+    """A running server: its port, and, on a serial line, its framing."""
 
     port: str
     framing: str | None = None
@@ -55,7 +55,7 @@ class Server(NamedTuple):
 
     @property
     def words(self) -> list[str]:
-        """Return how a command names the device."""
+        """Return the arguments that name the device in a command."""
         framing = [] if self.framing is None else ["--framing", self.framing]
         return [self.port, DEVICE, str(ADDRESS), *framing]
 
@@ -144,7 +144,7 @@ def test_exception_code_raises_drive_exception(server: Server) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     "name", [name for name in COMMANDS if name != "libmodbus tcp"]
-)  # answers to any unit
+)  # this server answers requests to any unit id
 def test_another_address_times_out(name: str, tmp_path: Path) -> None:
     advice = r"name the port socket://127\.0\.0\.1:\d+" if "tcp" in name else "does not answer"
     with running(name, tmp_path) as server, Bus(server.port) as bus:

@@ -58,7 +58,7 @@ def test_ticks_of_the_time_axis_differ(seconds: float) -> None:
 
 
 def noisy_ramp() -> list[Row]:
-    """A pump that runs up for 100 s; from 30 Hz on every second value of its fault register is damaged."""
+    """Return rows of a pump that runs up for 100 s; from 30 Hz on it misses every second value of `fault`."""
     rows = []
     for tick in range(1000):
         second, hz = tick / 10, tick / 20
@@ -180,7 +180,7 @@ def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
     slow = shares[1][shares[0] < 28]
     fast = shares[1][shares[0] > 32]
     assert slow.max() == 0
-    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # half of one register of two
+    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # half of `fault`, one of two registers
     assert miss_shares(look, "fan") is None
 
 
@@ -224,7 +224,7 @@ PLANNED: dict[str, Any] = {
 
 
 def turns() -> list[Row]:
-    """The pump's two registers and the fan's one, in turns of 100 ms; the fan is lost half-way."""
+    """Return rows of two registers of a pump and one of a fan, every 100 ms; the fan is lost half-way."""
     rows = []
     for tick in range(100):
         second = tick / 10
@@ -247,14 +247,14 @@ def test_utilisation_of_a_line(tmp_path: Path) -> None:
     assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)
     assert line.rate("pump") == pytest.approx(10, rel=0.01)
     assert line.rate("fan") == pytest.approx(5, rel=0.01)
-    assert line.cycle == pytest.approx(9.976 * 3 / 250, rel=0.01)  # three registers, 250 values
+    assert line.cycle == pytest.approx(9.976 * 3 / 250, rel=0.01)  # 3 registers in a cycle, 250 values in all
     page = report_page(look)
     assert "fan, exchanges/s" in page
     assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
 
 
 def test_utilisation_of_a_port_without_a_wire_is_at_most_1(tmp_path: Path) -> None:
-    """Requests follow each other after 2 ms; a wire would need 32 ms."""
+    """Requests follow each other after 2 ms, because the port is a network's; a wire would need 32 ms."""
     rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
     planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
     (line,) = line_uses(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
@@ -262,7 +262,7 @@ def test_utilisation_of_a_port_without_a_wire_is_at_most_1(tmp_path: Path) -> No
 
 
 def test_utilisation_of_blocks_that_differ_from_the_plan(tmp_path: Path) -> None:
-    """In the first half the pump's two registers are read singly, each with a reply of 7 characters."""
+    """In the first half, two requests read the pump's two registers; each reply has 7 characters."""
     rows = [
         row(tick / 10 + (0.05 if name == "fault" and tick < 50 else 0), "pump", name, 1.0, ms=14.0)
         for tick in range(100)
@@ -448,14 +448,14 @@ def test_a_near_zero_is_on_the_axis(tmp_path: Path) -> None:
         assert low == bottom if bottom is not None else 0 < low < least
 
 
-STATUS = {  # the families' own, as their documents have them
+STATUS = {  # metadata of the families' status registers, as their documents have them
     "erman": {"STOPPED": 0, "RUNNING": 1, "ACCELERATING": 2, "DECELERATING": 3},
     "che": {"FORWARD": 1, "REVERSE": 2, "STANDBY": 3, "FAULT": 4},
 }
 
 
 def states(path: Path, rows: list[Row]) -> Recording:
-    """A recording of two enumerations and one register of bits, all called status."""
+    """Return a recording of three drives whose `status` is an enumeration, another one, and a set of bits."""
     meanings: dict[str, Any] = {
         name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
     }
@@ -465,7 +465,7 @@ def states(path: Path, rows: list[Row]) -> Recording:
 
 
 def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
-    """Return the content of each lane, by its label: texts with their bars, in s since the first row."""
+    """Return the texts in each lane, by the lane's label, with start and end of their bars in s."""
     lanes = {text.get_text(): [] for text in axes.get_yticklabels()}
     names = list(lanes)
     bars: dict[int, list[tuple[float, float]]] = {}
@@ -483,7 +483,7 @@ def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
 
 
 def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> None:
-    """3 means decelerating on one drive and standby on the other."""
+    """The raw value 3 means decelerating on one drive, and standby on the other."""
     rows = [row(at, "erman", "status", value) for at, value in enumerate((0, 2, 1, 3, 3, 3))]
     rows += [row(at, "che", "status", value) for at, value in enumerate((3, 3, 1, None, 3, 7))]
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -491,7 +491,7 @@ def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> No
         "erman": [("stopped", 0, 1), ("accelerating", 1, 2), ("running", 2, 3), ("decelerating", 3, 5)],
         "che": [("standby", 0, 2), ("forward", 2, 3), ("standby", 4, 5), ("", 5, 5)],
     }
-    (ticks,) = axes.lines  # the miss, in its drive's lane
+    (ticks,) = axes.lines  # the miss is marked in its drive's lane
     assert ticks.get_ydata()[0] == pytest.approx(1.4)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["code 7"]
 
@@ -504,7 +504,7 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
 
     values = [*range(1, 5), *range(20, 45)]
     rows = [row(at, "che", "status", value) for at, value in enumerate(values)]
-    rows += [row(at, "yd", "status", 2) for at in range(2)]  # REVERSE: a state's name, and a bit's
+    rows += [row(at, "yd", "status", 2) for at in range(2)]  # REVERSE is the name of a state, and of a bit
     (axes,) = plot(states(tmp_path, rows))[0].axes
     *of_states, of_bit = (to_hex(colour) for bars in axes.collections for colour in bars.get_facecolor())
     of_drives = [to_hex(line_style(number)["color"]) for number in range(len(values))]
@@ -514,7 +514,7 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
 
 
 def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
-    """A pale bar of a pixel is not, without an edge."""
+    """Its pale bar is one pixel wide, and would be invisible without a dark edge."""
     rows = [row(at, "che", "status", 3 if at == 500 else None) for at in range(1000)]
     (axes,) = plot(states(tmp_path, rows))[0].axes
     (bars,) = axes.collections
@@ -525,7 +525,7 @@ def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
 def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
     rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
     (axes,) = plot(states(tmp_path, rows))[0].axes
-    assert drawn(axes) == {  # from 1 s on, when the first one is set
+    assert drawn(axes) == {  # the first bit is set after 1 s
         "yd reverse": [("", 1, 4)],
         "yd jog": [],
         "yd run": [("", 0, 2)],
@@ -535,7 +535,7 @@ def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
 
 
 def test_an_unnamed_number_is_not_a_sum_of_names(tmp_path: Path) -> None:
-    """A fault that is not in the enumeration is not several others at once."""
+    """A fault number that is not in the enumeration is not shown as the sum of several faults."""
     series = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", 9 + 2)], ABOUT)).series[0]
     assert [series.name_of(count) for count in (8.0, 9.0, 24.0, 1e308, -1.0, 0.5)] == [
         "OVERHEAT",
@@ -627,7 +627,7 @@ def test_series_without_room_are_named(run: Run, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
 def test_series_without_room_are_named_once(tmp_path: Path) -> None:
-    """Numbers and states of one name are two panels."""
+    """A register name whose values are numbers on one drive and states on another has two panels."""
     rows = [row(0, "pump", f"r{number}", 1) for number in range(MOST_PANELS)]
     rows += [row(0, drive, "status", 1) for drive in ("pump", "che")]
     assert plot(states(tmp_path, rows))[1] == ["status"]
@@ -699,13 +699,13 @@ def test_a_single_row_has_a_report(tmp_path: Path) -> None:
     assert "Report on it.arrows" in report_page(look)
 
 
-# ---- what makes no sense ----
+# ---- invalid metadata and values ----
 
 ODD: list[Any] = [10**400, None, True, -1, 1e308, "", "x", [], [1], {}, {"a": {}}, {"FORWARD": 10**400}]
 
 
 def with_odd(about: Any, odd: Any) -> Iterator[Any]:
-    """The same metadata, with each part in turn replaced by this."""
+    """Yield copies of the metadata, each with another part replaced by `odd`."""
     yield odd
     for key, part in about.items() if isinstance(about, dict) else enumerate(about) if about else ():
         if isinstance(part, dict | list):
@@ -729,7 +729,7 @@ def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> N
     rows = turns()[:30]
     for number, metadata in enumerate(with_odd(about, odd)):
         if not isinstance(metadata, dict):
-            continue  # is not a recording
+            continue  # the copy is not a recording
         look = load(record(tmp_path / f"{number}.arrows", rows, metadata, pieces=1))
         assert all(
             np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()

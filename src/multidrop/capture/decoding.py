@@ -122,7 +122,7 @@ _TABLES = {
     0x10: "holding_register",
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
-_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # most registers in a reply, even if the request asks for more
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # limit per reply, even if the request asks for more
 _WRITES = {  # function code of a request: the write functions of registers that it may write
     0x05: (0x05,),
     0x06: (0x06,),
@@ -285,7 +285,7 @@ class ExchangeFormatter:
 
 
 def data_of(exchange: SniffedExchange, request: Message) -> bytes:
-    """Return the data that was read or written, for a write from its request: some replies do not repeat it."""
+    """Return the data that was read or written; of a write, from its request: not all replies repeat it."""
     if exchange.framing is Framing.DELIXI and request.function == 0x02:
         return struct.pack(">I", request.start)
     if exchange.framing is not Framing.DELIXI and request.function >= 0x05:

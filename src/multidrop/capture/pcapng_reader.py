@@ -99,7 +99,7 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it does not begin like pcap or pcapng")
 
     def __iter__(self) -> Iterator[None]:
-        """Read a part of the file into `streams`, and yield; the caller then takes all bytes from `streams`."""
+        """Read a part of the file into `streams`, and yield, so that the caller takes all bytes from them."""
         unpacker = self._unpacker
         assert unpacker is not None
         seen = unpacker.at  # position in the file after the last byte read

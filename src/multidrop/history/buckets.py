@@ -171,7 +171,7 @@ def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
 
 
 class UnitBuckets:
-    """The buckets of one register, separate for each unit that rows state, as the rows of a fleet's hub do."""
+    """The buckets of one register, separate for each unit that its rows state (as rows of a hub do)."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid

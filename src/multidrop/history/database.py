@@ -155,7 +155,7 @@ def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
 
 
 def texts_of_metadata(database: Any, paths: Iterable[Path]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each distinct metadata text in these Parquet files, with the names of the files that contain it."""
+    """Yield each distinct metadata text in these Parquet files, with the names of the files that have it."""
     query = f"""select decode(value), list(file_name) from parquet_kv_metadata({_list(paths)})
         where decode(key) = $key group by value"""
     yield from database.execute(query, {"key": METADATA_KEY}).fetchall()

@@ -20,7 +20,7 @@ _NAME = re.compile(r"(\d{8,})(?:-(\d{8,}))?\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parq
 
 
 class HistoryFile(NamedTuple):
-    """A Parquet file: its path, its first and last segment, and a time span in s UTC that has all its rows."""
+    """A Parquet file: path, first and last segment number, and the time span of its rows, in s UTC."""
 
     path: Path
     first: int
@@ -74,7 +74,7 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 class Listing:
     """The current files of a history; each row is in one file."""
 
-    segments: dict[int, Path] = field(default_factory=dict)  # by number: segments not compacted into `rows` yet
+    segments: dict[int, Path] = field(default_factory=dict)  # by number: segments not in `rows`
     rows: dict[int, HistoryFile] = field(default_factory=dict)
     tens: list[HistoryFile] = field(default_factory=list)
 

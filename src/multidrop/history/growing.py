@@ -1,4 +1,4 @@
-"""Read a segment that is not compacted yet: the rows and ten-second summaries ("tens") of requested series."""
+"""Read a segment that is not compacted yet: rows and ten-second summaries ("tens") of requested series."""
 
 from __future__ import annotations
 
@@ -262,6 +262,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the series' cached rows if they reach up to the first of these batches, else an empty entry."""
+        """Return the series' cached rows if they reach to the first of these batches, else an empty entry."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

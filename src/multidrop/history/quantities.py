@@ -39,7 +39,7 @@ def known_by(metadata: object) -> Known:
 
 
 def units_of(metadata: object) -> dict[Series, str]:
-    """Return each series' text in the column `unit` of Parquet files; a fleet's messages have the same texts."""
+    """Return each series' text in the column `unit` of Parquet files, as in messages of a fleet's samples."""
     found = {}
     drives = _table(_table(metadata).get("drives"))
     for (drive, register), quantity in quantities_of(metadata).items():
@@ -135,7 +135,7 @@ class Parting:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata with a right description of each column, also of those it lacks or contradicts."""
+        """Return the metadata, with descriptions of the columns that it lacks or describes wrongly."""
         columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = quantities_of(metadata)

@@ -37,7 +37,7 @@ FILES_AT_ONCE = 200  # files per query of metadata; a file's metadata may take 1
 
 
 class Replaced(Exception):
-    """A listed file no longer exists: compaction moved its rows to another file, or it was removed for age."""
+    """A listed file is gone: compaction moved its rows to another file, or it was removed for its age."""
 
 
 class Sources:
@@ -92,7 +92,7 @@ class Sources:
                 segment.let_go()
 
     def _held(self, number: int, path: Path) -> GrowingSegment | None:
-        """Return a segment, on which the caller must call `let_go`; cache the indexes of the newest segments."""
+        """Return a segment; the caller must call its `let_go`. Cache the indexes of the newest segments."""
         segment = self._growing.get(number)
         if segment is None:
             try:
@@ -196,7 +196,7 @@ def rows_of_file(
     end: int,
     renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the series' rows (None: all), ordered by request time. Raises Replaced, only before the first row."""
+    """Yield the series' rows (None: all) in order of request times. Raises Replaced before the first row."""
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
         # Sorting reads the whole file before the first row is yielded, so Replaced is never raised after it.
@@ -232,7 +232,7 @@ def gather_files(
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return the quantities by first segment of each file, from the units that rows state. Raises Replaced."""
+    """Return each file's quantities by its first segment, from the units in its rows. Raises Replaced."""
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
     known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
@@ -297,7 +297,7 @@ def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
     marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
     others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
     condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
-    if len(drives) * len(registers) > len(series):  # not every drive with every register: add the slower, exact condition
+    if len(drives) * len(registers) > len(series):  # some pairs are not wanted; pair by pair is slower
         pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
         condition += f" and (drive, register) in ({pairs})"
     return condition, values

@@ -84,7 +84,7 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy the batch's rows for the writing thread. Takes microseconds; never raises because of the disk."""
+        """Copy a batch's rows for the writing thread, in microseconds. Never raises because of the disk."""
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)
@@ -204,7 +204,7 @@ class Compactor:
         self.is_possible = importlib.util.find_spec("duckdb") is not None
 
     def tend(self, below: int) -> None:
-        """Collect a finished child; start a child if segments with numbers under `below` are not compacted."""
+        """Collect a finished child; start a child if segments before `below` are not compacted yet."""
         if self._child and self._child.poll() is not None:
             self._note(self._child)
             self._child = None

@@ -24,7 +24,7 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import RecordedRows
 
-MOST_SPELLED = 1 << 28  # limit in bytes for one column's texts in a batch: a small file could expand to gigabytes
+MOST_SPELLED = 1 << 28  # limit in bytes for a column's texts in a batch; a small file may expand
 Buffers = tuple[Any, ...]
 
 
@@ -45,7 +45,7 @@ class RecordedColumns(NamedTuple):
 
 
 class BatchDecoder:
-    """Decodes one file's batches in their order; each batch uses the dictionaries that precede it in the file.
+    """Decodes one file's batches in their order; a batch uses the dictionaries that precede it in the file.
 
     `columns` lists the file's columns, each with the id of its dictionary or None.
     """
@@ -75,7 +75,7 @@ class BatchDecoder:
 
     @property
     def known(self) -> dict[int, Names]:
-        """The dictionaries decoded so far, by id. Each change makes a new mapping, so callers may keep one."""
+        """The dictionaries decoded so far, by id. A change makes a new mapping, so callers may keep this."""
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:

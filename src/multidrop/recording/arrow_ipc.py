@@ -120,7 +120,7 @@ class Structs(bytes):
 def build(root: Table) -> bytes:
     """Return the flatbuffer of this table."""
     out = bytearray(4)
-    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # positions of placeholders, and the tables whose offsets belong there
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # placeholders' positions, and targets
     while waiting:
         place, thing = waiting.popleft()
         if isinstance(thing, dict):
@@ -139,7 +139,7 @@ def _align(out: bytearray, size: int, ahead: int = 0) -> None:
 
 
 def _put_table(out: bytearray, table: Table, waiting: deque[tuple[int, Any]]) -> int:
-    """Append the vtable and the table; return the table's position. Larger fields come first, for alignment."""
+    """Append the vtable and the table; return the table's position. Larger fields come first: all align."""
     fields = {number: value if isinstance(value, tuple) else _OFFSET for number, value in table.items()}
     in_order = sorted(fields, key=lambda number: -struct.calcsize(fields[number][0]))
     slots = [0] * (max(table, default=-1) + 1)
@@ -200,7 +200,7 @@ class FileColumn(NamedTuple):
 COLUMNS = (
     FileColumn(b"time", TIMESTAMP, NANOSECONDS),
     FileColumn(b"monotonic_ns", INT, 64),
-    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up, so that it remains an upper bound
+    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up: stays an upper bound
     FileColumn(b"drive", UTF8, code_bits=16),
     FileColumn(b"register", UTF8, code_bits=16),
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),

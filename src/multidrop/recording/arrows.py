@@ -65,7 +65,7 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                elif message.kind == DICTIONARY_BATCH:  # without its batch it is skipped: other libraries cannot read it
+                elif message.kind == DICTIONARY_BATCH:  # other libraries fail if its batch is missing
                     continue
                 self._whole = message.end
         if not self._whole:
@@ -109,7 +109,7 @@ class ArrowsReader(RecordingReader):
 
 
 def _column(field: FlatTable) -> FileColumn:
-    """Return a column as the file describes it; `code_bits` is -1 for codes that this library never writes."""
+    """Return a column as the file describes it; `code_bits` is -1 for codes that we never write."""
     detail, coded = field.table(3), field.table(4)
     index = coded.table(1) if coded else None
     is_unsigned = index is not None and not index.number(1, "<?")
@@ -181,7 +181,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                if message.kind != RECORD_BATCH:  # a dictionary is read again with its batch: after a write fails, both are cut off
+                if message.kind != RECORD_BATCH:  # read again with its batch: a failed write cuts off both
                     self._decoder.decode(message, message.header, body)
                     continue
                 place = BatchPlace(message, self._decoder.known)

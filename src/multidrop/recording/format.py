@@ -167,7 +167,7 @@ class RecordingReader(ArrowTable):
         return ValueError(f"{path or self.path} is not a recording: {reason}")
 
     def _parse_metadata(self, text: bytes, path: Path | None = None) -> Metadata:
-        """Parse metadata of this file, or of the file at `path`. Raises ValueError if it is not a JSON object."""
+        """Parse metadata of this file, or of that at `path`. Raises ValueError if it is not a JSON object."""
         try:
             metadata = json.loads(text)
         except ValueError as error:

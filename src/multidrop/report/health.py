@@ -50,7 +50,7 @@ class DelaySeries:
 def delays(recording: Recording) -> list[DelaySeries]:
     """Return the delays of every drive that answered.
 
-    The first reply after a lost request is left out: it may answer the lost request, so its delay is not known.
+    The first reply after a lost request is left out: it may answer that request, so its delay is uncertain.
     """
     found = []
     for drive in recording.drives:
@@ -222,7 +222,7 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """The time in s to read every register once; None if a register has its own rate, or without values."""
+        """The time in s to read each register once; None if one has its own rate, or if there are no values."""
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None

@@ -63,7 +63,7 @@ class Series:
 
     @cached_property
     def pauses(self) -> Array:
-        """For each row except the last: True if polling paused after it, so that neither values nor misses follow."""
+        """For each row except the last: True if polling paused after it, without values and misses."""
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from multidrop.printable import printable
 from multidrop.report.load import Array
 
-# Okabe and Ito's colours, without black and yellow; further drives have the same colours, dashed.
+# Okabe and Ito's colours without black and yellow. Further drives get the same colours, dashed.
 MOST_DRIVES = 100  # in a picture; tables list all drives
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")

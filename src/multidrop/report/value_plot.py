@@ -1,4 +1,4 @@
-"""Draw a recording's values: a panel per quantity, with states as lanes, and with faults and misses marked."""
+"""Draw a recording's values: a panel per quantity, states as lanes, and marks of faults and misses."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ CURVES_INCHES = 1.9
 
 
 class Panel(NamedTuple):
-    """A register name and unit that have their own panel, because amperes and per cent cannot share an axis."""
+    """A register name and unit with a panel of their own: amperes and per cent cannot share an axis."""
 
     register: str
     unit: str
@@ -293,7 +293,7 @@ class Lane:
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return a panel's lanes, and the number of lanes without room. Lanes of bits that are never set go first."""
+    """Return a panel's lanes, and the number without room. Lanes of bits that are never set are dropped first."""
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found
@@ -349,7 +349,7 @@ def lanes_inches(lanes: Sequence[Lane]) -> float:
 
 
 def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
-    """Draw each lane as a row of bars, one per state. Names of states that fit into no bar go into a legend."""
+    """Draw each lane as a row of bars, one per state. Names that fit into no bar go into a legend."""
     names = dict.fromkeys(state for lane in lanes if not lane.is_bit for state in lane.state)
     styles = {name: _style(number) for number, name in enumerate(names)}
     span = max(recording.end - recording.begin, 1)
