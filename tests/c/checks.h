@@ -1,5 +1,5 @@
-/* Checks that are counted, and bytes that end at a page that cannot be read, so that even without tools an
- * over-read kills. */
+/* Counted checks; and copies of bytes that end at an unreadable page, so that an over-read crashes the test
+ * even without sanitizers. */
 #ifndef CHECKS_H
 #define CHECKS_H
 
@@ -15,7 +15,7 @@
                       : (failures++, printf("%s:%d: %s: %s\n", __FILE__, __LINE__, row, #truth), 0))
 
 static int checks, failures;
-static const char *row = ""; /* the present check, for the report */
+static const char *row = ""; /* name of the present check, for the report */
 
 static uint8_t *page_end(void)
 {

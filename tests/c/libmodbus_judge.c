@@ -1,14 +1,16 @@
-/* What libmodbus makes of frames: a line of standard input is a case, a line of standard output its word.
+/* Prints how libmodbus decodes frames: each line of standard input is a case, whose result is a line of
+ * standard output.
  *
- * Its input is a socket pair that ends after the frame, so that no read waits.
+ * libmodbus reads from a socket pair that ends after the frame, so that no read waits.
  *   "request FRAME"
- *       a server at the frame's address hears it: "refused ERRNO", or "taken LENGTH REPLY CHANGES",
- *       its reply (- for none) and each cell that it changed as table:address:value (- for none)
+ *       A server at the frame's address receives FRAME. The result is "refused ERRNO", or "taken LENGTH
+ *       REPLY CHANGES" with the server's reply (- for none) and each cell that it changed, as
+ *       table:address:value (- for none).
  *   "reply ADDRESS FUNCTION START COUNT DATA FRAME"
- *       a client asks and hears the frame: "REQUEST VALUES" with its request and what it read (- for
- *       a write), or "REQUEST error ERRNO"
- * Frames and data are in hexadecimal, - for empty; numbers are decimal; errno counts from libmodbus's
- * own base where it is its own. */
+ *       A client sends a request and receives FRAME. The result is "REQUEST VALUES" with the request and the
+ *       values that it read (- for a write), or "REQUEST error ERRNO".
+ * Frames and data are in hexadecimal, - if empty; numbers are decimal. An errno of libmodbus's own is printed
+ * relative to MODBUS_ENOBASE, another one negated. */
 #include <errno.h>
 #include <modbus.h>
 #include <stdio.h>
@@ -48,7 +50,7 @@ static int own_errno(void)
     return errno >= MODBUS_ENOBASE ? errno - MODBUS_ENOBASE : -errno;
 }
 
-/* Give it a line on which this has been said; the other end. */
+/* Connect libmodbus to a socket from which it will read this frame; return the socket's other end. */
 static int say(const uint8_t *frame, size_t len)
 {
     int ends[2];
@@ -59,7 +61,7 @@ static int say(const uint8_t *frame, size_t len)
     return ends[1];
 }
 
-/* Its output. */
+/* Read the bytes that libmodbus sent, and close the sockets; return the number of bytes. */
 static ssize_t hear(int end, uint8_t *out)
 {
     shutdown(modbus_get_socket(peer), SHUT_WR);
@@ -119,7 +121,7 @@ static void judge_request(const char *text)
     show_changes();
 }
 
-/* Ask; how many values there are now, or -1. */
+/* Let libmodbus make a request as a client; return the number of values in the reply, or -1. */
 static int ask(int function, int start, int count, const uint8_t *data, uint8_t *bits, uint16_t *words)
 {
     for (int i = 0; i < count && function == 0x0F; i++)
@@ -167,7 +169,7 @@ int main(void)
     map = modbus_mapping_new(CELLS, CELLS, CELLS, CELLS);
     if (!peer || !map)
         return 1;
-    modbus_set_response_timeout(peer, 0, 1000); /* it sleeps so long before it says exception 03 */
+    modbus_set_response_timeout(peer, 0, 1000); /* it sleeps for this time before a reply with exception 03 */
     fill();
     while (fgets(line, sizeof line, stdin)) {
         if (sscanf(line, "request %s", first) == 1)

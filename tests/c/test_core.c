@@ -1,4 +1,4 @@
-/* The C core against the documents' frames and against hostile lengths, without any framework.
+/* Test the C core with the frames that manuals print, and with hostile lengths, without a test framework.
  *
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
  *      -Icsrc tests/c/test_core.c csrc/{body,frame,tap,line,reply,tcp,late,stats,columns}.c \
@@ -9,10 +9,10 @@
 #include "checks.h"
 #include "line.h"
 
-/* ---- the documents' frames ---- */
+/* ---- frames printed in manuals ---- */
 
 struct frame {
-    int framing, is_reply, result; /* what parsing the whole must return */
+    int framing, is_reply, result; /* result: expected from parsing the whole frame */
     uint8_t bytes[MD_MOST_FRAME];
     size_t len;
 };
@@ -26,7 +26,7 @@ static int parse(const struct frame *frame, const uint8_t *bytes, size_t len,
                            : md_parse_request(frame->framing, edge, len, &found);
 }
 
-/* Whole, byte by byte, with bytes after it, and with each of its bits wrong. */
+/* Parse a frame whole, byte by byte, followed by other bytes, and with each of its bits inverted. */
 static void check_parse(const struct frame *frame, const struct md_message *request)
 {
     uint8_t bytes[MD_MOST_FRAME + 3];
@@ -36,7 +36,7 @@ static void check_parse(const struct frame *frame, const struct md_message *requ
     for (size_t len = 0; len < frame->len; len++) {
         int used = parse(frame, bytes, len, request);
         CHECK(used == MD_INCOMPLETE || (used < 0 && used == frame->result));
-        CHECK(used || !refused); /* a refusal is final */
+        CHECK(used || !refused); /* after a refusal, more bytes do not change it */
         refused = used;
     }
     for (size_t more = 0; more <= 3; more++)
@@ -58,14 +58,14 @@ static void send(struct md_line *line, const struct md_exchange *exchange, struc
     md_line_sent(line, line->tx_len, exchange->silence_ns, exchange->silence_ns);
 }
 
-/* Through the line, in pieces of `step` bytes, behind junk: found, and the junk counted. */
+/* Check that a line finds the frame after junk, in pieces of `step` bytes, and counts the junk. */
 static void check_line(const struct frame *frame, const struct md_message *request, const uint8_t *junk,
                        size_t junk_len, size_t step)
 {
     static struct md_line line;
     static struct md_completion completion;
     struct md_history history = {0};
-    /* For other exchanges than proofs the list of proofs is not read. */
+    /* `proofs` is NULL: only exchanges that are proofs may read the list. */
     struct md_drive drive = {.least_timeout_ns = 1000000, .most_timeout_ns = 1000000, .history = &history,
                              .proofs = NULL, .proof_count = MD_MOST_PROOFS};
     struct md_exchange exchange = {.framing = frame->framing, .request = *request, .character_ns = 1000,
@@ -92,10 +92,10 @@ static void check_behind_junk(const struct frame *frame, const struct md_message
     for (size_t junk_len = 0; junk_len <= sizeof junk; junk_len++)
         for (size_t step = 1; step <= 64; step *= 4)
             check_line(frame, request, junk, junk_len, step);
-    check_line(frame, request, frame->bytes, 2, 1); /* the start of a reply, then the reply */
+    check_line(frame, request, frame->bytes, 2, 1); /* the junk is the start of a reply */
 }
 
-/* "01 03 ..." or ":0103...\r\n" (spelt out) to bytes. */
+/* Convert "01 03 ..." or ":0103...\r\n" (with escapes) to bytes. */
 static size_t read_bytes(const char *text, uint8_t *bytes)
 {
     size_t len = 0;
@@ -109,7 +109,7 @@ static size_t read_bytes(const char *text, uint8_t *bytes)
     return len;
 }
 
-/* A reply belongs to the nearest well-formed request above it. */
+/* A reply in the file belongs to the last well-formed request before it. */
 static void check_documents(const char *path)
 {
     char text[512], model[32], framing[16], direction[16], bytes[256], verdict[32];
@@ -140,7 +140,7 @@ static void check_documents(const char *path)
         CHECK(md_build_request(frame.framing, &request, built, sizeof built) == (int)frame.len);
         CHECK(memcmp(built, frame.bytes, frame.len) == 0);
         CHECK(md_build_request(frame.framing, &request, built, frame.len - 1) == MD_BAD_REQUEST);
-        if (request.data_len && request.count == 0) { /* a write of one value is answered with its copy */
+        if (request.data_len && request.count == 0) { /* the reply repeats the written value */
             frame.is_reply = frame.framing != MD_DELIXI || request.function != 0x07;
             check_parse(&frame, &request);
         }
@@ -245,12 +245,12 @@ static void check_builders(void)
     }
 }
 
-/* ---- the first byte that decides ---- */
+/* ---- the first byte at which the result is known ---- */
 
 static const struct {
-    const char *name, *bytes; /* only the last one decides */
+    const char *name, *bytes; /* the result is known at the last byte, not before */
     int framing, result;
-    struct md_message request; /* none: the bytes are a request's */
+    struct md_message request; /* empty: the bytes are a request */
 } verdicts[] = {
     {"no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {0}},
     {"no function, as text", ":012B", MD_ASCII, MD_BAD_FUNCTION, {0}},
@@ -313,7 +313,7 @@ static void check_verdicts(void)
     }
 }
 
-/* A request that was never built: its count may be anything, but no reply may overrun the message. */
+/* For a request with an impossible count, parsing a reply must not write beyond the message's data. */
 static void check_impossible_counts(void)
 {
     static const uint8_t functions[] = {1, 2, 3, 4, 5, 6, 8, 0x0F, 0x10, 0x17, 0x83};

@@ -1,4 +1,4 @@
-/* Ports come and go on one engine while it carries exchanges out, on several threads of clients at once. */
+/* Several threads open and close ports on one engine while it carries out exchanges. */
 #include "internal.h"
 
 #include <assert.h>
@@ -15,7 +15,7 @@ static struct md_engine *engine;
 static struct md_row_queue *row_queue;
 static int is_over;
 
-/* A silent drive, and its read. */
+/* A drive that never replies, and an exchange that reads from it. */
 struct subject {
     struct md_history history;
     struct md_drive drive;
@@ -31,7 +31,7 @@ static void make(struct subject *subject)
     subject->exchange.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
 }
 
-/* Open a port, have it ask, take the place of another drive, and close it, again and again. */
+/* Repeatedly open a port, carry out exchanges, replace the drive by a second one, and close the port. */
 static void *come_and_go(void *argument)
 {
     uint32_t number = *(uint32_t *)argument;
@@ -50,7 +50,7 @@ static void *come_and_go(void *argument)
         assert(port);
         md_port_report(port, row_queue, number);
         md_port_submit(port, queued, at_once, QUEUED);
-        if (i % 3) /* else it is closed while it asks */
+        if (i % 3) /* otherwise the port is closed during an exchange */
             while (md_port_is_asking(port, &first.drive))
                 usleep(100);
         md_port_inherit(port, &second.drive, &first.drive);
@@ -71,7 +71,7 @@ static void *come_and_go(void *argument)
     return NULL;
 }
 
-/* The thread of a poller, at the same time. */
+/* The thread that takes rows, as a poller's consumer does, at the same time. */
 static void *take_calls(void *argument)
 {
     (void)argument;
@@ -81,8 +81,8 @@ static void *take_calls(void *argument)
     return NULL;
 }
 
-/* A program may have given SIGPIPE its default back, which is its death: a far end that is gone ends the port
- * alone. */
+/* Check that writing to a closed socket loses only the port, even if the program restored the default action
+ * of SIGPIPE, which kills a process. */
 static void check_a_broken_pipe_is_a_lost_port(void)
 {
     struct subject subject;

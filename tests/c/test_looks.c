@@ -1,10 +1,10 @@
-/* With any number of ports, a port is read once for an exchange if the silence before the next request is
- * over at once. */
+/* With any number of ports, the engine reads a port only once per exchange if it can send the next request
+ * immediately. */
 #include <unistd.h>
 
 static ssize_t counted(int fd, void *bytes, size_t room);
 #define read counted
-#define send send_request /* it is static there, and of another type than the system's */
+#define send send_request /* the included file has a static function send() that differs from the system's */
 #include "port.c"
 #undef send
 #undef read
@@ -26,7 +26,7 @@ static ssize_t counted(int fd, void *bytes, size_t room)
     return read(fd, bytes, room);
 }
 
-/* Answer EXCHANGES requests at once. */
+/* Answer EXCHANGES requests immediately. */
 static void *answer(void *argument)
 {
     int fd = *(int *)argument;
@@ -38,7 +38,7 @@ static void *answer(void *argument)
         ssize_t put = write(fd, frame, (size_t)length);
         assert(got == REQUEST && put == length);
     }
-    ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL); /* the client has all replies by now */
+    ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL); /* now the client has all replies */
     assert(got == REQUEST);
     return NULL;
 }
@@ -68,7 +68,7 @@ int main(void)
     md_port_repeat(ports[0], round, 1);
     pthread_join(drives, NULL);
     int found = atomic_load(&reads);
-    assert(found <= EXCHANGES + 1); /* and one look before the first request */
+    assert(found <= EXCHANGES + 1); /* and one read before the first request */
 
     for (int i = 0; i < PORTS; i++) {
         md_port_stop(ports[i]);

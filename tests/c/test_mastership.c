@@ -1,5 +1,5 @@
-/* The core checks CLOCK_BOOTTIME right before each write(2); results of requests that must not leave.
- * Clock and write(2) are the test's; the engine, its thread and the kernel's timer are real. */
+/* The core checks CLOCK_BOOTTIME right before each write(2), and does not send requests without mastership.
+ * This test replaces the clock and write(2); the engine, its thread and the kernel's timer are real. */
 #define _GNU_SOURCE
 #include <signal.h>
 #include <stdint.h>
@@ -18,7 +18,7 @@ static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #undef clock_gettime
 #include "rs485.c"
 #undef write
-#define send send_request /* it is static there, and of another type than the system's */
+#define send send_request /* the included file has a static function send() that differs from the system's */
 #include "port.c"
 #undef send
 
@@ -30,11 +30,11 @@ static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #include <sys/socket.h>
 
 enum { REQUEST = 8, MS = 1000000 };
-static const int64_t BEGIN_NS = INT64_C(5000) * MD_SECOND_NS; /* no machine here runs for so short a time */
+static const int64_t BEGIN_NS = INT64_C(5000) * MD_SECOND_NS; /* unlike the real clock's time */
 
 static _Atomic int64_t boottime_ns;
 static atomic_int looks, looks_written, written, most_written;
-static _Atomic int64_t passes_ns; /* while a part of a request is written */
+static _Atomic int64_t passes_ns; /* time by which the clock advances in each write */
 
 static int told_clock(clockid_t clock, struct timespec *now)
 {
@@ -44,7 +44,7 @@ static int told_clock(clockid_t clock, struct timespec *now)
     return 0;
 }
 
-/* A clock that stops while the machine sleeps would kill too late; only this assertion shows it. */
+/* The timer must use CLOCK_BOOTTIME: other clocks stop while the machine sleeps, and would kill too late. */
 static int made_timer(clockid_t clock, struct sigevent *event, timer_t *timer)
 {
     assert(clock == CLOCK_BOOTTIME);
@@ -78,7 +78,7 @@ static struct md_completion carry_out(const struct md_exchange *exchange)
 {
     struct md_completion found;
     md_engine_enter(port->engine);
-    drive.owed_count = 0; /* else late replies would hold the next one back */
+    drive.owed_count = 0; /* otherwise late replies would delay the next request */
     drive.late_until_ns = 0;
     md_engine_leave(port->engine);
     atomic_store(&written, 0);
@@ -90,7 +90,7 @@ static void make(void)
 {
     reading.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
     stop = reading;
-    stop.drive = &other; /* whose late reply holds no reading back */
+    stop.drive = &other; /* a late reply of `other` delays no reading of `drive` */
     stop.insists = 1;
     atomic_store(&boottime_ns, BEGIN_NS);
     atomic_store(&most_written, 1000);
@@ -115,7 +115,7 @@ static void check_unsent(const struct md_exchange *exchange)
     uint32_t failures = drive.failures;
     struct md_completion found = carry_out(exchange);
     assert(found.result == MD_NOT_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
-    assert(drive.failures == failures); /* not a failure of the drive */
+    assert(drive.failures == failures); /* does not count as a failure of the drive */
 }
 
 static int64_t left_of_timer(void)
@@ -132,7 +132,7 @@ static int64_t real_boottime_ns(void)
     return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
 }
 
-/* Hold for so long by the test's clock; the kernel's timer goes by its own, an hour ahead. */
+/* Extend the mastership by `ns` of the test's clock; set the kernel's timer to an hour of the real clock. */
 static void extend(int64_t ns)
 {
     int64_t kill_ns = real_boottime_ns() + 3600 * MD_SECOND_NS;
@@ -152,13 +152,13 @@ static void check_listens_no_more(void)
 {
     struct md_completion found;
     int tries = 0;
-    do /* a busy machine may hold one up for as long */
+    do /* a busy machine may delay an exchange as long as listening would */
         found = carry_out(&reading);
     while (found.sent_ns - found.begun_ns >= 30 * MS && tries++ < 20);
     assert(found.sent_ns - found.begun_ns < 30 * MS);
 }
 
-/* 256 characters of 0.1 ms, and 5 ms. */
+/* A new master listens for 256 characters of 0.1 ms, and 5 ms, before its first request. */
 static void check_listens_first(void)
 {
     struct md_completion found = carry_out(&reading);
@@ -166,7 +166,7 @@ static void check_listens_first(void)
     check_listens_no_more();
 }
 
-/* Without a request during the gap: another process may still have been the master. */
+/* Listen again after a gap in mastership, even if it had no request: another process may have been master. */
 static void check_listens_after_a_lapse(void)
 {
     extend(1000);
@@ -176,11 +176,11 @@ static void check_listens_after_a_lapse(void)
     md_mastership_end(mastership);
     extend(1000);
     check_listens_first();
-    extend(2000); /* before its end: no gap for another master */
+    extend(2000); /* extended before its end: no gap */
     check_listens_no_more();
 }
 
-/* A master before us may send for so long. */
+/* Wait for guard_ns before the first request, because the previous master may send for this time. */
 static void check_guard_comes_first(void)
 {
     md_mastership_end(mastership);
@@ -203,7 +203,7 @@ static void check_deadline(void)
     check_unsent(&stop);
 }
 
-/* A part has left when it is too late: the rest does not follow. */
+/* If the mastership ends after a part of a request was written, the rest is not written. */
 static void check_rest_is_held_back(void)
 {
     extend(1000);
@@ -217,7 +217,7 @@ static void check_rest_is_held_back(void)
     atomic_store(&most_written, 1000);
 }
 
-/* ---- another master is there ---- */
+/* ---- another master sends on the line ---- */
 
 static void check_all_foreign_bytes_are_counted(void)
 {
@@ -225,7 +225,7 @@ static void check_all_foreign_bytes_are_counted(void)
     md_listen_receive(&line, 3, 10);
     md_listen_receive(&line, 4, 20);
     assert(line.foreign == 7 && line.listened_ns == 25);
-    line.transactions = 1; /* a late reply to this process */
+    line.transactions = 1; /* now foreign bytes may be a late reply to this process */
     md_listen_receive(&line, 3, 30);
     assert(line.foreign == 7 && line.listened_ns == 25);
 }
@@ -263,13 +263,13 @@ static void check_other_master(void)
     pthread_t other, reader;
     struct md_completion found, stopped;
     extend(MD_SECOND_NS);
-    reading.character_ns = 2 * MS; /* it listens for half a second; the other port must not wait for that */
+    reading.character_ns = 2 * MS; /* it listens for half a second */
     atomic_store(&is_babbling, 1);
     pthread_create(&other, NULL, babble, NULL);
     found = carry_out(&reading);
     assert(found.result == MD_OTHER_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
     assert(found.raw_len > 0 && md_port_progress(port)->foreign > 0);
-    stopped = carry_out(&stop); /* it is not held up */
+    stopped = carry_out(&stop); /* a stop does not listen */
     assert(stopped.sent_ns && stopped.sent_ns - stopped.begun_ns < 300 * MS);
     assert(atomic_load(&written) == REQUEST);
     found = carry_out(&reading);
@@ -279,9 +279,9 @@ static void check_other_master(void)
     uint8_t rest[256];
     while (recv(ends[1], rest, sizeof rest, MSG_DONTWAIT) > 0)
         ;
-    check_sent(&reading); /* it has been silent */
+    check_sent(&reading); /* the other master is silent now */
 
-    /* a stop that comes while another request listens goes first, and that one follows */
+    /* a stop is sent while the reading still listens; the reading is sent afterwards */
     md_mastership_end(mastership);
     check_unsent(&reading);
     extend(MD_SECOND_NS);
@@ -304,12 +304,12 @@ int main(void)
     mastership = md_mastership_new(0);
     assert(mastership);
     md_port_fence(port, mastership);
-    check_unsent(&reading); /* it was never extended */
+    check_unsent(&reading); /* the mastership was never extended */
     check_unsent(&stop);
     extend(1000);
     check_sent(&stop);
     check_listens_first();
-    md_port_fence(port, mastership); /* as if by another, of as many terms */
+    md_port_fence(port, mastership); /* fenced again: listen again */
     check_listens_first();
     check_listens_after_a_lapse();
     check_guard_comes_first();

@@ -1,4 +1,4 @@
-/* The time of a row is that of its exchange, on clocks that are the test's own. */
+/* A row's time is that of its exchange, also if the wall clock is set. The clocks are the test's own. */
 #include "internal.h"
 
 #include <assert.h>
@@ -25,9 +25,9 @@ int main(void)
     struct md_row_queue *row_queue = md_row_queue_new(ROWS, 1);
     assert(row_queue);
     for (int64_t n = 0; n < ROWS; n++) {
-        ahead_ns = n < ROWS / 2 ? 1000 : 7000; /* the time of day is set, or the machine slept */
+        ahead_ns = n < ROWS / 2 ? 1000 : 7000; /* half-way, the time of day is set, or the machine slept */
         struct md_completion completion = {.result = MD_NO_REPLY, .begun_ns = (n + 1) * every_ns};
-        if (n == ROWS / 2) { /* it left before that, and its time-out is over now */
+        if (n == ROWS / 2) { /* this request was sent before the clock change, and timed out after it */
             completion.sent_ns = completion.begun_ns;
             completion.utc_ahead_ns = 1000;
         }

@@ -1,4 +1,4 @@
-/* Columns, names and packets of the C core, without any framework: built and run as test_core.c is. */
+/* Test columns, names and packets of the C core, without a test framework; built and run like test_core.c. */
 #include "checks.h"
 #include "internal.h"
 
@@ -105,10 +105,10 @@ static void check_spelling(void)
     CHECK(md_spell(codes, 4, names, offsets, NAMES - 1, ends, page_end() - 10, 10) == -1);
 }
 
-/* Packets as the pcapng draft has them, out of a ring whose end they cross; what finds no room is counted. */
+/* Check that packets match the pcapng draft, also across the ring's end, and that lost bytes are counted. */
 static void check_tap(void)
 {
-    enum { ROOM = 64, LEN = 5, SIZE = 28 + 8 + 4 + 4 }; /* head and bytes are 8 together, the tail 4 */
+    enum { ROOM = 64, LEN = 5, SIZE = 28 + 8 + 4 + 4 }; /* a packet: 28 + 8 (head and bytes) + 4 (tail) + 4 */
     static const uint8_t said[] = {'a', 'b', 'c', 'd', 'e'};
     static const uint8_t packet[SIZE] = {
         6, 0, 0, 0, SIZE, 0, 0, 0, 7, 0, 0, 0, 1, 0, 0, 0, 105, 0, 0, 0, 8, 0, 0, 0, 8, 0, 0, 0,
@@ -122,7 +122,7 @@ static void check_tap(void)
     struct md_tap tap = {.ring = ring, .room = ROOM};
     row = "tap";
     for (int round = 0; round < 100; round++) {
-        for (int n = 0; n < 4; n++) /* each takes 21 bytes of the ring: three fit */
+        for (int n = 0; n < 4; n++) /* each takes 21 bytes of the ring, so three fit */
             md_tap_put(&tap, MD_ANSWERING, INT64_C(0x100000000), said, LEN);
         CHECK(tap.lost == (uint64_t)LEN * (uint64_t)(round + 1));
         for (int n = 0; n < 3; n++) {

@@ -1,5 +1,5 @@
-/* When the transceiver's direction changes, against a UART and a clock of our own: what the driver is asked,
- * and what is written, comes here. */
+/* Check when the transceiver's direction changes. This test replaces the clock, the serial driver's calls and
+ * write(2), and simulates the UART. */
 #define _GNU_SOURCE
 #include "checks.h"
 #include "engine.h"
@@ -15,14 +15,14 @@ enum { CHARACTER_NS = 1145833, FD = 1000 }; /* 9600 8N1 */
 
 static struct {
     int64_t now_ns;
-    int64_t start_ns;   /* from a write to its first bit */
+    int64_t start_ns;   /* delay from a write to its first bit */
     int64_t percent;    /* actual time of a character, relative to the nominal one */
-    int64_t end_ns;     /* the last bit has left */
-    int64_t changed_ns; /* RTS was set last */
+    int64_t end_ns;     /* when the last bit has been sent */
+    int64_t changed_ns; /* when RTS was changed last */
     int is_up, changes, writes_while_receiving;
     int sending_level, takes, rings, keeps;
     int reports_end, rts_error, write_error;
-    int has_mode, is_deaf;  /* the driver has an RS-485 mode, and does not take it */
+    int has_mode, is_deaf;  /* the driver has an RS-485 mode; it ignores the request to use it */
     uint32_t flags;
 } uart;
 
@@ -91,14 +91,14 @@ int ioctl(int fd, int request, ...)
     case TIOCSERGETLSR:
         *(unsigned *)argument = is_left ? TIOCSER_TEMT : 0;
         return uart.reports_end ? 0 : refuse(ENOTTY);
-    case TIOCOUTQ: /* its shift register is not counted */
+    case TIOCOUTQ: /* does not count the character in the shift register */
         *(int *)argument = uart.now_ns + CHARACTER_NS < uart.end_ns;
         return 0;
     case TIOCGRS485:
     case TIOCSRS485:
         return mode_of_driver((unsigned long)request, argument);
     default:
-        CHECK(request == TIOCOUTQ); /* the core makes no other calls */
+        CHECK(request == TIOCOUTQ); /* the core makes no other ioctl */
         return refuse(ENOTTY);
     }
 }
@@ -127,13 +127,13 @@ static struct md_port *new_port(int mode, int reports_end)
     uart.percent = 100;
     uart.takes = 1000;
     uart.sending_level = mode != MD_RS485_RTS_DOWN;
-    uart.is_up = 1; /* as open() leaves it */
+    uart.is_up = 1; /* open() raises RTS */
     uart.reports_end = reports_end;
     CHECK(md_rs485_begin(&port, mode) == 0);
     return &port;
 }
 
-/* Look whenever that is wanted, until the transceiver receives. */
+/* Call md_rs485_look() at each time it asks for, until the transceiver receives; return its failure or 0. */
 static int look_until_received(struct md_port *port)
 {
     for (int looks = 0; looks < 10000 && port->rs485.is_sending; looks++) {
@@ -151,7 +151,7 @@ static void check_direction(void)
     static const struct {
         const char *row;
         int mode, reports_end, len;
-        int64_t start_ns, percent, most_ns; /* RTS falls so much later than the last bit */
+        int64_t start_ns, percent, most_ns; /* most_ns: limit from the last bit to the change of RTS */
     } rows[] = {
         {"an UART that tells its end", MD_RS485_RTS_UP, 1, 8, 0, 100, 0},
         {"RTS off while sending", MD_RS485_RTS_DOWN, 1, 8, 0, 100, 0},
@@ -166,7 +166,7 @@ static void check_direction(void)
     for (size_t i = 0; i < COUNT(rows); i++) {
         row = rows[i].row;
         struct md_port *port = new_port(rows[i].mode, rows[i].reports_end);
-        CHECK(uart.is_up != uart.sending_level); /* the bus is free from the start */
+        CHECK(uart.is_up != uart.sending_level); /* at first the transceiver receives */
         CHECK(uart.keeps == (rows[i].mode == MD_RS485_RTS_DOWN));
         uart.start_ns = rows[i].start_ns;
         uart.percent = rows[i].percent;
@@ -194,7 +194,7 @@ static void check_parts(void)
     int before = uart.changes;
     for (int at = 0; at < 64;) {
         at += (int)md_rs485_write(port, frame + at, (size_t)(64 - at));
-        uart.now_ns = uart.end_ns + 5 * CHARACTER_NS; /* the next part is late: RTS must not fall between */
+        uart.now_ns = uart.end_ns + 5 * CHARACTER_NS; /* late, but RTS must not change */
         CHECK(md_rs485_look(port, uart.now_ns) == 0 && uart.is_up);
     }
     port->turn.line.state = MD_AWAITING;
@@ -276,7 +276,7 @@ static void check_driver(void)
         uart.flags = rows[i].before;
         CHECK(md_rs485_begin(port, MD_RS485_KERNEL) == rows[i].result);
         CHECK(uart.flags == rows[i].after);
-        CHECK(md_rs485_write(port, frame, 8) == 8 && uart.changes == 0); /* RTS is the driver's */
+        CHECK(md_rs485_write(port, frame, 8) == 8 && uart.changes == 0); /* the driver switches RTS */
         row = "";
     }
 }

@@ -1,4 +1,4 @@
-/* The thread spins for the end of a silence before queued requests, but not for a waiting client. */
+/* The engine's thread spins at the end of a silence before a queued request, and sleeps before a client's. */
 #include "internal.h"
 
 #include <assert.h>
@@ -10,11 +10,11 @@
 
 enum {
     BY_HAND = 50, MOST_TRIES = 500,
-    FEW = 60 /* clock readings in an exchange; spinning makes some thirty per microsecond */
+    FEW = 60 /* limit of clock readings per exchange without spinning, which makes about 30 per us */
 };
 static const int64_t SILENCE_NS = 3000000, TIMEOUT_NS = INT64_C(5000000000);
 
-/* ---- in place of clock.c ---- */
+/* ---- replaces clock.c ---- */
 
 static atomic_int looks;
 
@@ -37,7 +37,7 @@ int64_t md_utc_ahead_ns(int64_t now_ns)
     return 0;
 }
 
-/* ---- a drive that answers at once ---- */
+/* ---- a drive that answers immediately ---- */
 
 static void *answer(void *argument)
 {

@@ -14,7 +14,7 @@
 static int has_pwait2;
 static int64_t asked_ns;
 
-/* epoll_pwait2(fd, events, most, span, signals, size), the one call that is made by its number */
+/* epoll_pwait2(fd, events, most, span, signals, size): the only system call that is made by number */
 long syscall(long number, ...)
 {
     va_list arguments;
@@ -32,7 +32,7 @@ long syscall(long number, ...)
 int ppoll(struct pollfd *fds, nfds_t count, const struct timespec *span, const sigset_t *signals)
 {
     (void)fds, (void)count, (void)signals;
-    assert(!has_pwait2); /* else it would be a call more */
+    assert(!has_pwait2); /* epoll_pwait2() makes another call unnecessary */
     asked_ns = span ? span->tv_sec * INT64_C(1000000000) + span->tv_nsec : -1;
     return 0;
 }

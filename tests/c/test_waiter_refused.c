@@ -17,7 +17,7 @@
 
 enum { SKIPPED = 77 };
 
-/* Let the call fail with this error in this process from now on; 0: not possible here. */
+/* Make epoll_pwait2() fail with this error in this process from now on; return 0 if that is not possible. */
 static int refuse(unsigned call, unsigned error)
 {
     struct sock_filter filter[] = {
@@ -68,7 +68,7 @@ static int try_without(unsigned error)
 
 int main(void)
 {
-    wait_for_both(); /* by whichever call this system has */
+    wait_for_both(); /* with the calls that this system has */
     static const unsigned errors[] = {ENOSYS, EPERM};
     for (size_t i = 0; i < sizeof errors / sizeof *errors; i++) {
         int status;

@@ -13,7 +13,7 @@ static const int64_t SILENCE_NS = 50000000, EARLY_NS = 80000, TIMEOUT_NS = INT64
 
 static atomic_int rings;
 
-/* ---- in place of wakeup.c ---- */
+/* ---- replaces wakeup.c ---- */
 
 int md_wakeup_make(struct md_wakeup *wakeup)
 {
@@ -41,7 +41,7 @@ void md_wakeup_silence(struct md_wakeup *wakeup)
     (void)!read(wakeup->fd, &byte, 1);
 }
 
-/* ---- a drive that answers at once ---- */
+/* ---- a drive that answers immediately ---- */
 
 static void *answer(void *argument)
 {
@@ -55,7 +55,7 @@ static void *answer(void *argument)
     return NULL;
 }
 
-/* Carry one out; return how often the thread was rung for it. */
+/* Carry out an exchange; return how often the client woke the engine's thread for it. */
 static int asked(struct md_port *port, const struct md_exchange *exchange, struct md_completion *found)
 {
     int before = atomic_load(&rings);
@@ -83,8 +83,8 @@ int main(void)
     struct md_port *port = md_port_open(engine, ends[0], -1, MD_NO_TRANSACTIONS, 4);
     assert(port);
 
-    /* A client that is back before the line is silent finds the thread about to wake. One that was held up
-     * for as long rings, and its request is not taken up before. */
+    /* A client whose next request comes during the silence need not wake the thread, which wakes at its end
+     * anyway. A client that is delayed for longer than the silence wakes the thread. */
     struct md_completion before, found;
     asked(port, &exchange, &before);
     int unrung = 0;
@@ -98,8 +98,8 @@ int main(void)
         before = found;
     }
 
-    /* Nobody looks at a line that has been silent for long: the thread is woken, and sends at once. On a busy
-     * machine it may not have come to rest yet. */
+    /* If a line has been silent for long, the thread sleeps: the client wakes it, and it sends immediately.
+     * On a busy machine the thread may still be awake. */
     int rung = 0;
     for (int tries = 0; rung == 0; tries++) {
         assert(tries < MOST_TRIES);

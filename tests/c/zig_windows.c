@@ -1,6 +1,6 @@
-// Names that the core needs of zig's own libraries for Windows (winpthreads, and what begins a DLL). A link
-// has these in their place: to compile the libraries takes zig two minutes. Their headers declare them, and
-// each wheel is linked with the libraries.
+// Defines the names that the core needs from zig's libraries for Windows (winpthreads, and the start code of
+// a DLL). A test link uses this file instead, because zig needs two minutes to compile the libraries. Their
+// headers declare the names, and each wheel is linked with the libraries.
 
 #define NAME(name) \
     void name(void); \

@@ -199,7 +199,7 @@ OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024
 
 @pytest.mark.slow
 def test_a_capture_truncated_during_reading_is_a_sentence(tmp_path: Path) -> None:
-    """A separate process reads it: if the file were mapped, reading past its new end would kill the process."""
+    """A separate process reads it: if the file were mapped, reading past its end would kill the process."""
     path = write(tmp_path / "it.pcapng", RTU * 20)
     code = (
         "import os, sys\nfrom multidrop.capture import Capture, CaptureError\n"

@@ -39,7 +39,7 @@ NEVER_ON_THE_LINE = {str(each) for each in (Status.NOT_ASKED, Status.LATE_ANSWER
 
 
 class RoughWire(LateWire):
-    """At random, adds noise before and after replies, and damages, truncates, loses, doubles or delays them."""
+    """At random, adds noise around replies, and damages, truncates, loses, doubles or delays replies."""
 
     def __init__(self, seed: int) -> None:
         super().__init__([EncodedDrive(drive) for drive in fast_drives()], unpaced=True)

@@ -1,7 +1,7 @@
 /* Shared by the C fuzz harnesses: assertions, and the position of line bytes (frames or noise) in an input.
  *
- * A harness defines LLVMFuzzerTestOneInput and find_wire. mutator.c mutates inputs and repairs the frame at the
- * position that find_wire returns: otherwise most mutants would have wrong byte counts and checksums. */
+ * A harness defines LLVMFuzzerTestOneInput and find_wire. mutator.c mutates inputs and repairs the frame at
+ * the position that find_wire returns: otherwise most mutants would have wrong byte counts and checksums. */
 #ifndef FUZZ_H
 #define FUZZ_H
 
@@ -27,8 +27,8 @@ struct wire {
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-/* Select line bytes in the input by `seed`; return 0 if there are none. May repair bytes around them, such as
- * lengths. */
+/* Select line bytes in the input by `seed`; return 0 if there are none. May repair bytes around them, such
+ * as lengths. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire);
 
 /* Return a copy in memory of exactly this size, so that sanitizers detect over-reads. The caller frees it. */

@@ -1,7 +1,7 @@
 /* Pass hostile capture files through the reader of packets, the splitter and the decoder to columns.
  *
- * An input is a byte with the kind of file, link type and clock, a byte with the size of buffers, and the file's
- * packets: pcap without its header, or pcapng. */
+ * An input is a byte with the kind of file, link type and clock, a byte with the size of buffers, and the
+ * file's packets: pcap without its header, or pcapng. */
 #include "fuzz.h"
 
 enum { HEADER = 2, MOST = 4096, ROWS = 64, PLACES = 16, CHANNELS = 2, PCAP_RECORD = 16, PCAPNG_HEAD = 28,

@@ -1,4 +1,4 @@
-/* Hostile replies and field declarations for the decoder of values, and hostile codes for the speller of names.
+/* Hostile replies and field declarations for the decoder of values, and hostile codes of names.
  *
  * An input is a header (result, room, and so on), four fields of a block, and the reply's data. */
 #include "fuzz.h"

@@ -26,7 +26,7 @@ static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size
         int used = parse(framing, exact, have, request, &out);
         free(exact);
         must(used <= (int)have);
-        must(used <= 0 || used == (int)have || used == decided); /* a frame is accepted with its last byte, not later */
+        must(used <= 0 || used == (int)have || used == decided); /* accepted at its last byte */
         must(decided == MD_INCOMPLETE || used == decided || (used < 0 && decided < 0));
         must(used != MD_BAD_REQUEST && used >= MD_BAD_ECHO);
         decided = used;

@@ -1,8 +1,8 @@
 /* Feed the state machine of a line with any bytes at any time in any order.
  *
- * An input is a header (adapter, time-outs) and steps: an exchange starts, time passes, the port takes bytes or
- * fails, noise comes, or a drive's reply comes: immediately, late, in pieces, damaged, doubled, or never. Each
- * reply has the number of its exchange as its value, so that a reply taken for another exchange's is detected.
+ * An input is a header (adapter, time-outs) and steps: an exchange starts, time passes, the port takes bytes
+ * or fails, noise comes, or a drive's reply comes: immediately, late, in pieces, damaged, doubled, or never.
+ * The value in a reply is the number of its exchange, so a reply taken for another exchange's is detected.
  * A character takes 1 ns, so that all times are small. */
 #include "fuzz.h"
 
@@ -29,13 +29,13 @@ struct scene {
     struct md_exchange exchange;
     int is_under_way, has_asked, adapter_echoes, is_spoiled;
     int number; /* number of the exchange */
-    int64_t now, begun, ends; /* present time; start of the exchange, and the time by which it must have ended */
+    int64_t now, begun, ends; /* present time; start of the exchange; when it must have ended */
     int64_t last_heard, silence; /* last activity on the line, and the silence required after it */
     /* numbers of received bytes: before the exchange, before its request was sent, and after that */
     size_t left_over, before, after;
     struct answer answers[ANSWERS];
     uint64_t exchanges[DRIVES];
-    int16_t origin[HEARD]; /* for each byte after the request: number of the exchange whose reply it belongs to */
+    int16_t origin[HEARD]; /* of each byte after the request: number of the replied exchange */
     uint8_t heard[HEARD];
     struct md_tap tap;
     /* how often each byte value went over the line: according to the tap, and in fact */
@@ -95,7 +95,7 @@ static void check_completion(void)
     const struct md_exchange *exchange = &scene.exchange;
     size_t used = done->result > 0 ? (size_t)done->result : 0;
     must(done->begun_ns == scene.begun && done->raw_len <= sizeof done->raw);
-    /* Every byte is part of the reply or counted. Bytes received while the request was sent may be its echo. */
+    /* Every byte is part of the reply or counted. Bytes received during sending may be the request's echo. */
     must(done->stale + done->skipped + used == scene.left_over + scene.before + scene.after);
     must(done->skipped + used >= scene.after && done->skipped + used <= scene.after + scene.line.tx_len);
     must((done->sent_ns != 0) == scene.has_asked || done->result == MD_LINE_LOST);
@@ -115,7 +115,7 @@ static void check_completion(void)
         must(exchange->request.address == 0 && scene.after == 0);
     else
         must((done->result >= MD_EXPIRED || done->result == MD_MAYBE_ECHO) && done->reply.address == 0);
-    if (done->result == MD_NO_REPLY) /* `raw` is empty or the request's echo, without replies of other drives */
+    if (done->result == MD_NO_REPLY) /* `raw` has nothing but the request's echo, if any */
         must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
 }
 
@@ -433,7 +433,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* Select noise, which becomes a frame: a request, or the reply to the last exchange that started before it. */
+/* Select noise to become a frame: a request, or the reply to the last exchange that started before it. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t found = 0, at = HEADER, used = 0;

@@ -38,7 +38,7 @@ def loop() -> ControlledLoop:
 
 
 def read_requests(path: Path) -> None:
-    """Parse and answer the requests in a stream, whose first byte is the size of the pieces in which it comes."""
+    """Parse and answer the requests in a file, whose first byte is the size of the pieces to pass on."""
     data = path.read_bytes()
     size, stream = (data[:1] or b"\1")[0] % 64 + 1, data[1:]
     found = list(taken(stream, size))

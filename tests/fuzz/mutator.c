@@ -1,7 +1,7 @@
 /* The mutator of all C harnesses: mutates, then repairs lengths, byte counts and checksums of frames.
  *
- * It repairs only the fields that a receiver checks first, so that mutated frames pass these checks. Sometimes it
- * leaves one of these fields wrong, to test the handling of a frame with a single mistake. */
+ * It repairs only the fields that a receiver checks first, so that mutated frames pass these checks.
+ * Sometimes it leaves one of these fields wrong, to test the handling of a frame with a single mistake. */
 #include "fuzz.h"
 
 enum { MOST_BODY = 260 }; /* slightly more than any frame's body */

@@ -1,5 +1,5 @@
-/* Passes a packed corpus to a harness, without libFuzzer: `replay corpus/PARSER.txt`. Each line of the file is
- * an input: its name, and its bytes in hex. */
+/* Passes a packed corpus to a harness, without libFuzzer: `replay corpus/PARSER.txt`. Each line of the file
+ * is an input: its name, and its bytes in hex. */
 #include "fuzz.h"
 
 #include <ctype.h>

@@ -43,7 +43,7 @@ def asked(printed: Printed) -> bytes:
 
 
 def over_tcp(printed: Printed, transaction: int) -> Iterator[bytes]:
-    """Yield the request in the format of `request_of`, and the frames of request and reply over Modbus TCP."""
+    """Yield the request in the format of `request_of`, and both frames of the exchange in Modbus TCP."""
     yield bytes([TCP]) + asked(printed)[1:]
     for frame in (printed.request_frame, printed.frame):
         yield struct.pack(">HHH", transaction, 0, len(frame) - 2) + frame[:-2]

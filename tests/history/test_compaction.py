@@ -32,13 +32,13 @@ SERIES = "pump-1.speed"
 
 
 def segments() -> list[list[Row]]:
-    """Two segments each on two days, and one on the next."""
+    """Return the rows of five segments: two on each of two days, and one on the next day."""
     begins = (NOON, NOON + 600 * SECOND, NOON + DAY, NOON + DAY + 600 * SECOND, NOON + 2 * DAY)
     return [random_rows(seed, begin, 120) for seed, begin in enumerate(begins)]
 
 
 def check(folder: Path, rows: list[Row]) -> None:
-    """Compare all that can be asked with the rows."""
+    """Check that all queries of the history return these rows."""
     with History(folder) as history:
         assert sorted(rows_in(history)) == sorted(rows)
         for points in (6, 4000):
@@ -58,7 +58,7 @@ def test_a_parquet_file_has_its_segment_s_rows(tmp_path: Path) -> None:
     compact(tmp_path, 2)
     (file,) = parquet_files(tmp_path / "rows")
     assert [path.name for path in tmp_path.glob("*.arrows")] == ["rows.00000002.arrows"]
-    recording = open_recording(file.path)  # by pyarrow: it is a recording like any
+    recording = open_recording(file.path)  # pyarrow reads it like any recording
     assert recording.metadata == METADATA
     found = [row for batch in recording for row in batch]
     assert found == sorted(rows, key=lambda row: (row.drive, row.time_ns))
@@ -129,11 +129,11 @@ def test_one_database_is_opened_only_for_work(tmp_path: Path, monkeypatch: pytes
 
 
 class BrokenOff(BaseException):
-    """The process ends here."""
+    """Ends compaction, as a kill of the process would."""
 
 
 class Breaker:
-    """Lets so many calls happen, and ends the process before the next."""
+    """Lets `calls` calls of the wrapped functions succeed, and raises BrokenOff at the next call."""
 
     def __init__(self, calls: int) -> None:
         self.left = calls
@@ -148,8 +148,8 @@ class Breaker:
         return call
 
 
-# Five segments take 10 steps each: with every third step, each of the ten is tried once or twice.
-# Those that are always tried, 23 apart, are other ones in each, and of a merge.
+# `apart` is the distance between interrupted steps. Each of five segments takes 10 steps. A distance of 3
+# covers each of the ten once or twice; 23, the default, covers a few steps of segments and of a merge.
 @pytest.mark.long
 @pytest.mark.parametrize("apart", usually(23, 3))
 def test_compaction_interrupted_before_each_step_loses_no_row(
@@ -197,7 +197,7 @@ def test_compaction_killed_at_any_step_loses_no_row(tmp_path: Path) -> None:
         check(tmp_path, expected)
         if ended == 0:
             break
-        delay *= 1.3  # a busy machine needs longer
+        delay *= 1.3  # give a busy machine more time
     assert ended == 0
     assert not listing(tmp_path).segments
 
@@ -221,7 +221,7 @@ def test_the_readable_part_of_a_damaged_segment_is_read(
     record(tmp_path, rows)
     path = tmp_path / "rows.00000002.arrows"
     data = bytearray(path.read_bytes())
-    at = data.rindex(b"no reply")  # of the first batch's dictionary: the last one that was written
+    at = data.rindex(b"no reply")  # in the first batch's dictionary of statuses, the last one written
     data[at] = 0xFF
     path.write_bytes(data)
     whole = _readable(path)
@@ -294,7 +294,7 @@ def test_compaction_runs_at_the_lowest_priority_if_allowed(monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_compaction_leaves_its_recorder_s_real_time_scheduling() -> None:
-    """A process that may not run by SCHED_RR leaves the usual scheduling all the same."""
+    """If this process may not use SCHED_RR, the test starts with the usual scheduling."""
     lines = (
         "import contextlib, os",
         "from multidrop.history.compact import be_low",

@@ -36,7 +36,7 @@ def test_all_mistakes_of_its_table_at_once() -> None:
 
 
 def test_a_folder_that_cannot_be_created_is_one_sentence(tmp_path: Path) -> None:
-    """Not even root may create a folder in /sys."""
+    """The test uses /sys, where not even root may create a folder."""
     inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
     with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
         build(HistorySettings(folder="/sys/history"), inside)
@@ -44,7 +44,7 @@ def test_a_folder_that_cannot_be_created_is_one_sentence(tmp_path: Path) -> None
 
 
 def test_a_number_without_end_is_null() -> None:
-    """JSON has none, and the plot of all the others would be refused."""
+    """JSON has no infinity and NaN: with them, a browser could not parse the whole answer."""
     found = as_json(Buckets(0, MS, [1, 2], [0, 0], [-inf, 1.0], [nan, 1.5], [inf, 2.0]))
     assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
 
@@ -52,7 +52,7 @@ def test_a_number_without_end_is_null() -> None:
 async def test_large_answers_are_refused_and_made_outside_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A stop comes through the loop: it would wait for whatever is reckoned there."""
+    """A stop needs the asyncio loop, and would wait for computations in it."""
     makers: list[int] = []
 
     def noted(made: Buckets) -> dict[str, Any]:
@@ -124,7 +124,7 @@ async def test_the_historian_records_and_answers(tmp_path: Path) -> None:
     assert found["step_ms"] == 10_000
     pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
     assert pump["time"] == [begin + 10_000 * number for number in range(10)]
-    assert pump["least"] == [10.0 * number for number in range(10)]  # each tenth is a miss
+    assert pump["least"] == [10.0 * number for number in range(10)]  # every tenth row is a miss
     assert pump["most"] == [10.0 * number + 8 for number in range(10)]
     assert pump["mean"] == [10.0 * number + 4 for number in range(10)]
     assert fan["mean"] == [None] * 10

@@ -32,7 +32,7 @@ COMPACTED = pytest.mark.parametrize("compacted", usually(2, 0, 4), ids="{} compa
 
 @pytest.fixture(scope="module")
 def rows() -> list[list[Row]]:
-    """The rows of four segments: two in succession, one after a gap, one after the clock was set back."""
+    """Return rows of four segments: two in succession, one after a gap, one after the clock was set back."""
     begins = (NOON, NOON + 80 * SECOND, NOON + 300 * SECOND, NOON + 60 * SECOND)
     made = [random_rows(seed, begin, 400) for seed, begin in enumerate(begins)]
     return [
@@ -61,7 +61,7 @@ def test_rows_come_in_the_order_of_recording(folder: Path, rows: list[list[Row]]
         found = history.read()
         assert found.metadata == METADATA
         assert [row for batch in found for row in batch] == flat(rows)
-        assert [row for batch in found for row in batch] == flat(rows)  # and again
+        assert [row for batch in found for row in batch] == flat(rows)  # iterating again gives the same
         assert history.damage == []
 
 
@@ -199,7 +199,7 @@ def test_an_hour_is_made_of_tens_from_2_s_a_point_on() -> None:
     assert grid_of(*hour, 1801).step < 2 * SECOND
 
 
-# ---- while it records ----
+# ---- while the history is recorded ----
 
 
 @pytest.mark.long
@@ -225,20 +225,20 @@ def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_replaced_files_lose_no_row_for_a_reader(tmp_path: Path) -> None:
-    """Compacted between its listing and its reading: each row comes once all the same."""
+    """Files are compacted after the reader lists them and before it reads them: each row still comes once."""
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(4)]
     record(tmp_path, rows)
     with History(tmp_path) as history:
         found = iter(history.read())
         first = list(next(found))
-        compact(tmp_path, 4)  # the first is open, the others are only listed
+        compact(tmp_path, 4)  # the first segment is open, the others are only listed
         assert first + [row for batch in found for row in batch] == flat(rows)
     with History(tmp_path) as history:
         found = iter(history.read())
         first = list(next(found))
         for path in tmp_path.glob("rows/00000003.*"):
-            path.unlink()  # too old
+            path.unlink()  # as if it were too old
         left = first + [row for batch in found for row in batch]
     assert left == flat([*rows[:2], rows[3]])
 
@@ -292,7 +292,7 @@ def test_a_damaged_segment_hides_no_other(tmp_path: Path) -> None:
 def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
     record(tmp_path, rows)
-    for number in (2, 1):  # the newest may still be written
+    for number in (2, 1):  # the end of the newest may still be incomplete without damage
         path = tmp_path / f"rows.0000000{number}.arrows"
         path.write_bytes(path.read_bytes() + b"\0" * 7)
         with History(tmp_path) as history:
@@ -314,7 +314,7 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
                 flat(rows),
                 "pump-0.speed",
             )
-            assert history.export(tmp_path / "a.parquet") == 400  # by pyarrow
+            assert history.export(tmp_path / "a.parquet") == 400  # pyarrow wrote the file
     compact(tmp_path, 2)
     monkeypatch.setitem(sys.modules, "duckdb", None)
     with History(tmp_path) as history:
@@ -329,7 +329,7 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
 def test_plots_of_a_growing_segment_have_all_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    """Repeated queries for other series and ranges; some start earlier or much later."""
+    """Queries for changing series and ranges use the cache; some ranges start earlier or much later."""
     monkeypatch.setattr(growing, "MOST_KEPT", most)
     monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
     dice = random.Random(most)
@@ -383,7 +383,7 @@ def test_duckdb_spills_into_a_private_folder(tmp_path: Path, monkeypatch: pytest
 def test_a_slow_reader_outlasts_files_that_are_replaced_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a busy machine each listing takes as long as a file exists."""
+    """On a busy machine, each listed file may be replaced before it is read."""
     record(tmp_path, [random_rows(1, NOON, 100)])
     replaced = iter(range(20))
 

@@ -1,4 +1,4 @@
-"""Kill -9 at any moment: no written row is missing or doubled."""
+"""SIGKILL of recorders and compaction at any moment: no written row is missing or doubled."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ SUPPORT = os.pathsep.join(map(str, Path(histories.__file__).parents[1].iterdir()
 
 
 def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
-    """Let it record for a while, and kill it; return how many rows it said that it had written."""
+    """Run a recorder for a while, and kill it; return the number of rows that it reported as written."""
     words = [sys.executable, histories.__file__, str(folder), str(run)]
     here = {**os.environ, "PYTHONPATH": SUPPORT}
     with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True) as child:
         assert child.stdout is not None
-        assert child.stdout.readline()  # it is recording
-        with History(folder) as history:  # a reader while it records
+        assert child.stdout.readline()  # wait until it records
+        with History(folder) as history:  # read during recording
             check(history, {}, NOON + run * RUN)
         time.sleep(dice.uniform(0, 1.2))
         if dice.random() < 0.5:
-            child.kill()  # the process that compacts goes on
+            child.kill()  # only the recorder: compaction continues
         else:
             os.killpg(child.pid, signal.SIGKILL)
         said = child.stdout.read().split("\n")[:-1]
@@ -44,13 +44,15 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
 
 
 def check(history: History, written: dict[str, int], begin: int | None = None) -> int:
-    """Compare each run, or those since `begin`, with its count. Return the number of all rows."""
+    """Check that each run has at least its written rows, without gaps; return the number of all rows.
+
+    Rows before `begin` are ignored."""
     runs: dict[str, list[int]] = defaultdict(list)
     for rows in history.read(None, begin):
         for row in rows:
             runs[row.drive].append(row.monotonic_ns // STEP)
     for run, numbers in runs.items():
-        assert numbers == list(range(len(numbers))), run  # in order, without a gap, each once
+        assert numbers == list(range(len(numbers))), run  # in order, without gaps or duplicates
     for run, count in written.items():
         assert len(runs.get(run, ())) >= count, run
     return sum(map(len, runs.values()))
@@ -78,7 +80,7 @@ def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int
                 total = check(history, written)
                 assert total_of_tens(history, run + 1) == total
     assert sum(written.values()) > 100 * kills
-    for _ in range(100):  # a child that was left may still be at it
+    for _ in range(100):  # a remaining child may still compact
         compact([str(tmp_path), "--below", "99999999"])
         found = listing(tmp_path)
         if not found.segments:
@@ -86,7 +88,7 @@ def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int
         time.sleep(0.1)
     assert not found.segments
     assert len(found.rows) > kills // 2
-    assert any(file.first < file.last for file in found.tens)  # days were merged
+    assert any(file.first < file.last for file in found.tens)  # the tens of a day were merged
     assert not [*tmp_path.rglob("*.part"), *(tmp_path / "damaged").iterdir()]
     with History(tmp_path) as history:
         assert check(history, written) == total

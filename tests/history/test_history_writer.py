@@ -88,7 +88,7 @@ def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[.
 def test_the_writer_keeps_no_memory_of_the_core(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:
-    """It takes a copy: the core may use a batch's memory again."""
+    """The writer copies rows, because the core reuses a batch's memory."""
     writer = writers(tmp_path)
     one = some(0)
     expected = list(one)
@@ -162,7 +162,7 @@ def test_a_hanging_disk_delays_no_polling(
     writer.take(some(0))
     assert is_hanging.wait(PATIENCE)
     for number in range(1, 31):
-        writer.take(some(number))  # would wait for ever
+        writer.take(some(number))  # must not wait for the disk
     assert writer.state().dropped == 20 * 20
     goes_on.set()
     writer.close()

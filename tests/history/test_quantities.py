@@ -1,4 +1,4 @@
-"""A name that has another unit from one segment on: two units are never mixed."""
+"""A register name that gets another unit in a new segment: values of two units are never mixed."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ STATES, OTHER_STATES = {"values": {"RUN": 1, "STOP": 2}}, {"values": {"STOP": 1,
 
 
 def described(about: dict[str, Any]) -> dict[str, Any]:
-    """The metadata of a plant whose first drive has this register; the second one's stays the same."""
+    """Return a plant's metadata in which pump-1's register `load` is `about`, and pump-2's is in amperes."""
     drives = {"pump-1": {"registers": {"load": about}}, "pump-2": {"registers": {"load": AMPERE}}}
     return {"drives": drives}
 
 
 def recorded(folder: Path, *segments: dict[str, Any]) -> None:
-    """Record a segment of each quantity: 30 s of its own value, from the same second of each minute on."""
+    """Record a segment per quantity, each with a value of its own during the first 30 s of a minute."""
     with SegmentWriter(folder / "rows.arrows", {}, every=1e9) as writer:
         for number, about in enumerate(segments):
             writer.rotate(described(about))
@@ -53,7 +53,7 @@ def how(request: pytest.FixtureRequest) -> str:
 
 
 def kept(folder: Path, how: str, count: int) -> None:
-    """Keep the segments as they are, as files of each, or as files of each with the tens of a whole day."""
+    """Keep the segments, compact each of them ("files"), or also merge the tens of their day ("days")."""
     if how == "segments":
         return
     pytest.importorskip("duckdb", reason="needs duckdb")
@@ -68,7 +68,7 @@ def of(
     folder: Path, points: int, begin: int = NOON, end: int = NOON + 300 * SECOND
 ) -> tuple[Buckets, Buckets]:
     with History(folder) as history:
-        for _ in range(2):  # cached facts of the files do not matter
+        for _ in range(2):  # the second time, facts about the files are cached
             found = history.buckets([SERIES, OTHER], begin, end, points)
     return found[SERIES], found[OTHER]
 
@@ -140,7 +140,7 @@ def test_rows_before_a_changed_plant_are_in_the_earlier_segment(tmp_path: Path) 
 
 
 def columns_of(recording: Iterable[Rows]) -> dict[str, set[float | None]]:
-    """The values of each column."""
+    """Return the set of values in each column."""
     found: dict[str, set[float | None]] = {}
     for rows in recording:
         for row in rows:
@@ -153,7 +153,7 @@ PARTED = {SERIES: {10.0, 1000.0}, f"{SERIES} [A]": {1.0, 100.0}, OTHER: {1.0, 10
 
 @pytest.mark.long
 def test_a_column_has_one_unit(tmp_path: Path, how: str) -> None:
-    """Rows of another quantity are in a column that says so, wherever they are read or written to."""
+    """Rows of another quantity have a column with the unit in its name, in queries and in every export."""
     (tmp_path / "h").mkdir()
     recorded(tmp_path / "h", AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path / "h", how, 4)

@@ -175,7 +175,7 @@ def _c_statements(bare: str) -> Iterator[Edit]:
 
 
 def _python(source: str) -> tuple[str, list[Edit]]:
-    """Blank the parts of a Python source that are not mutated; return that, and edits of whole expressions."""
+    """Blank the parts of a Python source that are not mutated; return that, and edits of expressions."""
     starts = [0]
     for line in source.split("\n"):
         starts.append(starts[-1] + len(line) + 1)

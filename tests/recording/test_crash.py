@@ -1,8 +1,7 @@
-"""Clients that are killed at random while they poll, record and write: acknowledged data is there once.
+"""Kill clients at random while they poll, record and write: acknowledged data must be stored exactly once.
 
-A client acknowledges data after the call has returned: rows that `Writer.write` took, and numbers that
-`Drive.write` confirmed. By default 20 clients are killed; more with
-`pytest tests/recording/test_crash.py --kills 200`.
+A client acknowledges data after a call has returned: rows after `RecordingWriter.write`, and numbers after
+`Drive.write`. By default 20 clients are killed; more with `pytest tests/recording/test_crash.py --kills 200`.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.sim.memory import MemoryCell
 
 SEED = 6
-MOST_TOLD = 9  # lines that a client reports before it is killed
-LONGEST_WAIT = 0.03  # s, from then until it is
+MOST_TOLD = 9  # limit of lines that a client reports before it is killed
+LONGEST_WAIT = 0.03  # s, limit from the last awaited line to the kill
 
 
 class Counting(SimulatedDrive):
-    """Its count is how often it was read, and it remembers every number that was written to it."""
+    """A drive whose register `count` is the number of its reads, and which lists every written number."""
 
     def __init__(self) -> None:
         super().__init__(Counted(1, name=NAME))
@@ -53,7 +52,7 @@ class Counting(SimulatedDrive):
 
 
 class Nursery:
-    """A process whose children live until they are killed."""
+    """A process that starts clients as its children, which the test kills."""
 
     def __init__(self, port: str, directory: Path) -> None:
         self._port = port
@@ -97,15 +96,15 @@ def nursery(counting: Counting, tmp_path: Path) -> Iterator[Nursery]:
 
 
 def told(directory: Path, life: str) -> list[str]:
-    """Return the lines that a client has reported; a truncated last line does not count."""
+    """Return the complete lines that a client has reported."""
     path = directory / f"{life}.told"
     return path.read_text().rpartition("\n")[0].splitlines() if path.exists() else []
 
 
 def check_rows(rows: Sequence[Row]) -> None:
-    """The count grew by one from sample to sample, but for exchanges that are rows without a value.
+    """Check that the count grows by one from value to value, or by more across rows without a value.
 
-    On a busy machine a drive may count as silent: then rows report that it was not asked.
+    On a busy machine a drive may be treated as silent; then some rows report that it was not asked.
     """
     samples = [row for row in rows if row.value is not None]
     assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(samples))
@@ -119,7 +118,7 @@ def check_rows(rows: Sequence[Row]) -> None:
 
 
 def check_recordings(directory: Path, life: str, acknowledged: int | None) -> int:
-    """Check that both recordings open and have at least the acknowledged rows; return their number."""
+    """Check that both recordings open and have at least the acknowledged rows; return the number of these."""
     for suffix in (".arrows", ".csv"):
         path = directory / f"{life}{suffix}"
         if acknowledged is None and (not path.exists() or not path.stat().st_size):
@@ -133,7 +132,7 @@ def check_recordings(directory: Path, life: str, acknowledged: int | None) -> in
 
 
 def check_ledger(directory: Path, sent: int, lives: int) -> None:
-    """Every write that was sent is counted; one more for each client that was killed in between."""
+    """Check that the EEPROM ledger counts every sent write, and at most one more per killed client."""
     book = ledger(directory)
     if not book.path.exists():
         assert sent == 0
@@ -145,7 +144,7 @@ def check_ledger(directory: Path, sent: int, lives: int) -> None:
 
 
 def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[int], lives: int) -> None:
-    """Every acknowledged write is there as done, none is there twice, and none that was not sent."""
+    """Check that the audit log has every acknowledged write as done, no write twice, and no unsent write."""
     path = audit(directory)
     records = list(read_audit(path)) if path.exists() else []
     noted = [int(str(record["write"]).removeprefix("number = ")) for record in records]
@@ -165,8 +164,8 @@ def test_reported_rows_of_a_killed_client_are_recorded_once(
     rows = 0
     acknowledged: list[int] = []
     for life in range(kills):
-        # A killed client's last write may still be on its way, as the number that comes next: a client that
-        # finds its number there sends no write, so the audit log has no record of it.
+        # The last write of a killed client may still be on the line. Skip its number: the next client would
+        # read its own number from the drive, send no write, and leave no record in the audit log.
         next_number = counting.numbers[-1] + 2 if counting.numbers else 1
         lines, seconds = chance.randint(0, MOST_TOLD), chance.uniform(0.0, LONGEST_WAIT)
         died_of = nursery.live(str(life), next_number, lines, seconds)

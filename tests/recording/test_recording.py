@@ -42,7 +42,7 @@ every_format = pytest.mark.parametrize("suffix", FORMATS)
 
 
 def record(path: Path, metadata: Metadata = METADATA) -> Path:
-    """The example and 2500 rows more, in three batches."""
+    """Record the example and 2500 more rows in three batches; return the path."""
     with open_writer(path, metadata) as writer:
         for batch in (example(), counting(2000), counting(500, 2000)):
             writer.write(batch)
@@ -120,7 +120,7 @@ def test_a_reader_ends_at_the_size_when_it_was_opened(tmp_path: Path, suffix: st
         assert rows(reader) == list(counting(10))
 
 
-# ---- opened by others ----
+# ---- opened by other programs ----
 
 
 def test_pyarrow_opens_arrows(tmp_path: Path) -> None:
@@ -275,7 +275,7 @@ def test_any_rows_are_read_as_they_were_written(
 def test_any_batches_converted(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
 ) -> None:
-    """A drive may send NaN, which equals only its name."""
+    """Values may be NaN, which does not equal itself, so the test compares texts."""
     folder = tmp_path_factory.mktemp("any")
     with open_writer(folder / f"a{suffix}", {}) as writer:
         for some in filter(None, batches):
@@ -289,7 +289,7 @@ def test_any_batches_converted(
 
 
 def as_text(name: str) -> str:
-    """A cell's text: no spreadsheet takes it for a formula."""
+    """Return a name as a .csv has it: after an apostrophe if a spreadsheet would evaluate it as a formula."""
     return f"'{name}" if name.lstrip("'")[:1] in tuple("=+-@\t\r\n") else name
 
 
@@ -377,13 +377,13 @@ def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) 
     assert rows(open_recording(target)) == RECORDED
 
 
-DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".parquet": b"PAR1"}  # behind it
+DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".parquet": b"PAR1"}  # damage follows
 
 
 @every_format
 @pytest.mark.parametrize("target", FORMATS)
 def test_a_failed_conversion_leaves_no_file(tmp_path: Path, suffix: str, target: str) -> None:
-    """The error is about the recording, in words of ours."""
+    """The error's message is one of our own, and names the recording."""
     path = record(tmp_path / f"a{suffix}")
     content = path.read_bytes()
     at = content.index(DAMAGED_AT[suffix], 0 if suffix == ".parquet" else len(content) // 2) + 4
@@ -414,7 +414,7 @@ def test_an_interrupted_conversion_leaves_no_file(
     assert set(tmp_path.iterdir()) == before
 
 
-# ---- mistakes ----
+# ---- mistakes of callers ----
 
 
 @table("act", [lambda path: open_writer(path, {}), open_recording, repair])
@@ -493,7 +493,7 @@ def test_pandas_and_duckdb_take_arrows_through_pyarrow(tmp_path: Path) -> None:
 
 
 class Grown:
-    """Batches whose drives become more, as those of a poller to which drives are added."""
+    """Makes batches with more and more drives, like a poller to which drives are added."""
 
     def __init__(self) -> None:
         self.names = Names(["pump-0"])
@@ -511,7 +511,7 @@ class Grown:
 
 @pytest.mark.long
 def test_every_reader_gets_names_of_later_drives(tmp_path: Path) -> None:
-    """polars and nanoarrow read no deltas, so each changed dictionary is written again."""
+    """polars and nanoarrow cannot read deltas, so each changed dictionary is written again as a whole."""
     polars = pytest.importorskip("polars", reason="needs polars")
     nanoarrow = pytest.importorskip("nanoarrow")
     path, grown = tmp_path / "a.arrows", Grown()
@@ -528,7 +528,7 @@ def test_every_reader_gets_names_of_later_drives(tmp_path: Path) -> None:
 
 
 def test_a_stream_rewritten_by_another_program_is_read(tmp_path: Path) -> None:
-    """Its dictionaries have other ids, and some come as deltas."""
+    """In the rewritten stream, dictionaries have other ids, and some are deltas."""
     path, grown = record(tmp_path / "a.arrows"), Grown()
     table = pa.ipc.open_stream(path.read_bytes()).read_all()
     with pa.ipc.new_stream(tmp_path / "b.arrows", table.schema) as stream:
@@ -553,7 +553,7 @@ def test_more_statuses_than_a_byte_has_values(tmp_path: Path, count: int) -> Non
 
 
 def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
-    """The core's own codes: 255 exceptions, and a good reply between them."""
+    """Rows with each of the core's codes for 255 exceptions, and with a good reply between them."""
     columns = Columns(1024)
     for code in range(512):
         reply = completion(code + 1, first_ns=code + 2, words=(7,), exception=code % 256)
@@ -572,7 +572,7 @@ def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
 
 
 def test_a_row_takes_at_most_35_bytes(tmp_path: Path) -> None:
-    """31 drives with 10 values at 10 Hz, in batches of a tenth of a second; some rows are misses."""
+    """31 drives with 10 values at 10 Hz, in batches of 0.1 s; some rows are misses."""
     drives = Names([f"pump-{number}" for number in range(31)])
     registers = Names([f"some_register_{number}" for number in range(10)])
     with open_writer(tmp_path / "a.arrows", METADATA) as writer:

@@ -41,7 +41,7 @@ from multidrop.recording.format import AppendFile
 from multidrop.recording.rows import from_rows
 
 growing = pytest.mark.parametrize("suffix", [".arrows", ".csv"])
-ROWS = 20  # of a batch
+ROWS = 20  # per batch
 
 
 def rows(reader: RecordingReader) -> list[Row]:
@@ -49,7 +49,7 @@ def rows(reader: RecordingReader) -> list[Row]:
 
 
 def record(path: Path, batches: int) -> list[int]:
-    """Count up; the length of the file after its head and after each batch."""
+    """Record batches of increasing numbers; return the file's length after its head and after each batch."""
     lengths = []
     with open_writer(path, METADATA) as writer:
         lengths.append(path.stat().st_size)
@@ -80,7 +80,7 @@ def test_random_cuts_of_arrows_lose_only_incomplete_batches(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_a_cut_between_dictionary_and_rows_is_readable(tmp_path: Path) -> None:
-    """Dictionaries precede their batch: a cut may leave some dictionaries without a batch."""
+    """Dictionaries precede their batch, so a cut may leave some dictionaries without a batch."""
     polars = pytest.importorskip("polars", reason="needs polars")
     path = tmp_path / "a.arrows"
     lengths, names = [], Names(["pump-0"])
@@ -115,7 +115,7 @@ def test_names_of_a_failed_batch_are_written_with_the_next(tmp_path: Path) -> No
 
 
 def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
-    """Two recordings, one behind the other: codes of the second mean other names."""
+    """In a file with two recordings, codes in the second one stand for other names."""
     first, second = tmp_path / "a.arrows", tmp_path / "b.arrows"
     record(first, 2)
     with open_writer(second, METADATA) as writer:
@@ -129,7 +129,7 @@ def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
 def test_names_that_exceed_memory_are_damage(
     tmp_path: Path, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scale the limit and the data down by the same factor."""
+    """The test scales the limit and the data down by the same factor."""
     monkeypatch.setattr(arrow_decoder, "MOST_SPELLED", 2**28 // part)
     path = tmp_path / "a.arrows"
     row = Row(1, 1, None, "x" * (2**20 // part), "r", None, "no reply")
@@ -155,7 +155,7 @@ def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
 
 
 def test_no_drive_has_a_name_of_two_lines() -> None:
-    """A line of text that is truncated within a name would look whole."""
+    """Otherwise a .csv that is truncated within a name could end with a line that looks complete."""
     with pytest.raises(ValueError, match=r"the name 'pump\\n1' is not one line"):
         Toy(1, name="pump\n1")
 
@@ -221,7 +221,7 @@ for at in count():
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_a_killed_writer_keeps_all_written_batches(tmp_path: Path, suffix: str) -> None:
-    """SIGKILL at full speed: every batch whose write had returned is there."""
+    """SIGKILL ends a writer at full speed; every batch whose write had returned can be read."""
     for until in (1, examples(160)):
         path = tmp_path / f"{until}{suffix}"
         command = [
@@ -316,7 +316,7 @@ def test_a_full_disk_refuses_a_recording(tmp_path: Path, suffix: str) -> None:
 
 @growing
 def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: str) -> None:
-    """A batch that did not fit leaves no half of itself between the others."""
+    """No part of a batch that did not fit remains between the batches before and after it."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
@@ -332,13 +332,13 @@ def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: st
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_read_only_directory_is_one_sentence(tmp_path: Path, suffix: str) -> None:
-    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # imports before rights are dropped
+    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # import modules before dropping privileges
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
         with pytest.raises(RecordingError) as failure:
             open_writer(path, METADATA)
     assert str(failure.value) == f"{path}: cannot be written: Permission denied"
-    assert failure.value.strerror is None  # the sentence is ours
+    assert failure.value.strerror is None  # the message is ours, not the system's
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -352,7 +352,7 @@ def test_a_missing_directory_is_an_error(tmp_path: Path, suffix: str) -> None:
 def test_an_incomplete_batch_is_cut_off_before_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk fails for a while, for cutting too."""
+    """For a while, the disk fails for writing and also for truncating."""
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
@@ -373,7 +373,7 @@ def _fail(file: AppendFile) -> None:
 
 @growing
 def test_an_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, suffix: str) -> None:
-    """Ctrl-C between the two halves of a piece that the system takes in two."""
+    """The system accepts a piece in two parts, and Ctrl-C comes between them."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
@@ -388,7 +388,7 @@ def test_an_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, suffix: 
 
 
 class Halving:
-    """A file that writes half of the bytes, and then raises KeyboardInterrupt."""
+    """A file that writes half of a piece, and then raises KeyboardInterrupt."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -406,7 +406,7 @@ class Halving:
 
 @pytest.mark.parametrize("room", range(0, 120, 10))
 def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None:
-    """No .csv.json is incomplete, wherever the disk becomes full."""
+    """No .csv.json is incomplete, at whatever byte the disk becomes full."""
     path = tmp_path / "a.csv"
     whole = {"plant": "p" * 60}
     try:
@@ -424,7 +424,7 @@ def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_rows_keep_their_order_if_the_clock_is_set_back(tmp_path: Path, suffix: str) -> None:
-    """Rows stay in the order of monotonic_ns; `time` repeats the clock."""
+    """Rows stay in the order of `monotonic_ns`; `time` has the time of the clock that was set back."""
     path = tmp_path / f"a{suffix}"
     offsets = (UTC_0, UTC_0 - 3600 * SECOND)
     with open_writer(path, METADATA) as writer:
@@ -437,7 +437,7 @@ def test_rows_keep_their_order_if_the_clock_is_set_back(tmp_path: Path, suffix: 
     assert [row.time_ns for row in found] == [UTC_0 + 1, UTC_0 + 2 - 3600 * SECOND]
 
 
-# ---- not a recording ----
+# ---- files that are not recordings ----
 
 GARBAGE = {
     "empty": b"",
@@ -478,7 +478,7 @@ def test_other_columns_are_not_a_recording(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("uses_dictionary", [True, False])
 def test_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, uses_dictionary: bool) -> None:
-    """A few kilobytes of zstd can hold gigabytes of names, by a dictionary or as they are."""
+    """A few kilobytes of zstd can expand to gigabytes of names, with or without a dictionary."""
     rows, name = (100_000, "x" * 36_000) if uses_dictionary else (600, "x" * 1_000_000)
     described = pa.schema(schema())
     names = [name if uses_dictionary else f"{name}{at}" for at in range(rows)]
@@ -529,7 +529,7 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damage_anywhere_raises_one_sentence(tmp_path: Path, suffix: str) -> None:
-    """Some bytes are overwritten: it is read with other values, cut short, or refused; never a crash."""
+    """Overwritten bytes lead to other values, to a partly read file or to one sentence; never to a crash."""
     path = tmp_path / f"a{suffix}"
     record(path, 2)
     whole = path.read_bytes()
@@ -559,7 +559,7 @@ def suppress_mistake_that_names(path: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("rows", [-77, -(1 << 59), 1 << 59])
 def test_a_batch_of_impossibly_many_rows(tmp_path: Path, rows: int) -> None:
-    """A size computed from their number, in bytes, would wrap around."""
+    """A size in bytes that is computed from the number of rows would overflow."""
     path = tmp_path / "run.arrows"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(77))

@@ -57,7 +57,7 @@ def read(path: Path) -> list[Row]:
 
 def test_a_segment_starts_when_the_last_is_old_enough(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
-        assert names(tmp_path) == []  # no rows, no file
+        assert names(tmp_path) == []  # without rows there is no file
         for number in range(5):
             writer.write(rows(number))
             hand.now += 30
@@ -88,7 +88,7 @@ def test_other_files_are_not_segments(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60, keep=1.0, most=1000) as writer:
         writer.write(rows(0))
         assert writer.number == 1
-    assert len([*tmp_path.iterdir()]) == 6  # and the lock
+    assert len([*tmp_path.iterdir()]) == 6  # the four files, a segment, and the lock file
 
 
 def test_other_metadata_starts_a_segment(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_an_incomplete_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> No
     (_, segment), *_ = segments_of(path)
     os.truncate(segment, segment.stat().st_size - 20)
     SegmentWriter(path, ABOUT, every=60).close()
-    assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # it refuses half a batch
+    assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # else pyarrow raises
 
 
 def test_a_longer_damaged_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,12 +224,12 @@ def test_a_clock_that_jumps_removes_no_segment() -> None:
         return [file.number for file in files if file not in gone]
 
     assert left(8 * DAY, week) == [3, 4, 5, 6, 7]
-    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # as if no time had passed
+    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # after a jump, as if no time had passed
     ahead = [*week, *(StoredFile(Path(str(n)), n, (4000 + n) * DAY, 100) for n in (8, 9))]
-    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # and goes on from there
+    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # ages grow from there
     corrected = [*ahead, StoredFile(Path("10"), 10, 10 * DAY, 100)]
-    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # those that are 5 days old at most, again
-    assert left(16.5 * DAY, corrected) == [5, 6, 7, 8, 9, 10]  # it was off for longer than is kept
+    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # clock corrected: again those up to 5 days old
+    assert left(16.5 * DAY, corrected) == [5, 6, 7, 8, 9, 10]  # recording paused for longer than `keep`
     booted_in_1970 = [*week, StoredFile(Path("8"), 8, 60.0, 100)]
     assert left(9 * DAY, booted_in_1970) == [1, 2, 3, 4, 5, 6, 7, 8]
     two = [file._replace(path=Path(f"tens/{file.number}"), end=file.end + 5) for file in week]

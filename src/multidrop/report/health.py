@@ -222,7 +222,7 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """The time in s to read each register once; None if one has its own rate, or if there are no values."""
+        """The time in s to read each register once; None if one has its own rate, or without values."""
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None

@@ -293,7 +293,7 @@ class Lane:
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return a panel's lanes, and the number without room. Lanes of bits that are never set are dropped first."""
+    """Return a panel's lanes, and the number without room. Bits that are never set are dropped first."""
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found
