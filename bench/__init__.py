@@ -1,1 +1,1 @@
-"""Benchmarks: questions, players, masters and results."""
+"""Benchmarks: questions (scripts), players (simulated lines), masters under test, and results."""

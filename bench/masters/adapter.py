@@ -29,7 +29,7 @@ LEASE_NS = 3600 * 1_000_000_000
 
 
 def silence(baudrate: int) -> float:
-    """Return multidrop's pause between two exchanges in s: one bit longer, for a second stop bit."""
+    """Return multidrop's silence between two exchanges in s, which includes a bit time for a second stop bit."""
     drive = Played(1, baudrate=baudrate)
     return drive.needed_silence() + drive.settings.bit
 
@@ -47,7 +47,7 @@ def _plant_text(job: Job) -> str:
 
 @contextmanager
 def polling(job: Job, mastership: Mastership | None = None) -> Iterator[Poller]:
-    """Poll all registers of all drives, as fast as the line allows."""
+    """Yield a poller of all registers of all drives, which polls as fast as the line allows."""
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
         path.write_text(_plant_text(job))
@@ -57,7 +57,7 @@ def polling(job: Job, mastership: Mastership | None = None) -> Iterator[Poller]:
 
 
 def counts(poller: Poller) -> tuple[int, int]:
-    """Return the numbers of good exchanges and of failures so far."""
+    """Return the numbers of good and of failed exchanges so far."""
     summary = poller.summary()
     return summary["samples"] // REGISTERS, summary["misses"] // REGISTERS
 
@@ -68,13 +68,15 @@ def missed(batch: Batch) -> int:
 
 
 def dropped(poller: Poller) -> int:
-    """Return the number of dropped rows; for thousands of drives, `summary` would take long."""
+    """Return the number of dropped rows, faster than `summary` does for thousands of drives."""
     return poller._row_queue.dropped
 
 
 @contextmanager
 def multidrop(job: Job, mastership: Mastership | None = None) -> Iterator[Callable[[], tuple[int, int]]]:
-    """Poll as a rival does: take batches of columns ten times a second, and check the last one."""
+    """Yield a function that polls with a Poller, and returns the numbers of good and of failed exchanges.
+
+    It takes batches ten times a second, and checks the values of the last batch."""
 
     def poll() -> tuple[int, int]:
         for row in last(poller.batches(job.seconds)):
@@ -92,7 +94,7 @@ def multidrop(job: Job, mastership: Mastership | None = None) -> Iterator[Callab
 
 @contextmanager
 def leased(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
-    """Poll with a mastership: the core checks the clock before each request."""
+    """Do the same with a mastership: the core then checks the clock before each request."""
     mastership = Mastership()
     mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + LEASE_NS)
     try:
@@ -104,7 +106,7 @@ def leased(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
 
 @contextmanager
 def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
-    """Return a function that reads all registers of the drive at an address."""
+    """Yield a function that reads all registers of the drive at an address."""
     family = Played if job.baudrate else Unpaced
     registers = family.readings()
     with Bus(job.port, baudrate=job.port_baudrate) as bus:
@@ -117,7 +119,7 @@ def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
 
     The consumer sleeps on the poller's descriptor, and takes the rows as soon as it wakes.
     """
-    _replied_ns(decoder(1)())  # imports at the first use would delay it
+    _replied_ns(decoder(1)())  # imports modules now, which would delay the first values
     late = [numpy.empty(0)]
     with polling(job) as poller:
         end = time.monotonic() + job.seconds
@@ -157,7 +159,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
     def decode() -> Batch:
         columns = Columns(BATCH_ROWS)
-        add, into = lib.md_columns_add, columns.c  # as the core's own thread does, with little Python code
+        add, into = lib.md_columns_add, columns.c  # what the core's thread calls, with little Python code
         for block, found in turns[: BATCH_ROWS // REGISTERS]:
             add(into, block.c, found, 0)
         return Batch(columns, *names)
@@ -166,7 +168,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
 
 def record(path: Path, decode: Callable[[], Batch], values: int) -> int:
-    """Decode and write until the recording has that many values; return their number."""
+    """Decode and write batches until the recording has at least `values` values; return their number."""
     with open_writer(path, {}) as writer:
         while writer.rows < values:
             writer.write(decode())

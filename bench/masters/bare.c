@@ -3,7 +3,7 @@
 #include <poll.h>
 #include <unistd.h>
 
-/* Make `n` exchanges of an 8-byte request and a 25-byte reply; return the number of good ones. */
+/* Make `n` exchanges of an 8-byte request and a 25-byte reply; return the number of successful exchanges. */
 int bare_exchanges(int fd, int n)
 {
     static const unsigned char request[8] = {0x01, 0x03, 0x00, 0x00, 0x00, 0x0A, 0xC5, 0xCD};

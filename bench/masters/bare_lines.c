@@ -1,5 +1,5 @@
-/* The baseline for many lines: a client that does the minimum. It writes, waits with epoll and reads, with
- * one exchange at a time on each line, and checks only the reply's length. Prints JSON. */
+/* The baseline for many lines: a client that does the minimum. It writes, waits with epoll and reads, one
+ * exchange at a time on each line, and checks only the reply's length. Prints the results as JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
 

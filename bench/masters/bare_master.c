@@ -1,5 +1,5 @@
-/* The baseline: a master that does the minimum and keeps the silence. It writes, polls, reads the bytes as
- * they come, waits, and checks only the reply's length. Prints JSON. */
+/* The baseline for one line: a master that does the minimum. It writes a request, reads the reply with poll(2),
+ * checks only its length, and keeps the silence. Prints the results as JSON. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <errno.h>
@@ -89,7 +89,7 @@ static int open_line(const char *path)
     return fd;
 }
 
-/* Return 1 if a reply of that many bytes came within the time-out; sleep for the first `asleep_ns`. */
+/* Send a request; return 1 if a reply of `expected` bytes comes in time. First sleep for `asleep_ns`. */
 static int exchange(int fd, const uint8_t *request, size_t expected, int64_t asleep_ns)
 {
     uint8_t reply[256];
@@ -116,7 +116,7 @@ int main(int argc, char **argv)
         {"seconds", 1, NULL, 's'},    {"drives", 1, NULL, 'n'},  {"registers", 1, NULL, 'r'},
         {"silence-us", 1, NULL, 'q'}, {"spin-us", 1, NULL, 'p'}, {"asleep-us", 1, NULL, 'a'},
         {NULL, 0, NULL, 0}};
-    double seconds = 3, silence_us = 0, spin_us = 60, asleep_us = 0; /* silence 0: unpaced */
+    double seconds = 3, silence_us = 0, spin_us = 60, asleep_us = 0; /* silence_us 0: no silence */
     int drives = 16, registers = 10, key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
         double number = optarg ? strtod(optarg, NULL) : 0;

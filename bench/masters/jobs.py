@@ -1,4 +1,4 @@
-"""The job that every master is given, and the values that the drives hold."""
+"""The job that every master carries out, and the values of the drives' registers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ CHARACTER_BITS = 10
 
 @dataclass(frozen=True)
 class Job:
-    """Read the registers of addresses 1 to `drives` in turn, for `seconds`; baud rate 0: no waits."""
+    """Read all registers of the addresses 1 to `drives` in turn, for `seconds`.
+
+    With baud rate 0, the line's player does not wait for the times of characters."""
 
     port: str
     baudrate: int
@@ -21,7 +23,7 @@ class Job:
 
     @property
     def wire(self) -> float:
-        """Seconds from the start of a request to the end of its reply on paced_line."""
+        """The time in s from the start of a request to the end of its reply on paced_line."""
         return (8 + 5 + 2 * REGISTERS) * self.character + DELAY_S
 
     @property
@@ -30,10 +32,10 @@ class Job:
 
     @property
     def port_baudrate(self) -> int:
-        """The baud rate with which a rival opens the port; it computes its waits from it."""
+        """The baud rate with which a rival opens the port, and from which the rival computes its waits."""
         return self.baudrate or 115200
 
 
 def expected(address: int) -> list[int]:
-    """The values that paced_line's drive of this address holds."""
+    """Return the register values of paced_line's drive with this address."""
     return [256 * address + register for register in range(REGISTERS)]

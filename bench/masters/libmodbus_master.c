@@ -1,5 +1,5 @@
-/* libmodbus in C as a master: reads the drives in turn, as its own examples do. For RTU over TCP, an RTU
- * context gets a connected socket. Prints JSON. */
+/* libmodbus in C as a master: reads the drives in turn, as libmodbus's own examples do. For RTU over TCP, an
+ * RTU context gets a connected socket. Prints the results as JSON. */
 #include <arpa/inet.h>
 #include <errno.h>
 #include <modbus.h>

@@ -1,4 +1,4 @@
-"""Poll lines without a plant file: on open descriptors, with all families, or with unreliable replies."""
+"""multidrop on lines without a plant file: on open descriptors, with all families, or with late replies."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _opened(port: str, *facts: Any) -> Line:
 
 @contextmanager
 def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
-    """Poll all registers of the drives on each port: a path, or the number of an open descriptor."""
+    """Yield a poller of all registers of the drives on each port: a path, or the number of a descriptor."""
     declared = tuple(
         PlantLine(
             port,
@@ -68,7 +68,7 @@ def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -
 def polling_lines(
     ports: Sequence[str], baudrate: int, drives: int = 16, every: float | None = None
 ) -> Iterator[Poller]:
-    """Poll drives with addresses from 1 on each port; baud rate 0: without waits."""
+    """Yield a poller of `drives` drives, with addresses from 1, on each port; baud rate 0: without waits."""
 
     def drive(port: str, address: int) -> Drive:
         name = _name(port, address)
@@ -90,7 +90,7 @@ def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds
         grids = {_name(line.name, 1): line.started_ns for line in poller._lines}
     period_ns = round(every * 1e9)
     sent_ns = {(row.drive, row.monotonic_ns - grids[row.drive]) for batch in batches for row in batch}
-    # The first slots start with polling itself.
+    # Skip the first slots, which start when polling starts.
     return [sent % period_ns / 1e3 for _, sent in sorted(sent_ns) if sent > period_ns / 2]
 
 
@@ -103,8 +103,8 @@ class Mixed:
 
     drives: Sequence[Drive]
     words: Sequence[str]
-    requests: int  # in a bus cycle
-    cycle: float  # as predicted, in s
+    requests: int  # number of requests in a bus cycle
+    cycle: float  # predicted bus cycle in s
 
 
 def mixed() -> Mixed:
@@ -130,13 +130,13 @@ def mixed() -> Mixed:
             )
         )
         for drive in drives
-        for demanded in [drive.needed_silence() + drive.settings.bit]  # multidrop waits longer around ASCII
+        for demanded in [drive.needed_silence() + drive.settings.bit]  # around ASCII frames multidrop waits longer
     ]
     return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
 
 def poll_mixed(port: str, seconds: float) -> dict[str, Any]:
-    """Poll the line; return its summary."""
+    """Poll the line of `mixed` for `seconds`; return the line's part of the poller's summary."""
     with _polling_drives({port: mixed().drives}, None) as poller:
         for _ in poller.batches(seconds):
             pass
@@ -153,20 +153,20 @@ class Judged:
 
     exchanges: int = 0  # requests that were sent
     samples: int = 0
-    wrong: int = 0  # values of another register
-    beyond: int = 0  # of these, from replies later than three time-outs
+    wrong: int = 0  # values that belong to another register
+    beyond: int = 0  # of `wrong`: replies that came later than three time-outs
     late: int = 0  # replies that were recognised after their time-out
     misses: Counter[str] = field(default_factory=Counter)
-    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # without a reply, by drive and value
+    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered requests, by drive and value
 
 
 def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
-    """Poll for that many exchanges, and compare each value with its register's."""
+    """Poll for `exchanges` exchanges, and compare each value with the true value of its register."""
     return _judged(ports, drives, lambda judged: judged.exchanges >= exchanges)
 
 
 def judge_for(ports: Sequence[str], seconds: float, drives: int) -> Judged:
-    """Do the same for that many seconds."""
+    """Do the same as `judge` for `seconds`."""
     end = time.monotonic() + seconds
     return _judged(ports, drives, lambda judged: time.monotonic() >= end)
 
@@ -221,7 +221,7 @@ def _judge(batch: Batch, held: Mapping[tuple[str, str], int], judged: Judged) ->
 
 
 def _is_beyond(row: Mapping[str, Any], asked_ns: Mapping[tuple[str, int], int]) -> bool:
-    """Return True if the value answers a request from more than three time-outs ago."""
+    """Return True if a wrong value is the reply to a request sent more than three time-outs earlier."""
     question_ns = asked_ns.get((row["drive"], int(row["value"])))
     last_ns = 3e9 * Unreliable.response_timeout
     return question_ns is not None and row["monotonic_ns"] + row["uncertainty_ns"] - question_ns > last_ns

@@ -1,4 +1,4 @@
-"""Masters that are compared, each in a process of its own (`python -m bench.masters.rivals MASTER JOB`).
+"""The masters to compare, each run in a separate process (`python -m bench.masters.rivals MASTER JOB`).
 
 A rival is used as its own documentation shows, with its own waits, and no retries.
 """
@@ -109,7 +109,7 @@ def umodbus(job: Job) -> Iterator[Read]:
 def in_turn(
     reader: Callable[[Job], AbstractContextManager[Read]],
 ) -> Callable[[Job], AbstractContextManager[Poll]]:
-    """A rival that reads the drives in turn; an exchange is good if its values are right."""
+    """Return a master that reads the drives in turn; an exchange counts as good if its values are right."""
 
     @contextmanager
     def rival(job: Job) -> Iterator[Poll]:
@@ -118,7 +118,7 @@ def in_turn(
             while time.monotonic() < end:
                 address = 1 + asked % job.drives
                 asked += 1
-                with suppress(Exception):  # each rival has errors of its own
+                with suppress(Exception):  # each rival has its own error classes
                     good += list(read(address)) == expected(address)
             return good, asked - good
 
@@ -128,7 +128,7 @@ def in_turn(
     return rival
 
 
-# ---- a master that polls by itself ----
+# ---- masters that poll by themselves ----
 
 
 @contextmanager
@@ -199,7 +199,7 @@ def _missing(wanted: Sequence[str]) -> set[str]:
 
 
 def insist_on(masters: Sequence[str]) -> None:
-    """Exit with one sentence that names the packages to install, if any is missing."""
+    """Exit with one sentence that names the packages to install, if a master's package is missing."""
     missing = _missing([name for name in masters if name in IN_PYTHON])
     if missing:
         sys.exit(f"rivals are missing: {sys.executable} -m pip install {' '.join(sorted(missing))}")
@@ -208,7 +208,7 @@ def insist_on(masters: Sequence[str]) -> None:
 
 
 def measure(master: str, job: Job) -> dict[str, Any]:
-    """Run a master; return exchanges, failures, CPU seconds, seconds and its version."""
+    """Run a master; return its exchanges, failures, CPU seconds, elapsed seconds and version."""
     if master == "libmodbus":
         flags = subprocess.check_output(["pkg-config", "--cflags", "--libs", "libmodbus"], text=True).split()
         program = compiled("masters/libmodbus_master.c", *flags)
@@ -220,7 +220,7 @@ def measure(master: str, job: Job) -> dict[str, Any]:
 
 
 def measure_bare(job: Job, silence: float, asleep: float = 0.0) -> dict[str, Any]:
-    """Return the same for bare_master.c: `silence` s before each request, `asleep` s of sleep after it."""
+    """Do the same with bare_master.c: `silence` s before each request, and `asleep` s of sleep after it."""
     command = [compiled("masters/bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
     command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]
     command += ["--asleep-us", asleep * 1e6, job.port]

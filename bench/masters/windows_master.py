@@ -1,6 +1,6 @@
-"""multidrop as a master on Windows: `python windows_master.py JOB`, a Job as JSON; prints its result as JSON.
+"""multidrop as a master on Windows: `python windows_master.py JOB`. JOB is a Job as JSON.
 
-It runs without the package `bench`, and uses only the declared drives of this folder.
+Prints the result as JSON. It runs without the package `bench`, from a folder that also has replay.py.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def plant_text(job: dict[str, Any]) -> str:
 
 
 def values_of(batch: Any) -> int:
-    """Return the number of values; a wrong value ends this program."""
+    """Return the number of values in a batch; exit the program if a value is wrong."""
     found = 0
     for row in batch:
         address, register = int(row.drive.partition("-")[2]), int(row.register[1:])

@@ -1,1 +1,1 @@
-"""Players: lines, drives and clients under attack."""
+"""Players: programs that simulate lines and drives, and clients to be attacked."""

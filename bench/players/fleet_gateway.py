@@ -1,8 +1,8 @@
-"""A gateway of known samples: `python -m bench.players.fleet_gateway NAME FOLDER TOLD URL...`
+"""A gateway with known samples: `python -m bench.players.fleet_gateway NAME FOLDER TOLD URL...`
 
-It appends numbered exchanges. In the file TOLD it notes how many the spool reported as stored, as lines with
-a run's first number and a count. With `-` for TOLD it only forwards its samples. It may be killed at any
-moment.
+It appends numbered exchanges to its spool in FOLDER, and forwards them to the NATS servers at URL. Into the
+file TOLD it writes lines with a run's first number and the count of exchanges that are stored. With `-` for
+TOLD it only forwards. It may be killed at any moment.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.samples_stream import samples_path
 from multidrop.fleet.samples.spool import Spool
 
-EXCHANGES = 100  # in a batch
-RATE = 1000  # exchanges a second: 10,000 values
-GAP = 1_000_000  # between the first numbers of two runs
+EXCHANGES = 100  # per batch
+RATE = 1000  # exchanges per second, with 10 values each
+GAP = 1_000_000  # difference of the first numbers of two runs
 
 
 async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:
@@ -40,11 +40,11 @@ async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:
         await asyncio.gather(*doing)
     except Exception:
         traceback.print_exc()
-    os._exit(1)  # neither ends by itself, and the thread would continue
+    os._exit(1)  # a task failed: exit, because the thread would continue
 
 
 def fill(spool: Spool, drives: Names, told: Path) -> None:
-    """Append without end."""
+    """Append numbered exchanges forever, and write into `told` how many are stored."""
     runs = len({line.split()[0] for line in told.read_text().splitlines()}) if told.exists() else 0
     first, count, begun = runs * GAP, 0, time.monotonic()
     with told.open("a") as file:

@@ -1,4 +1,4 @@
-/* Drives of different families on one line at the pace of a real wire, as they see it.
+/* Plays drives of different families on one line at the pace of a real wire.
  *
  * Each argument is a drive: ADDRESS:FRAMING:BAUDRATE:CHARACTER_NS:DELAY_NS:SILENCE_NS. It receives only
  * requests at its own baud rate, and answers every read. Each byte of a reply is written when its last bit
@@ -19,8 +19,8 @@
 
 enum { MOST_DRIVES = 247 };
 
-static const int64_t TOLERANCE_NS = 20000; /* a request this much too early still counts as in time */
-static const int64_t SPIN_NS = 80000;      /* a sleep ends this long before its deadline */
+static const int64_t TOLERANCE_NS = 20000; /* a request that is early by less does not count as too early */
+static const int64_t SPIN_NS = 80000;      /* spin for this time before a deadline, instead of sleeping */
 
 struct drive {
     int address, framing;
@@ -36,7 +36,7 @@ static struct {
     long requests, early, refused, cycles; /* a cycle ends when the first request comes again */
     struct md_message first;
     int64_t first_ns, last_ns, cycles_ns;
-    int64_t exchange_ns, ideal_ns; /* of the current request, without the silence; of all earlier ones */
+    int64_t exchange_ns, ideal_ns; /* least time of the last exchange, without silence; of all before it */
 } seen;
 
 static int64_t now_ns(void)
@@ -117,7 +117,7 @@ static int64_t answer(int fd, struct drive *drive, const struct md_message *requ
 
 /* ---- the line ---- */
 
-/* Count a request. The line was silent since quiet_ns; the required silence is silence_ns. */
+/* Count a request that came at came_ns. The line was silent since quiet_ns; silence_ns was required. */
 static void note(const struct md_message *request, int64_t came_ns, int64_t quiet_ns, int64_t silence_ns)
 {
     if (seen.requests++ == 0) {

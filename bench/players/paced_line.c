@@ -1,8 +1,8 @@
-/* A line of Modbus RTU drives at the pace of a real wire, as its drives see it.
+/* Plays a line of Modbus RTU drives at the pace of a real wire.
  *
- * Plays addresses 1..N on a new pty, whose path it prints, until standard input ends. Then it prints the
- * requests and their times as JSON. A request counts as being on the wire for the time of its characters,
- * from its arrival here. Each byte of a reply is written when its last bit would have arrived. */
+ * Plays addresses 1..N on a new pty, whose path it prints, until standard input ends. Then it prints numbers
+ * and times of requests as JSON. A request occupies the wire for the time of its characters, from its arrival
+ * here. Each byte of a reply is written at the time when its last bit would arrive. */
 #define _GNU_SOURCE
 #include "raw_pty.h"
 #include <arpa/inet.h>
@@ -22,9 +22,9 @@
 
 enum { MOST_DRIVES = 247, REQUEST = 8 };
 
-static const int64_t TOLERANCE_NS = 20000; /* a request this much too early still counts as in time */
-static const int64_t SPIN_NS = 80000;      /* a sleep ends this long before its deadline */
-static const int64_t STALE_NS = 50000000;  /* a request that takes longer is discarded */
+static const int64_t TOLERANCE_NS = 20000; /* a request that is early by less does not count as too early */
+static const int64_t SPIN_NS = 80000;      /* spin for this time before a deadline, instead of sleeping */
+static const int64_t STALE_NS = 50000000;  /* a request that takes longer to arrive is discarded */
 
 static struct {
     long baudrate, bits, drives, registers, delay_us, settle_ms; /* baudrate 0: no waits at all */
@@ -42,7 +42,7 @@ struct samples {
 };
 
 static struct samples lateness, excess;
-static int64_t settled_ns, first_ns, last_ns; /* of requests: start of counting, first, last */
+static int64_t settled_ns, first_ns, last_ns; /* times: start of counting, first and last counted request */
 static int64_t pending_ideal_ns, ideal_ns;
 static long answered, unanswered, early, given_up, refused, registers, per_drive[MOST_DRIVES + 1];
 static int is_crossed; /* a request came before the previous reply was complete */
@@ -141,7 +141,7 @@ static uint16_t crc16(const uint8_t *bytes, size_t len)
     return (uint16_t)crc;
 }
 
-/* Build the reply to FC03: register r of address a is 256 * a + r. A missing register is an exception. */
+/* Build the reply to FC03: register r of address a is 256 * a + r. A missing register gives an exception. */
 static size_t make_reply(const uint8_t *request, uint8_t *out)
 {
     unsigned start = (unsigned)(request[2] << 8 | request[3]),
@@ -193,7 +193,8 @@ static int64_t send_reply(int fd, const uint8_t *reply, size_t len, int64_t begi
     return now;
 }
 
-/* Answer a request that came at begun_ns, perhaps with the next one; return when the silence starts. */
+/* Answer a request that came at begun_ns (`has_next`: the next request has come too). Return the time from
+ * which the line is silent. */
 static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t quiet_ns, int has_next)
 {
     uint8_t reply[300];
@@ -209,7 +210,7 @@ static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t 
         if (quiet_ns && character_ns) {
             int is_early = begun_ns < quiet_ns + silence_ns - TOLERANCE_NS;
             early += is_early;
-            given_up += is_early && is_crossed; /* the master no longer waited for the reply */
+            given_up += is_early && is_crossed; /* the master did not wait for the previous reply */
             add(&excess, begun_ns - quiet_ns - silence_ns);
         }
     }
@@ -227,7 +228,7 @@ static int64_t answer(int fd, const uint8_t *request, int64_t begun_ns, int64_t 
     return send_reply(fd, reply, len, end_ns + delay_ns);
 }
 
-/* ---- the line's end ---- */
+/* ---- port ---- */
 
 static int open_tcp(void)
 {
@@ -247,9 +248,9 @@ static int open_tcp(void)
     return fd;
 }
 
-/* Read bytes and their time; return 0 when standard input or the client has ended. Sleeps until they come:
- * spinning would keep the kernel's worker, which carries a pty's bytes, from its processor. So a request is
- * seen some 30 us late, like a reply at the master. */
+/* Read bytes and the time of their arrival; return 0 when standard input or the client has ended. Sleeps until
+ * bytes come: spinning could block the kernel's worker thread that carries a pty's bytes. So a request is
+ * noticed about 30 us late, like a reply at the master. */
 static ssize_t hear(int fd, uint8_t *bytes, size_t room, int64_t *came_ns)
 {
     struct pollfd ready[2] = {{.fd = fd, .events = POLLIN}, {.fd = 0, .events = POLLIN}};
@@ -339,7 +340,7 @@ int main(int argc, char **argv)
     read_options(argc, argv);
     if (options.baudrate) {
         character_ns = options.bits * 1000000000 / options.baudrate;
-        /* serial-line guide 2.5.1.1 */
+        /* Modbus serial-line guide, 2.5.1.1 */
         silence_ns = options.baudrate > 19200 ? 1750000 : character_ns * 7 / 2;
         delay_ns = options.delay_us * 1000;
     }

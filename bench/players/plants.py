@@ -35,14 +35,14 @@ VARIANTS = (  # name, model, framing
 )
 OPTIONS = {"maximum_frequency": 50}
 MOTOR = "fan"
-EVERY = 2.0  # s, period of each drive's first register; the others have no rate
-PATIENCE = 30.0  # s, until the simulator has started
-BEAT = 5e-3  # s
-LONG = 30e-3  # s; with the latest reply and a collision, close to the shortest response time-out
+EVERY = 2.0  # s, period of each drive's first register; the other registers have no rate
+PATIENCE = 30.0  # s, limit for the simulator's start
+BEAT = 5e-3  # s, between two measurements of delays
+LONG = 30e-3  # s; a longer delay of the simulator may make a reply miss its time-out
 
 
 def write_plant(directory: Path, lines: int) -> Path:
-    """Write a plant file; the last of several lines has a TCP port that the simulator chooses."""
+    """Write a plant file; if it has several lines, the last has a TCP port that the simulator chooses."""
     path = directory / "plant.toml"
     tables = []
     for number in range(1, lines + 1):
@@ -63,7 +63,7 @@ def write_plant(directory: Path, lines: int) -> Path:
 
 
 def proofs(plant: Plant) -> dict[tuple[str, str], float]:
-    """Return each register's value, by names of drive and register; those of motors are unknown."""
+    """Return each register's value, by names of drive and register, except for the drives with motors."""
     return {
         (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
         for line in plant.lines
@@ -86,13 +86,13 @@ class RunningPlant:
     _late: SynchronizedArray[float]
 
     def latest(self) -> float:
-        """The longest delay of the simulator or a pty since the last call, in s."""
+        """Return the longest delay of the simulator or a pty since the last call, in s."""
         with self._late.get_lock():
             late, self._late[0] = self._late[0], 0.0
         return late
 
     def was_held_up(self, since: float) -> bool:
-        """Return True if a delay was so long that replies may have come after their time-out."""
+        """Return True if a delay since the time `since` was long enough to make replies miss their time-out."""
         return max(self._late[1:]) >= since
 
 
@@ -114,7 +114,7 @@ def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
 
 @contextmanager
 def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[RunningPlant]:
-    """Run the wires that `make` returns in a separate process, which calls it."""
+    """Simulate the wires that `make(*arguments)` returns in a separate process, which calls `make`."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     late = context.Array("d", 2)  # the longest delay; the time of the last long delay
@@ -138,7 +138,7 @@ def _simulate(
     connection: Connection,
     late: SynchronizedArray[float],
 ) -> None:
-    with suppress(OSError):  # so that the line keeps its pace on a busy machine
+    with suppress(OSError):  # real-time priority keeps the lines' pace on a busy machine
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     Thread(target=_watch, args=(late,), daemon=True).start()
 
@@ -149,9 +149,9 @@ def _simulate(
 
 
 def _watch(late: SynchronizedArray[float]) -> None:
-    """Measure the delays of this process, and of a pty's worker in the kernel.
+    """Measure the delays of this process, and of the kernel's worker for a pty, forever.
 
-    A drive that receives late replies late.
+    A simulated drive that receives a request late also replies late.
     """
     master, slave = os.openpty()
     tty.setraw(slave)

@@ -1,4 +1,4 @@
-/* A raw pty that does not block, and stays alive between clients. */
+/* A non-blocking raw pty that stays open between clients. */
 #ifndef RAW_PTY_H
 #define RAW_PTY_H
 
@@ -14,7 +14,7 @@ static int open_raw_pty(void)
         perror("no pty");
         exit(1);
     }
-    int slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* keeps it alive */
+    int slave = open(ptsname(master), O_RDWR | O_NOCTTY); /* keeps the pty open without a client */
     struct termios raw;
     tcgetattr(slave, &raw);
     cfmakeraw(&raw);
@@ -22,7 +22,7 @@ static int open_raw_pty(void)
     return master;
 }
 
-/* Open one and print its path. */
+/* Open a raw pty, print its path, and return its descriptor. */
 static inline int announce_pty(void)
 {
     int master = open_raw_pty();

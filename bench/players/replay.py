@@ -1,4 +1,4 @@
-"""The drives that paced_line.c and responders.c play, declared as a family of one's own."""
+"""Declarations of the drives that paced_line.c and responders.c play, as a user declares own families."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from multidrop.drive.register import HOLDING, INPUT, reading
 
 
 class Played(Drive):
-    """Register r of address a has the value 256 * a + r."""
+    """A drive of paced_line.c: register r at address a has the value 256 * a + r."""
 
     model = "played"
     title = "Played by paced_line"
@@ -20,7 +20,7 @@ class Played(Drive):
 
 
 class NoTime(Settings):
-    """Characters that take almost no time, so that fewer of them are still better."""
+    """Settings with characters that take almost no time, but not 0: plans still prefer fewer characters."""
 
     @property
     def character(self) -> float:
@@ -32,7 +32,7 @@ class NoTime(Settings):
 
 
 class Unpaced(Played):
-    """The same on a line without waits, which shows the host's own cost."""
+    """The same drive on a line without waits, on which the host's own cost is measured."""
 
     response_delay = 0.0
 
@@ -42,7 +42,7 @@ class Unpaced(Played):
 
 
 class Unreliable(Unpaced):
-    """Played by responders: four blocks of one length, whose replies differ only in their values."""
+    """A drive of responders.c with four blocks of equal length, whose replies differ only in their values."""
 
     model = "unreliable"
     title = "Played by responders"
@@ -58,6 +58,6 @@ class Unreliable(Unpaced):
 
     @classmethod
     def held(cls, address: int, name: str) -> int:
-        """Return the value of this register of the drive with this address."""
+        """Return the value that the register with this name has in the drive with this address."""
         register = cls.register(name)
         return 256 * address + register.address + (128 if register.table is INPUT else 0)

@@ -1,4 +1,4 @@
-/* A server that answers every 8-byte request at once with 10 registers, on a new pty, whose path it prints.
+/* Answers every 8-byte request immediately with 10 registers, on a new pty, whose path it prints.
  * Runs until standard input ends. */
 #define _GNU_SOURCE
 #include "raw_pty.h"

@@ -1,11 +1,11 @@
-/* Drives at the far ends of any number of lines, in one thread. Each reply is scheduled, so that even many
- * lines cost little.
+/* Plays the drives on any number of lines in one thread. Replies are scheduled, so that many lines need little
+ * CPU time.
  *
- * Each register's value is 256 * address + register, and 128 more for function 04. A reply comes at once, or
- * when it would have been complete on a wire of --baudrate. Some replies are late by up to --late-us, never
- * by more; some are lost, and some come twice. All replies of a line come --path-us later, in order. Those
- * due in the first --stall-us of each --stall-every-us come at the end of that time. Lines are inherited
- * descriptors, or new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
+ * Each register's value is 256 * address + register, and 128 more for function 04. A reply comes immediately,
+ * or when it would be complete on a wire of --baudrate. Some replies are late by up to --late-us, some are
+ * lost, and some come twice. All replies of a line come --path-us later, in order. Replies due in the first
+ * --stall-us of each --stall-every-us are delayed until the stall's end. Lines are inherited descriptors, or
+ * new ptys, whose paths are printed. Runs until standard input ends, then prints counts as JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
 #include "raw_pty.h"
@@ -30,14 +30,14 @@ static struct {
 
 struct line {
     int fd;
-    int64_t last_due_ns; /* a path keeps the order */
+    int64_t last_due_ns; /* of the last reply: a path keeps the order of replies */
     size_t have;
     uint8_t received[256];
 };
 
 /* Pending replies: a heap, with the earliest one at 0. */
 struct reply {
-    int64_t due_ns, last_ns; /* after this time it is lost */
+    int64_t due_ns, last_ns; /* when to send it; after last_ns it counts as lost */
     int fd;
     uint16_t len;
     uint8_t bytes[MOST_REPLY];
@@ -97,7 +97,7 @@ static void hand_over(const struct reply *reply)
         lost++;
         return;
     }
-    (void)!write(reply->fd, reply->bytes, reply->len); /* the client may have ended */
+    (void)!write(reply->fd, reply->bytes, reply->len); /* ignore errors: the client may have ended */
 }
 
 static int happens(long permille)
@@ -122,7 +122,7 @@ static void make_reply(struct reply *reply, const uint8_t *request)
     reply->bytes[reply->len - 1] = (uint8_t)(crc >> 8);
 }
 
-/* Return the time at which bytes that enter the line's path at `at_ns` leave it. */
+/* Return when bytes that enter the line's path at `at_ns` leave it, after its delay and stalls. */
 static int64_t through_path(struct line *line, int64_t at_ns)
 {
     int64_t due_ns = at_ns + options.path_us * 1000;
@@ -131,7 +131,7 @@ static int64_t through_path(struct line *line, int64_t at_ns)
         if (since_ns < options.stall_us * 1000)
             due_ns += options.stall_us * 1000 - since_ns;
     }
-    if (due_ns <= line->last_due_ns) /* the heap does not keep the order of equal times */
+    if (due_ns <= line->last_due_ns) /* make times distinct: the heap does not keep the order of equal ones */
         due_ns = line->last_due_ns + 1;
     line->last_due_ns = due_ns;
     return due_ns;
@@ -148,7 +148,7 @@ static void answer(struct line *line, const uint8_t *request, int64_t came_ns)
     }
     if (happens(options.twice_permille) && reply.len <= MOST_REPLY / 2) {
         twice++;
-        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* one after the other, as on a wire */
+        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* both copies in succession, as on a wire */
         reply.len = (uint16_t)(2 * reply.len);
     }
     reply.due_ns = came_ns + (REQUEST + reply.len) * character_ns + options.delay_us * 1000;

@@ -8,11 +8,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-PIECE = 64  # bytes that are forwarded at once
+PIECE = 64  # limit in bytes for a piece that is forwarded as a whole
 
 
 class SlowWay:
-    """Forward `port` to another port at `rate` bytes per second; None means unlimited."""
+    """Forward connections to `port` to the server's port, at `rate` bytes per second (None: unlimited)."""
 
     def __init__(self, server: int) -> None:
         self.rate: float | None = None
@@ -25,7 +25,7 @@ class SlowWay:
         self._listener.close()
 
     def _accept(self) -> None:
-        with suppress(OSError):  # it is closed
+        with suppress(OSError):  # the listener was closed
             while True:
                 client, _ = self._listener.accept()
                 server = socket.create_connection(("127.0.0.1", self._server))
@@ -35,7 +35,7 @@ class SlowWay:
                     threading.Thread(target=self._pass_on, args=ends, daemon=True).start()
 
     def _pass_on(self, source: socket.socket, sink: socket.socket) -> None:
-        free = 0.0  # when the earlier bytes are through
+        free = 0.0  # time at which all earlier bytes are forwarded
         with suppress(OSError):
             while piece := source.recv(PIECE if self.rate else 1 << 16):
                 if self.rate:

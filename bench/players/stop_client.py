@@ -1,4 +1,4 @@
-"""A client under attack: it reads one command per line, and reports each result with its time."""
+"""A client to be attacked: it reads one command per line of its input, and reports each result with its time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def tell(what: str, **more: Any) -> None:
 
 
 def told(call: Callable[[], object]) -> str:
-    """Return the error of a call as text; empty if it did not fail."""
+    """Call the function; return its error as text, or "" without an error."""
     try:
         call()
     except Exception as failure:
@@ -40,7 +40,7 @@ def told(call: Callable[[], object]) -> str:
 
 
 class Client:
-    """Buses with their drives; each method carries out one command."""
+    """The client's buses and drives; each public method carries out one command."""
 
     def __init__(self, buses: Sequence[Bus]) -> None:
         self.buses = buses
@@ -70,7 +70,7 @@ class Client:
         tell("called", failure=failure, start=found[0])
 
     def start_aside(self, drive: int, verb: str) -> None:
-        """Start a motor in a thread, and return at once."""
+        """Start a motor in another thread, and return immediately."""
         threading.Thread(target=told, args=(getattr(self.drives[drive], verb),), daemon=True).start()
         tell("asked")
 
@@ -88,7 +88,7 @@ def attached(stack: ExitStack, port: str, drives: Sequence[Drive]) -> Bus:
 
 
 def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Drive]]) -> list[Bus]:
-    """Return the buses of a poller that reads two registers of each drive as fast as possible."""
+    """Start a poller that reads two registers of each drive as fast as possible; return its buses."""
     lines = []
     for port, found in zip(ports, drives, strict=True):
         asked = [PolledDrive(each, tuple(Polled(reg, None) for reg in each.readings()[:2])) for each in found]
@@ -97,7 +97,7 @@ def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Dri
 
 
 def main() -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT by default
     given = json.loads(sys.argv[1])
     drives = [
         [FAMILIES[kind](at, name=f"{kind}-{number}-{at}", **KINDS[kind].makes) for kind, at in found]

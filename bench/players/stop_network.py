@@ -1,4 +1,4 @@
-"""A network between client and responder that can be cut in the direction of the responder only."""
+"""A network between client and responder that can be cut in one direction: from client to responder."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LISTEN = (
 
 
 class Network:
-    """A network namespace with an interface that is connected to one of this namespace."""
+    """A second network namespace, connected to this process's namespace by a pair of interfaces."""
 
     def __init__(self) -> None:
         self.name = f"stops{os.getpid()}"
@@ -57,7 +57,7 @@ class Network:
             _ip("netns", "del", self.name)
 
     def listen(self) -> socket.socket:
-        """Return a listening socket in the namespace, owned by this process."""
+        """Return a socket of this process that listens in the second namespace."""
         ours, theirs = socket.socketpair()
         with ours, theirs:
             words = [
@@ -127,7 +127,9 @@ def _cut_one(
     counters: Counters,
     is_long: bool,
 ) -> None:
-    """Start twice with a network, to count the reads before a start, and once with a cut network."""
+    """Start a motor twice, to count the reads before a start; then start it while the network is cut.
+
+    Count a frame that moves the motor after the client reported that the start failed."""
     looks = 0
     for _ in range(2):
         begun = len(line.log)
@@ -149,7 +151,7 @@ def _cut_one(
         client.hear("left")
     time.sleep(chance.uniform(0.0, 10.0) if is_long else 0.0)
     made.mend()
-    time.sleep(3.0 if is_long else 1.5)  # TCP delivers its held-back bytes now
+    time.sleep(3.0 if is_long else 1.5)  # during this time TCP retransmits bytes that were lost
     counters.rounds += 1
     late = [each for each in client.received(line, 1, "moves") if each.at > told_ns]
     counters.moved += len(late)

@@ -1,4 +1,4 @@
-"""The responders and the client of one attack, and the results of its stops."""
+"""The client process and the responders of one attack, and the counters of the stops' results."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from responder import ReceivedFrame, Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 
 CLIENT = "bench.players.stop_client"
-PATIENCE = 150.0  # s, for a client to end by itself
+PATIENCE = 150.0  # s, limit for a client's end
 
 
 @dataclass
 class Counters:
-    """Requested stops, one for each motor, and their results."""
+    """The numbers of requested stops (one for each motor) and of their results."""
 
     rounds: int = 0
     asked: int = 0
-    turning: int = 0  # motors that still turn afterwards
+    turning: int = 0  # motors that still turn after the stop
     moved: int = 0  # frames that move a motor after its stop
     unsent: int = 0  # stops that never reached the wire
     excused: int = 0  # motors that turn after an aborted stop that was reported
@@ -42,7 +42,7 @@ class Counters:
 
 
 class Victim:
-    """A client process, its responders, and the time of the request to stop."""
+    """A client process to be attacked, its responders, and the time at which stops were requested."""
 
     def __init__(self, far: Responder, process: subprocess.Popen[str], errors: Path) -> None:
         self.far = far
@@ -58,7 +58,7 @@ class Victim:
         self.process.stdin.flush()
 
     def hear(self, what: str) -> dict[str, Any]:
-        """Return the client's next report; empty if it has ended."""
+        """Return the client's next report, of the kind `what`; {} if the client has ended."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             said: dict[str, Any] = json.loads(line)
@@ -72,7 +72,7 @@ class Victim:
         self.process.stdin.close()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal; the first one requests the stops."""
+        """Send a signal to the client; the first signal is the request to stop."""
         if not self.asked_ns:
             self.asked_ns = time.monotonic_ns()
         self.process.send_signal(number)
@@ -87,7 +87,7 @@ class Victim:
         return self._errors.read_text()
 
     def begin(self, *, turning: bool) -> None:
-        """Start a new episode; its motors are set turning, or left as they are."""
+        """Start a new episode: forget earlier frames and, with `turning`, set all motors turning."""
         self.asked_ns = 0
         for line in self.lines:
             self._begun[line] = len(line.log)
@@ -96,14 +96,14 @@ class Victim:
                     drive.turn()
 
     def hold(self, requests: int) -> None:
-        """Stop answering on the first line after that many requests, until `release`."""
+        """Stop answering on the first line after `requests` requests, until `release` is called."""
         self.far.do(lambda: self.lines[0].hold(requests))
 
     def release(self) -> None:
         self.far.release(self.lines[0])
 
     def received(self, line: ResponderLine, address: int, what: str) -> list[ReceivedFrame]:
-        """Return the frames of this kind that the drive received in this episode."""
+        """Return the frames of the kind `what` (such as "stops") that the drive received in this episode."""
         return [
             each
             for each in line.log[self._begun.get(line, 0) :]
@@ -111,7 +111,7 @@ class Victim:
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
-        """Count the results of the stops of all drives."""
+        """Count the results of this episode's stops. With `excuse`, motors may turn: the client reported it."""
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():
@@ -144,7 +144,7 @@ def victim(
     ramp: float = 0.0,
     far: Responder | None = None,
 ) -> Iterator[Victim]:
-    """Yield a ready client, with one line for each list of kinds and addresses."""
+    """Yield a client that is ready, with a line for each list of (kind of drive, address) in `plant`."""
     with TemporaryDirectory(prefix="multidrop-stops-") as name:
         directory = Path(name)
         if far is None:
