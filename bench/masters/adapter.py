@@ -29,7 +29,7 @@ LEASE_NS = 3600 * 1_000_000_000
 
 
 def silence(baudrate: int) -> float:
-    """Return multidrop's silence between two exchanges in s, which includes a bit time for a second stop bit."""
+    """Return multidrop's silence between two exchanges in s, with one bit time for a second stop bit."""
     drive = Played(1, baudrate=baudrate)
     return drive.needed_silence() + drive.settings.bit
 

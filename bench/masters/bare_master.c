@@ -1,5 +1,5 @@
-/* The baseline for one line: a master that does the minimum. It writes a request, reads the reply with poll(2),
- * checks only its length, and keeps the silence. Prints the results as JSON. */
+/* The baseline for one line: a master that does the minimum. It writes a request, reads the reply with
+ * poll(2), checks only its length, and keeps the silence. Prints the results as JSON. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <errno.h>

@@ -1,5 +1,5 @@
-/* The baseline for jitter: writes a request at fixed intervals, sleeps in between, and prints the delay of each
- * request in ns. */
+/* The baseline for jitter: writes a request at fixed intervals, sleeps in between, and prints the delay of
+ * each request in ns. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <stdint.h>

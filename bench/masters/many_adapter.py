@@ -130,7 +130,7 @@ def mixed() -> Mixed:
             )
         )
         for drive in drives
-        for demanded in [drive.needed_silence() + drive.settings.bit]  # around ASCII frames multidrop waits longer
+        for demanded in [drive.needed_silence() + drive.settings.bit]  # multidrop waits longer around ASCII
     ]
     return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
@@ -157,7 +157,7 @@ class Judged:
     beyond: int = 0  # of `wrong`: replies that came later than three time-outs
     late: int = 0  # replies that were recognised after their time-out
     misses: Counter[str] = field(default_factory=Counter)
-    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered requests, by drive and value
+    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered, by drive and value
 
 
 def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:

@@ -248,9 +248,9 @@ static int open_tcp(void)
     return fd;
 }
 
-/* Read bytes and the time of their arrival; return 0 when standard input or the client has ended. Sleeps until
- * bytes come: spinning could block the kernel's worker thread that carries a pty's bytes. So a request is
- * noticed about 30 us late, like a reply at the master. */
+/* Read bytes and the time of their arrival; return 0 when standard input or the client has ended. Sleeps
+ * until bytes come: spinning could block the kernel's worker thread that carries a pty's bytes. So a request
+ * is noticed about 30 us late, like a reply at the master. */
 static ssize_t hear(int fd, uint8_t *bytes, size_t room, int64_t *came_ns)
 {
     struct pollfd ready[2] = {{.fd = fd, .events = POLLIN}, {.fd = 0, .events = POLLIN}};

@@ -92,7 +92,7 @@ class RunningPlant:
         return late
 
     def was_held_up(self, since: float) -> bool:
-        """Return True if a delay since the time `since` was long enough to make replies miss their time-out."""
+        """Return True if a delay after the time `since` may have made replies miss their time-out."""
         return max(self._late[1:]) >= since
 
 

@@ -1,5 +1,5 @@
-/* Plays the drives on any number of lines in one thread. Replies are scheduled, so that many lines need little
- * CPU time.
+/* Plays the drives on any number of lines in one thread. Replies are scheduled, so that many lines need
+ * little CPU time.
  *
  * Each register's value is 256 * address + register, and 128 more for function 04. A reply comes immediately,
  * or when it would be complete on a wire of --baudrate. Some replies are late by up to --late-us, some are

@@ -1,4 +1,4 @@
-"""A client to be attacked: it reads one command per line of its input, and reports each result with its time."""
+"""A client to be attacked: it reads one command per line, and reports each result with its time."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Dri
 
 
 def main() -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT by default
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores SIGINT otherwise
     given = json.loads(sys.argv[1])
     drives = [
         [FAMILIES[kind](at, name=f"{kind}-{number}-{at}", **KINDS[kind].makes) for kind, at in found]

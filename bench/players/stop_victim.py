@@ -111,7 +111,7 @@ class Victim:
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
-        """Count the results of this episode's stops. With `excuse`, motors may turn: the client reported it."""
+        """Count the results of this episode's stops; `excuse`: the client reported an aborted stop."""
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():

@@ -1,1 +1,1 @@
-"""One question a script."""
+"""Each script of this package answers one question by measurements."""

@@ -1,6 +1,6 @@
-"""The polling rate, and the delay of results, beside a busy Python thread.
+"""The polling rate and the delay of results, alone and while another Python thread computes.
 
-`python -m bench.questions.cadence MASTER JOB` is the process of one master; its results come as JSON.
+`python -m bench.questions.cadence MASTER JOB` is the process of one master; it prints its results as JSON.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def of_multidrop(job: Job) -> tuple[int, numpy.ndarray]:
 
 
 def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
-    """Return the number of good exchanges, and the time of each call beyond its time on the wire, in ms."""
+    """Return the number of good exchanges, and for each the time in ms that its call took beyond the wire's."""
     wire = job.wire if job.baudrate else 0.0
     took: list[float] = []
     with rivals.pymodbus(job) as read:
@@ -51,7 +51,7 @@ MASTERS = {"multidrop": of_multidrop, "pymodbus": of_pymodbus}
 
 
 def work(master: str, job: Job) -> None:
-    """Print rate and delay as JSON: first alone, and then beside the busy thread."""
+    """Print a master's rate and delays as JSON: first alone, then while another thread computes."""
     told = {}
     for when in ("alone", "beside"):
         if when == "beside":

@@ -1,7 +1,7 @@
-"""Polling of a line beside threads that read without pause.
+"""The rate of polling a line while threads read from its drives without pause.
 
 16 drives at the pace of a wire are polled as fast as the line allows. Each thread calls `drive.read_many`
-in a loop, and its exchanges go ahead of polling.
+in a loop; its exchanges have priority over polling.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
                 drive.read_many(drive.readings())
                 took.append(time.monotonic() - begun)
 
-        time.sleep(1.0)  # to measure the delays
+        time.sleep(1.0)  # the poller learns the response delays
         readers = [threading.Thread(target=read, args=[bus.drives[at]]) for at in range(threads)]
         before, begun = adapter.counts(poller)[0], time.monotonic()
         for reader in readers:

@@ -1,4 +1,4 @@
-"""Fixtures: a server in C that answers at once, and a bare client loop in C."""
+"""Fixtures: a server in C that answers immediately, and a minimal client loop in C."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def compiled(source: str, target: Path, *flags: str) -> Path:
 
 @pytest.fixture(scope="session")
 def responder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Path of an unpaced pty on which address 1 answers every request with ten registers."""
+    """Yield the path of a pty on which address 1 immediately answers every request with ten registers."""
     program = compiled("players/responder.c", tmp_path_factory.mktemp("responder") / "responder")
     with subprocess.Popen([program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -1,7 +1,7 @@
-"""The share of your device templates that the register model can represent, and the reasons for the rest.
+"""The share of device templates that the library can represent, and the reasons why it cannot do the rest.
 
-It reads a folder of other programs' files, in any layout that `multidrop import` reads. It declares each
-entry as its program uses it, read or written, so the library itself decides.
+Reads a folder with files of other programs, in any format that `multidrop import` reads. Each entry is
+declared as its program uses it, for reading or writing; the library accepts or rejects the declaration.
 
 This repository contains none of the public collections. Use one whose licence allows it, or your own files.
 """
@@ -18,13 +18,13 @@ from bench.support.holding import DETAILS, Holding, family_of, holdings
 from bench.support.tables import heading, show
 from multidrop.importers import SUFFIXES, ImportedDevice, all_devices
 
-MOST_SHOWN = 15  # remarks in the report
+MOST_SHOWN = 15  # limit of remarks in the report
 # A number or a name in a reason: reasons that differ only in these count together.
 _DETAIL = re.compile(r"\b((?<=scale register )\w+|0x[0-9a-fA-F]+|[0-9A-F]{4}H|\d+)\b")
 
 
 def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
-    """Return the devices of all files below a folder, and a sentence for each file that has none."""
+    """Return the devices in all files below a folder, and a sentence for each file without devices."""
     found: list[ImportedDevice] = []
     unread: list[str] = []
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
@@ -41,7 +41,7 @@ def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
 
 
 class Coverage:
-    """Counts of representable entries of devices."""
+    """Counts the entries of devices that the library can represent."""
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
@@ -61,13 +61,13 @@ class Coverage:
         return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each detail, the entries that need it, and the representable ones among them."""
+        """Yield each detail with the number of entries that need it, and of those that are representable."""
         for key, words in DETAILS.items():
             needing = [entry for entry in self.entries if key in entry.details]
             yield words, len(needing), sum(entry.is_whole for entry in needing)
 
     def lacking(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each reason, and the numbers of entries and of devices that it excludes."""
+        """Yield each reason for rejection, with the numbers of rejected entries and of their devices."""
         entries, devices = Counter[str](), Counter[str]()
         for _, found in self.by_device:
             reasons = [_lack(entry) for entry in found if entry.lacks]
@@ -76,7 +76,7 @@ class Coverage:
         yield from ((reason, count, devices[reason]) for reason, count in entries.most_common())
 
     def besides(self) -> Iterator[tuple[str, int]]:
-        """Yield each remark of the importers on representable entries, and how often they make it."""
+        """Yield each remark of the importers on representable entries, with its number of occurrences."""
         said = Counter(
             _DETAIL.sub("N", gap) for entry in self.entries if entry.entry for gap in entry.entry.gaps
         )
@@ -95,7 +95,7 @@ def _lack(entry: Holding) -> str:
 
 
 def report(coverage: Coverage, unread: list[str]) -> None:
-    """Print the shares, the required details, and the reasons for missing entries."""
+    """Print the shares of representable entries and devices, the needed details, and reasons for rejection."""
     entries, devices = coverage.entries, len(coverage.by_device)
     held = sum(entry.is_whole for entry in entries)
     readable = sum(entry.is_held for entry in entries)

@@ -1,6 +1,6 @@
-"""Conversion of RTU captures to columns on one core, in megabytes of frames per second.
+"""The speed of decoding RTU captures to columns on one CPU core, in megabytes of frames per second.
 
-Every capture is read from memory. Each packet has one frame, without any information about its sender.
+Captures are in the page cache. Each packet has one frame, without information about its sender.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from multidrop.capture import Capture, Decoding
 from multidrop.core import Framing, Message, build_reply, build_request
 
 USER_LINK_TYPE = 147
-EXCHANGES = 2000  # different ones
+EXCHANGES = 2000  # number of different exchanges, repeated in a capture
 
 
 def main() -> None:
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def write(path: Path, registers: int, least_bytes: float) -> int:
-    """Write a capture with at least that many bytes of frames; return the actual number."""
+    """Write a capture with at least `least_bytes` bytes of frames; return their actual number."""
     records, size = [], 0
     for time_us, frame in enumerate(frames(registers)):
         records.append(struct.pack("<IIII", 0, time_us, len(frame), len(frame)) + frame)
@@ -63,7 +63,7 @@ def frames(registers: int) -> Iterator[bytes]:
 
 
 def decoded(path: Path) -> tuple[int, float]:
-    """Return the number of values, and the CPU seconds that decoding them took."""
+    """Decode a capture; return the number of values, and the CPU seconds."""
     begun = time.process_time()
     with Capture(path) as capture:
         values = sum(map(len, Decoding(capture)))

@@ -1,7 +1,7 @@
-"""Cost of faults on a paced line: stray bytes, silent drives, refused requests.
+"""The cost of faults on a paced line: stray bytes, silent drives, refused requests.
 
-31 drives at 38400 baud, or `--drives` of them. Each rate is divided by the rate of the same plant without the
-stray bytes, or without the silent drives, measured immediately before. All figures are medians.
+The line has 31 drives (or `--drives`) at 38400 baud. Each rate is divided by the rate of the same plant
+without the stray bytes, or without the silent drives, measured immediately before. All figures are medians.
 `python -m bench.questions.faults MASTER JOB` is the process of a master whose requests are refused.
 """
 
@@ -26,12 +26,14 @@ from bench.support.programs import module, paced_line
 DRIVES = 31
 BAUDRATE = 38400
 REFUSALS = 20
-CHARACTERS = 8 + 5  # of a request and of its exception reply
+CHARACTERS = 8 + 5  # in a request and its exception reply
 WIRE_MS = CHARACTERS * 10 / BAUDRATE * 1e3 + 2
 
 
 def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: Any) -> tuple[float, float]:
-    """Return the replies per second after the settling time, and the share of good exchanges."""
+    """Let a master poll a line with this fault; return replies per second, and the share of good exchanges.
+
+    Replies before the settling time are not counted."""
     settle_ms = round(arguments.settle * 1000)
     with paced_line(baudrate=BAUDRATE, drives=drives, settle_ms=settle_ms, **fault) as line:
         own = rivals.measure(master, Job(line.path, BAUDRATE, arguments.settle + arguments.seconds, drives))
@@ -40,7 +42,7 @@ def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: A
 
 
 def cases(drives: int, silent: list[int]) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Yield each fault's name, the drives of the plant without the fault, and the line's options for it."""
+    """Yield each fault's name, the number of drives without the fault, and paced_line's options for it."""
     yield "00 before every reply", drives, {"stray": True}
     for dead in silent:
         living = drives - dead
@@ -72,14 +74,14 @@ READERS = {"multidrop": of_multidrop, **rivals.READERS}
 
 
 def ask_in_vain(master: str, job: Job) -> None:
-    """Print, as JSON, the ms until each call reported the drive's refusal, and its error text."""
+    """Print as JSON how many ms each call took to report that the drive refused, and the error's text."""
     took, said = [], "an empty answer"
     with READERS[master](job) as read:
         for at in range(REFUSALS):
             begun = time.monotonic()
             try:
                 read(1 + at % job.drives)
-            except Exception as failure:  # each master has errors of its own
+            except Exception as failure:  # each master has its own error classes
                 said = str(failure) or type(failure).__name__
             took.append(1e3 * (time.monotonic() - begun))
     print(json.dumps({"took": took, "said": said.splitlines()[0]}))

@@ -1,9 +1,9 @@
-"""Requests from a suspended master on lines that another master has taken over, as seen from the far end.
+"""Does a suspended master send requests on lines that another master has taken over? Counted by the drives.
 
-A process polls 10 socket:// lines under a lease, and is stopped (SIGSTOP) at a random moment. Another process
-takes over when, by its own clock, the last renewal is older than lease and guard. Then the first one
-continues. There are three kinds: with the clock check and the kernel's timer, with the check only, and
-without both. Exits with 1 if the first kind let a request through, or if the last kind did not.
+A process polls 10 socket:// lines under a lease, and is suspended (SIGSTOP) at a random moment. Another
+process takes over when, by its own clock, the last renewal is older than lease and guard. Then the first
+process continues. The first one runs in three kinds: with the clock check and the kernel's timer, with the
+check only, and without either. Exits with 1 if a request got through with both, or if none did without.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def rounds(kind: str, stops: int, lines: int, lease: float, guard: float, seed: 
 
 
 def side_by_side(kind: str, stops: int, details: argparse.Namespace) -> list[Round]:
-    """Distribute the suspensions over processes; each has lines and masters of its own."""
+    """Distribute `stops` suspensions over processes, each with its own lines and masters; return the results."""
     jobs = details.jobs
     shares = [stops // jobs + (job < stops % jobs) for job in range(jobs)]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:

@@ -1,9 +1,9 @@
-"""Does a real gateway in a large fleet keep the rate of its lines, as a poller alone does?
+"""Does a gateway in a large fleet poll its lines at their configured rate, like a poller alone?
 
 A fleet of 20 gateways on three real NATS nodes has thousands of lines, all on this machine. 19 gateways are
-only state machines, whose lines do not exist. The real one polls its share: some 500 lines on TCP sockets
-with one drive each. Before that, `multidrop poll` polls the same lines alone. Two cores can poll so many
-lines only at a modest rate: twice a second by default. The rates are measured from the drives' side.
+only state machines, whose lines do not exist. The real gateway polls its share: some 500 lines on TCP
+sockets with one drive each. Before that, `multidrop poll` polls the same lines alone. Two CPU cores can poll
+500 lines only at a modest rate: twice a second by default. The simulated drives measure the rates.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SETTLE_S = 5.0
 
 
 class Seen(NamedTuple):
-    """One run, from the drives' side; the CPU time is that of the polling process."""
+    """The results of one run as the simulated drives measured them, and the polling process's CPU time."""
 
     requests: int
     longest_s: float
@@ -58,7 +58,7 @@ def main() -> None:
     own = [line for line, gateway in shares.items() if gateway == REAL]
 
     def run(words: Sequence[str]) -> Seen:
-        """Poll the lines of `hall` with this `multidrop` command."""
+        """Poll the lines of `hall` with this `multidrop` command; yield when it has started."""
         log, command = Path(folder) / "log", [sys.executable, "-m", "multidrop", *words]
         with (
             log.open("wb") as output,
@@ -112,7 +112,7 @@ def main() -> None:
 
 
 def seconds_of(text: str) -> float:
-    """Return the seconds of "500 ms" or "2 s"."""
+    """Convert a time such as "500 ms" or "2 s" to seconds."""
     number, unit = text.split()
     return float(number) * {"ms": 0.001, "s": 1.0}[unit]
 

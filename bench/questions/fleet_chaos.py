@@ -1,10 +1,10 @@
-"""Is a sample lost or doubled between a poller and the sinks, whatever process is killed?
+"""Is a sample lost or doubled between a poller and the sinks if any of the processes are killed?
 
-Two gateways append known samples and note which ones were reported as stored. Three NATS nodes forward the
-samples. One hub stores them in Parquet files, another in PostgreSQL. For some minutes all these processes are
-killed (SIGKILL) at random moments, alone or together, and some stay away for seconds. Then all run until they
-are done, and both sinks are compared with the notes. Exits with 1 if a noted sample is missing, or if any
-sample is stored twice.
+Two gateways append known samples, and note which samples their spool reported as stored. Three NATS nodes
+forward the samples. One hub stores them in Parquet files, another in PostgreSQL. For some minutes all these
+processes are killed (SIGKILL) at random moments, alone or together, and some restart only after seconds. Then
+all processes run until every sample is forwarded, and both sinks are compared with the notes. Exits with 1
+if a noted sample is missing, or if any sample is stored twice.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from multidrop.fleet.samples.samples_stream import create_stream, last_of, sampl
 
 ROOT = Path(__file__).parents[2]
 GATEWAYS = ("gateway-1", "gateway-2")
-PATIENCE_S = 300.0  # until all must be done after the last kill
+PATIENCE_S = 300.0  # limit from the last kill until every sample is stored
 
 Numbers = dict[str, Counter[int]]  # by gateway: the number of copies of each exchange
 
@@ -49,7 +49,7 @@ class Process:
         self.start()
 
     def start(self) -> None:
-        with self._log.open("ab") as log:  # in this directory, for `bench`; the library is installed
+        with self._log.open("ab") as log:  # cwd=ROOT makes `bench` importable
             self.process = subprocess.Popen(
                 self._words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=ROOT
             )
@@ -62,7 +62,7 @@ class Process:
         return self.process.poll() is not None
 
     def check_alive(self) -> None:
-        """Raise AssertionError with the end of its log if it ended by itself."""
+        """Raise AssertionError with the end of the program's log if the program ended by itself."""
         assert not self.is_over(), f"it ended by itself: {self._log.read_text()[-1000:]}"
 
 
@@ -87,7 +87,7 @@ class Chaos:
         return Process(self.folder, name, *words)
 
     def await_told(self) -> None:
-        """Wait until each gateway has stored samples: before that, none can be lost."""
+        """Wait until each gateway has noted stored samples. Earlier attacks could not lose any."""
         ends = time.monotonic() + PATIENCE_S
         while not all(sum(runs.values()) for runs in told(self.folder).values()):
             for gateway in self.gateways:
@@ -96,7 +96,7 @@ class Chaos:
             time.sleep(0.1)
 
     def round(self) -> None:
-        """Make one random attack, and let all processes run for a while."""
+        """Make one random attack; then let all processes run for a while."""
         attacks: tuple[tuple[str, Callable[[], None]], ...] = (
             ("gateway", self._gateway),
             ("node", self._node),
@@ -112,7 +112,7 @@ class Chaos:
         self.counts[name] += 1
         self._wait(0.2, 6.0)  # an election takes 4 to 9 s
         for hub in self.hubs:
-            if hub.is_over():  # it ended without an attack
+            if hub.is_over():  # the hub ended without an attack
                 self.counts["hub ended by itself"] += 1
                 hub.start()
 
@@ -176,7 +176,7 @@ class Chaos:
                 gateway.start()
 
     def settle(self) -> None:
-        """Kill all gateways and hubs, and let all stored samples reach the sinks."""
+        """Kill and restart all gateways and hubs, and wait until all stored samples have reached the sinks."""
         self.close()
         self.servers.wait()
         self.database.wait()
@@ -191,12 +191,12 @@ class Chaos:
             self.hubs[at].process.wait(PATIENCE_S)
 
     async def _forwarded(self) -> None:
-        """Wait until the stream has the newest message of each spool."""
+        """Wait until the NATS stream has the newest message of each gateway's spool."""
         ends = time.monotonic() + PATIENCE_S
         async with samples_path(self.servers.urls) as path:
             for name, gateway in zip(GATEWAYS, self.gateways, strict=True):
                 stored = [int(file.name[:12]) for file in (self.folder / name).glob("*.arrows")]
-                if not stored:  # it was always killed before it stored a sample
+                if not stored:  # the gateway was always killed before it stored a sample
                     continue
                 log = subject_of(name, _log_of(self.folder / name))
                 while True:
@@ -215,7 +215,7 @@ def _log_of(folder: Path) -> str:
 
 
 def told(folder: Path) -> dict[str, dict[int, int]]:
-    """Return the number of exchanges reported as stored, by gateway and the first number of each run."""
+    """Return the noted numbers of stored exchanges, by gateway and by the first number of each run."""
     found: dict[str, dict[int, int]] = {}
     for name in GATEWAYS:
         runs: dict[int, int] = defaultdict(int)
@@ -250,7 +250,7 @@ def in_postgres(database: Postgres) -> Numbers:
 
 
 def compare(of: dict[str, dict[int, int]], kept: Numbers) -> tuple[int, int, int, int]:
-    """Return the numbers of noted exchanges, of missing ones among them, of holes in runs, and of doubles."""
+    """Return how many exchanges were noted, how many of these are missing, and counts of gaps and doubles."""
     missing = holes = 0
     for name, runs in of.items():
         numbers = kept[name]
@@ -274,7 +274,7 @@ def everything(folder: Path, dice: random.Random) -> Iterator[Chaos]:
                     with suppress(FleetError):
                         await create_stream(path, replicas=3)
                         return
-                    await asyncio.sleep(0.2)  # no leader yet
+                    await asyncio.sleep(0.2)  # the NATS cluster has no leader yet
 
         asyncio.run(make())
         chaos = Chaos(folder, servers, database, dice)
@@ -283,7 +283,7 @@ def everything(folder: Path, dice: random.Random) -> Iterator[Chaos]:
 
 
 def run(folder: Path, seconds: float, dice: random.Random) -> int:
-    """Attack for that long, compare, and return the number of errors."""
+    """Attack for `seconds`, compare sinks and notes, print the results, and return the number of errors."""
     with everything(folder, dice) as chaos:
         chaos.await_told()
         ends = time.monotonic() + seconds

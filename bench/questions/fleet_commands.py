@@ -1,10 +1,10 @@
-"""Is a command of a fleet carried out twice, or its result reported wrongly, under attack?
+"""Under attack, is a fleet's command carried out twice, or its result reported wrongly?
 
 Three gateways and three NATS nodes are killed (SIGKILL) and suspended (SIGSTOP, gateways for up to 3.5 s) at
-random moments. Meanwhile callers write setpoints to the simulated drives of their lines. Some of their
-messages are doubled, at once or seconds later, and some are late. Every 20th command is a stop. The drives'
-own lists of writes show the truth. Exits with 1 if a command was carried out twice, if its caller got a wrong
-result, or if an executed command is missing in its gateway's log.
+random moments. Meanwhile callers write setpoints to simulated drives on the gateways' lines. Some of their
+messages are doubled, immediately or seconds later, and some are late. Every 20th command is a stop. The
+simulated drives list the writes that they receive. Exits with 1 if a command was carried out twice, if its
+caller got a wrong result, or if an executed command is missing in its gateway's audit log.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Fleet drills: how long is a line silent if gateways or NATS nodes are killed, and do masters overlap?
+"""How long is a line without requests if gateways or NATS nodes are killed, and do two gateways poll it?
 
 All processes are real and run on this machine: three NATS nodes, three gateways, and lines on sockets that
 record each request with its connection. The second part puts each gateway and each node into a network
-namespace and cuts its cable for 1 to 8 s; this needs root. The third part puts a gateway and a node into each
-of three namespaces, like three machines. A gap is the longest time between two requests of one line, in the
-11 s or more after an attack.
+namespace, and cuts its connection for 1 to 8 s; this needs root. The third part puts a gateway and a node
+into each of three namespaces, like three machines. A gap is the longest time between two requests on a line
+in the 11 s or more after an attack.
 """
 
 from __future__ import annotations

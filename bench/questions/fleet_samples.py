@@ -1,8 +1,9 @@
 """Samples of a fleet: bytes and CPU time per value, in messages and in the hub's stores.
 
-The rows resemble those of a real plant, which are less regular than a simulator's. Each line reads its drives
-in turn, ten registers at once, every 12 ms or a little more. Speeds, currents and voltages change by a step
-or two in three of five polls, temperatures in one of three. 5 of 1000 requests are missed.
+The rows resemble those of a real plant, which are less regular than a simulator's. On each line, the drives
+are read in turn, ten registers per request, every 12 ms or slightly more. Speeds, currents and voltages
+change by one or two steps in three of five polls, temperatures in one of three. 5 of 1000 requests get no
+reply.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from multidrop.polling import BatchColumns
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # per line
-REGISTERS = {  # name: a value in steps, the step, and the probability of a change
+REGISTERS = {  # name: first raw value, step, and probability that a poll finds a change
     "output_frequency": (4500, 0.01, 0.6),
     "output_current": (53, 0.1, 0.7),
     "output_voltage": (3800, 0.1, 0.3),
@@ -56,7 +57,7 @@ STATUSES = ("ok", "no reply")
 
 
 def exchanges(lines: int, dice: random.Random) -> Iterator[tuple[int, int, int, list[float] | None]]:
-    """Yield the time, the uncertainty, the drive and its values, or None for a miss."""
+    """Yield each exchange: its time and uncertainty, the drive's number, and the values (None: a miss)."""
     due = [(dice.randrange(12_000_000), line) for line in range(lines)]
     heapq.heapify(due)
     turn = [0] * lines
@@ -78,7 +79,7 @@ def exchanges(lines: int, dice: random.Random) -> Iterator[tuple[int, int, int, 
 
 
 def columns_of(rows: int, lines: int, dice: random.Random) -> BatchColumns:
-    """Return rows in the form of `Batch.columns()`."""
+    """Return `rows` random rows in the format of `Batch.columns()`."""
     kinds = {"time": "q", "monotonic_ns": "q", "uncertainty_ns": "q"}
     kinds |= {"drive": "H", "register": "H", "value": "d", "status": "H"}
     made: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
@@ -121,7 +122,7 @@ def cpu() -> float:
 
 
 def cost(act: Any, times: int) -> float:
-    """Return the CPU of one call in ns."""
+    """Return the CPU time of one call of `act` in ns, the mean of `times` calls."""
     act()
     begun = cpu()
     for _ in range(times):
@@ -144,7 +145,7 @@ def messages() -> Iterator[tuple[object, ...]]:
 def stores(folder: Path) -> Iterator[tuple[object, ...]]:
     """Write the same half million rows of 500 lines to each store, in two commits."""
     found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
-    units = units_of(found[0])  # all messages have the same drives
+    units = units_of(found[0])  # the first message will do: all have the same drives
     sent = [one.data for columns in found for one in packed(columns, units)]
     rows = sum(len(columns.time) for columns in found)
     spool = SpoolFolder(folder / "spool", "gateway-1")
@@ -191,7 +192,7 @@ def commit(sink: SampleSink, sent: list[bytes]) -> None:
 
 
 def narrow(database: Postgres, sent: list[bytes]) -> int:
-    """Write one row per value, with an index by drive, register and time: the obvious way."""
+    """Write the obvious table for comparison: one row per value, with an index by drive, register and time."""
     import psycopg
 
     database.ask(
@@ -225,7 +226,9 @@ def size_of(folder: Path) -> int:
 
 
 def timed(rows: int, act: Callable[[], int]) -> tuple[str, str, str]:
-    """Return million rows per second, and per row the CPU time of this process in ns and bytes on disk."""
+    """Run `act`, which writes `rows` rows and returns the bytes on disk.
+
+    Return millions of rows per second, and per row the CPU time of this process in ns and the bytes on disk."""
     begun, used = time.monotonic(), cpu()
     size = act()
     seconds, used = time.monotonic() - begun, cpu() - used

@@ -1,8 +1,8 @@
 """The time until each of 10,000 lines has a gateway: at the start, and after a quarter of the fleet dies.
 
-20 real state machines of gateways, in four processes, and three real NATS nodes run on this machine. The
-lines do not exist, so no port is opened. A cold start counts from the moment when all processes are
-connected. CPU seconds are those of all gateways and servers: two cores offer 16 of them in 8 s.
+Four processes with the state machines of 20 gateways, and three NATS nodes, run on this machine. The lines do
+not exist, so no port is opened. The time of a cold start counts from the moment when all processes are
+connected. CPU seconds are the sum of all gateways and servers; two cores offer 16 CPU seconds in 8 s.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
             fleet.check()
             begun = fleet.start(dead.gateways)
             fleet.settled(begun)
-            time.sleep(10)  # for the balance to move lines to them
+            time.sleep(10)  # until the fleet's balancing has moved lines to the new gateways
             fleet.check()
     tables.show(("what", "lines", "until the last, s", "CPU s", "lines a gateway", "load"), rows)
 

@@ -1,7 +1,8 @@
-"""Memory of a poller, and the instructions of an exchange, to estimate the load of small machines.
+"""A poller's memory, and the CPU instructions per exchange, to estimate the load of small computers.
 
-valgrind counts the instructions of the polling process in two runs of different lengths; the difference is
-polling alone. It does not count the kernel's, so the kernel's time is measured in a run without valgrind.
+valgrind counts the instructions of the polling process in two runs of different lengths; their difference is
+polling without start and end. valgrind does not count the kernel's instructions: the kernel's time is
+measured in a run without valgrind.
 `python -m bench.questions.footprint JOB` is the process that polls.
 """
 
@@ -25,7 +26,7 @@ BAUDRATE = 38400
 DRIVES = 31
 SETTLE_S = 2.0
 
-# Cortex cores: clock in GHz, and the assumed instructions per cycle of such code.
+# By board: clock in GHz, and the assumed instructions per cycle of such code.
 BOARDS = {
     "Raspberry Pi Zero W (ARM1176, 1.0 GHz)": (1.0, 0.4),
     "Raspberry Pi 3, Zero 2 W (Cortex-A53, 1.0 GHz)": (1.0, 0.6),
@@ -37,7 +38,7 @@ BOARDS = {
 class Job:
     ports: list[str]
     seconds: float
-    record: str = ""  # a file; "": rows are taken and discarded
+    record: str = ""  # path of a recording; "": rows are discarded
 
 
 # ---- the process that polls: it imports only modules that a user's program imports ----
@@ -98,7 +99,7 @@ def poll(job: Job) -> dict[str, Any]:
 
 
 def run(job: Job, *before: str) -> dict[str, Any]:
-    """Run a process that polls, under the program `before`."""
+    """Run a process that polls, under the command `before` (such as valgrind); return its results."""
     command = [*before, sys.executable, "-m", "bench.questions.footprint", json.dumps(asdict(job))]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return dict(json.loads(told))
@@ -117,7 +118,7 @@ def instructions(lines: int, seconds: float) -> tuple[int, dict[str, Any]]:
 
 @contextmanager
 def talkers(lines: int) -> Iterator[list[str]]:
-    """Play that many paced lines; yield their ports."""
+    """Play `lines` paced lines; yield their ports."""
     from bench.players.responders import responders
 
     with responders("pty", lines, "--baudrate", BAUDRATE, "--delay-us", 2000) as (ports, _):

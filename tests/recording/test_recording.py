@@ -377,7 +377,7 @@ def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) 
     assert rows(open_recording(target)) == RECORDED
 
 
-DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".parquet": b"PAR1"}  # then damage
+DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".parquet": b"PAR1"}  # damaged
 
 
 @every_format
