@@ -35,7 +35,7 @@ def of_multidrop(job: Job) -> tuple[int, numpy.ndarray]:
 
 
 def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
-    """Return the number of good exchanges, and for each the time in ms that its call took beyond the wire's."""
+    """Return the number of good exchanges, and the time in ms of each call without its time on the wire."""
     wire = job.wire if job.baudrate else 0.0
     took: list[float] = []
     with rivals.pymodbus(job) as read:

@@ -95,7 +95,7 @@ def _lack(entry: Holding) -> str:
 
 
 def report(coverage: Coverage, unread: list[str]) -> None:
-    """Print the shares of representable entries and devices, the needed details, and reasons for rejection."""
+    """Print the shares of representable entries and devices, needed details, and reasons for rejection."""
     entries, devices = coverage.entries, len(coverage.by_device)
     held = sum(entry.is_whole for entry in entries)
     readable = sum(entry.is_held for entry in entries)

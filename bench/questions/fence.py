@@ -40,7 +40,7 @@ def rounds(kind: str, stops: int, lines: int, lease: float, guard: float, seed: 
 
 
 def side_by_side(kind: str, stops: int, details: argparse.Namespace) -> list[Round]:
-    """Distribute `stops` suspensions over processes, each with its own lines and masters; return the results."""
+    """Distribute `stops` suspensions over processes, which have lines and masters of their own."""
     jobs = details.jobs
     shares = [stops // jobs + (job < stops % jobs) for job in range(jobs)]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:

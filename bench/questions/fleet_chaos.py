@@ -176,7 +176,7 @@ class Chaos:
                 gateway.start()
 
     def settle(self) -> None:
-        """Kill and restart all gateways and hubs, and wait until all stored samples have reached the sinks."""
+        """Kill and restart all gateways and hubs; wait until all stored samples have reached the sinks."""
         self.close()
         self.servers.wait()
         self.database.wait()

@@ -192,7 +192,7 @@ def commit(sink: SampleSink, sent: list[bytes]) -> None:
 
 
 def narrow(database: Postgres, sent: list[bytes]) -> int:
-    """Write the obvious table for comparison: one row per value, with an index by drive, register and time."""
+    """Write the obvious table, for comparison: a row per value, an index by drive, register and time."""
     import psycopg
 
     database.ask(
@@ -228,7 +228,8 @@ def size_of(folder: Path) -> int:
 def timed(rows: int, act: Callable[[], int]) -> tuple[str, str, str]:
     """Run `act`, which writes `rows` rows and returns the bytes on disk.
 
-    Return millions of rows per second, and per row the CPU time of this process in ns and the bytes on disk."""
+    Return millions of rows per second; per row, the CPU time of this process in ns, and the bytes on disk.
+    """
     begun, used = time.monotonic(), cpu()
     size = act()
     seconds, used = time.monotonic() - begun, cpu() - used

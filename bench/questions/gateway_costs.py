@@ -1,9 +1,9 @@
 """Measure the CPU time of each kind of work of `multidrop serve`, alone and with warm caches.
 
-The hub of a gateway that does not run has 31 drives with 10 values each. Requests are passed to its protocols
-as asyncio would pass them. Before each turn the hub gets new rows with other values. The table has the least
-of many turns, because other work disturbs it least. It contains neither the kernel's share nor cold caches:
-see `gateway_load`.
+A gateway's hub, which polls nothing, has 31 drives with 10 values each. The script calls its protocols as
+asyncio would. Before each measurement the hub gets new rows with other values. The table has the least time
+of many measurements, which other processes disturbed least. It includes neither the kernel's time nor the
+effect of cold caches: see `gateway_load` for these.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from multidrop.gateway.settings import ServeSettings
 from multidrop.polling.batch import Batch
 from multidrop.transport.statistics import line_statistics
 
-LINES = (8, 8, 8, 7)  # drives on each line
+LINES = (8, 8, 8, 7)  # numbers of drives on each line
 
 
 def as_numbers(data: Any, kind: str) -> memoryview:
-    """Return bytes as numbers of a format that is known only at run time."""
+    """Return a view of bytes as numbers in the format `kind` of the module struct."""
     found: memoryview = data.cast(kind)
     return found
 
 
 class GivenColumns(Columns):
-    """Columns that do not come from the core."""
+    """Columns with given arrays, in place of the core's."""
 
     def __init__(self, columns: dict[str, memoryview]) -> None:
         self._columns = columns
@@ -65,7 +65,7 @@ class GivenColumns(Columns):
 
 
 class FakeTransport(asyncio.Transport):
-    """A network that discards all bytes."""
+    """A connection that counts the written bytes and discards them."""
 
     written = 0
 
@@ -84,7 +84,7 @@ class FakeTransport(asyncio.Transport):
 
 
 class Worker:
-    """A gateway that does not run, and its kinds of work, each done once for all drives."""
+    """A gateway that is not started, with a method for each kind of its work, for all drives."""
 
     def __init__(self, folder: Path) -> None:
         self.plant = Plant.load(write_plant(folder, LINES))
@@ -122,13 +122,13 @@ class Worker:
         self.gateway.hub.take(self.batch)
 
     def frame(self) -> None:
-        """Make a frame, and encode it for viewers that have the previous frame."""
+        """Make a frame of live values, and encode its changes for viewers that have the previous frame."""
         frames = self.gateway.frames
         frames._build()
         frames._since(frames._remembered[-2]["n"] if len(frames._remembered) > 1 else WHOLE)
 
     def next_viewer(self) -> Callable[[], Any]:
-        """Return a function that sends the changes to a viewer after another viewer got the same."""
+        """Return a function that sends a frame's changes to a second viewer, after the first one got them."""
         frames = self.gateway.frames
         for _ in range(2):
             self.take_rows()
@@ -143,7 +143,7 @@ class Worker:
         self.gateway._look_for_events()
 
     def statistics(self) -> None:
-        """Take a reading of the exchanges of one second."""
+        """Read the statistics of the exchanges of one second."""
         turn = next(self._turns)
         delays = Counter(dict.fromkeys(range(60, 75), turn))
         of_drive = Counters(turn, turn, 10 * turn, turn, ideal_ns=turn, missed=Counter({Status.NO_REPLY: 1}))
@@ -160,7 +160,7 @@ class Worker:
         expose_metrics(families_of(gateway), "")
 
     def masters(self, start: int, words: int) -> Callable[[], None]:
-        """Return a function that reads these words of all drives."""
+        """Return a function that reads `words` registers of each drive over Modbus TCP."""
         units = {name: number for number, name in enumerate(self.drives, 1)}
         gateway, settings = self.gateway, ModbusSettings(units=units)
         server = ModbusServer(self.plant, gateway.hub, gateway.commands, settings, gateway.ask)
@@ -171,13 +171,13 @@ class Worker:
             before = self.transport.written
             for unit in units.values():
                 client.data_received(struct.pack(">HHHBBHH", unit, 0, 6, unit, 3, start, words))
-                client._drain()  # it would yield to other clients here
+                client._drain()  # answer now, where the gateway would first serve other clients
             assert self.transport.written - before == len(units) * (9 + 2 * words)
 
         return read
 
     def viewer(self) -> Callable[[], Any]:
-        """Return a function that requests an available frame."""
+        """Return a function that requests, over HTTP, a frame that is available."""
         from uvicorn import Config
         from uvicorn.protocols.http.h11_impl import H11Protocol
         from uvicorn.server import ServerState
@@ -216,7 +216,7 @@ WORKS: dict[str, Callable[[Worker], Callable[[], Any]]] = {
 
 
 async def least_us(name: str, turns: int) -> float:
-    """Return the least CPU time of that many turns, in us."""
+    """Return the least CPU time in us of `turns` measurements of this kind of work."""
     with TemporaryDirectory() as folder:
         worker = Worker(Path(folder))
         act, least = WORKS[name](worker), float("inf")

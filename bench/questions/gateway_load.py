@@ -1,12 +1,12 @@
-"""Measure how much `multidrop serve` with many users costs polling, and delays a stop of all drives.
+"""How much do many users of `multidrop serve` slow down its polling, and delay a stop of all drives?
 
-A simulated plant has 31 drives with 10 values each at 10 Hz. Slices of three kinds alternate: a plain Poller
-that records, the gateway alone, and the gateway with its users. The users are five viewers, ten more that do
-not read, a scraper, history queries, an MQTT listener and two Modbus masters.
+A simulated plant has 31 drives with 10 values each at 10 Hz. Measurements of three kinds alternate: a plain
+Poller that records, the gateway alone, and the gateway with its users. The users are five viewers, ten more
+viewers that do not read, a scraper of metrics, history queries, an MQTT listener and two Modbus masters.
 
 Then all motors are stopped over HTTP many times, without and with the users. Times are from the request to
-the last drive's stop, as the simulator received it, and to the answer. `--minutes 60` continues with the
-users, and prints a row per minute.
+the last drive's stop, as the simulator received it, and to the HTTP answer. `--minutes 60` continues with
+the users, and prints a row per minute.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from multidrop import Plant, Poller
 from multidrop.recording import SegmentWriter
 
 LINES = (8, 8, 8, 7)  # drives on each line, at 115200 bit/s: 78 % utilisation by `multidrop plan`
-LOOK_S = 0.05  # between readings of counters
-SETTLE_S = 3.0  # after a start: delays are measured, and users are connected
-RUN_S = 1.0  # motors run this long before a stop
+LOOK_S = 0.05  # interval between readings of counters
+SETTLE_S = 3.0  # after a start: time to learn response delays and to connect the users
+RUN_S = 1.0  # time for which motors run before a stop
 STOPS_IN_A_ROW = 3
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 PATIENCE_S = 60.0
@@ -49,16 +49,16 @@ BROKER_CONF = "listener {} 127.0.0.1\nallow_anonymous true\n"
 
 
 class Counts(NamedTuple):
-    """Counters since polling started, and the time of their reading, in s."""
+    """Counters since the start of polling, and the time in s at which they were read."""
 
     at: float
     exchanges: float
     samples: float
-    misses: Mapping[str, float]  # by reason
+    misses: Mapping[str, float]  # number by reason
 
 
 class Used(NamedTuple):
-    """The CPU time of a process, and of its children, in s; resident memory in MB."""
+    """The CPU times of a process and of its children in s, and its resident memory in MB."""
 
     own: float
     children: float
@@ -81,14 +81,14 @@ def used(pid: int) -> Used:
 
 
 def _cpu(pid: int) -> tuple[float, float]:
-    """Return the CPU time of a process, and of its ended children."""
+    """Return the CPU time of a process in s, and that of its ended children."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     own, children = (int(fields[at]) + int(fields[at + 1]) for at in (11, 13))
     return own * TICK_S, children * TICK_S
 
 
 class Polling:
-    """A process that polls the plant."""
+    """A process that polls the plant, and its counters."""
 
     pid: int
 
@@ -97,7 +97,7 @@ class Polling:
 
 
 class PlainPoll(Polling):
-    """A Poller that only records."""
+    """A process with a Poller that only records."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process, self.pid = process, process.pid
@@ -110,7 +110,7 @@ class PlainPoll(Polling):
 
 
 class Gateway(Polling):
-    """The command `serve`."""
+    """The process of `multidrop serve`."""
 
     def __init__(self, pid: int, place: Place) -> None:
         self.pid, self.place = pid, place
@@ -127,7 +127,7 @@ class Gateway(Polling):
         return said
 
     def counts(self) -> Counts:
-        """Return the counts when they change, once a second."""
+        """Wait until the gateway's counters change, which is once a second; return them."""
         before, now = self._counts(), self._counts()
         while now.exchanges == before.exchanges:
             time.sleep(LOOK_S)
@@ -148,7 +148,7 @@ class Gateway(Polling):
 
 
 def poll(plant: Path, folder: Path) -> None:
-    """Poll and record; print the counts for each line of standard input, until it ends."""
+    """Poll and record; print the counters after each line of standard input, until standard input ends."""
     with Poller(Plant.load(plant)) as poller, SegmentWriter(folder / "rows.arrows", {}, every=600) as writer:
         poller.on_batch(writer.write)
         for _ in sys.stdin:
@@ -194,7 +194,7 @@ def broker(folder: Path, port: int) -> Iterator[None]:
             process.terminate()
 
 
-# ---- slices ----
+# ---- measurements ----
 
 HEAD = (
     *("slice", "exchanges/s", "values/s", "missed", "CPU %", "children %", "MB begin", "middle", "end"),
@@ -203,12 +203,12 @@ HEAD = (
 
 
 class Hall:
-    """The plant, its simulator and its broker, and the measurements."""
+    """The plant, its simulator and its MQTT broker, with methods that measure."""
 
     def __init__(self, pumps: SimulatedPumps, plant: Path, place: Place, before: Sequence[str]) -> None:
         self.pumps, self.plant, self.place, self.before = pumps, plant, place, before
         self.failures: Counter[str] = Counter()
-        self.missed: Counter[str] = Counter()  # by slice and reason
+        self.missed: Counter[str] = Counter()  # by kind of measurement and reason
         self.counts: dict[str, float] = {}
         self.loaded_s = 0.0
 
@@ -226,7 +226,7 @@ class Hall:
             self.counts[what] = max(before, number) if "longest" in what else before + number
 
     def slice(self, name: str, polling: Polling, seconds: float) -> tuple[object, ...]:
-        """Measure for that many seconds. A suspended simulator replies late, so values are missed."""
+        """Measure for `seconds`; return a row. If the host suspends the simulator, values are missed."""
         self.pumps.late_s()
         counts = polling.counts()
         begun, before = time.monotonic(), used(polling.pid)
@@ -261,7 +261,7 @@ class Hall:
                     yield self.slice("serve, users", gateway, seconds)
 
     def stops(self, rounds: int) -> Iterator[tuple[object, ...]]:
-        """Stop all drives, in alternating rounds without and with the users."""
+        """Stop all drives in alternating rounds without and with the users; yield a row for each."""
         found: dict[str, list[tuple[float, float, float]]] = {"alone": [], "users": []}
         with serving(self.plant, self.place, self.before) as gateway:
             time.sleep(SETTLE_S)
@@ -289,7 +289,7 @@ class Hall:
         return min(times) - begun, max(times) - begun, answered - begun
 
     def minutes(self, number: int, seconds: float) -> Iterator[tuple[object, ...]]:
-        """Poll alone for a while, then serve users for that many minutes, and poll alone again."""
+        """Yield a row per minute: poll alone for a while, then with users for `number` minutes, then alone."""
         with plain_poll(self.plant, self.before) as polling:
             time.sleep(SETTLE_S)
             yield self.slice("poll", polling, seconds)
@@ -316,7 +316,7 @@ def hall(rotate: str, before: Sequence[str]) -> Iterator[Hall]:
 
 
 def show_as_they_come(head: Sequence[str], rows: Iterator[tuple[object, ...]]) -> list[tuple[object, ...]]:
-    """Print each row on stderr at once; return all rows."""
+    """Print each row on stderr as soon as it is measured; return all rows."""
     found = []
     for row in rows:
         print(*row, f"load {os.getloadavg()[0]:.1f}", sep="  ", file=sys.stderr, flush=True)
@@ -325,7 +325,7 @@ def show_as_they_come(head: Sequence[str], rows: Iterator[tuple[object, ...]]) -
 
 
 def medians(rows: Sequence[tuple[object, ...]]) -> Iterator[tuple[object, ...]]:
-    """Yield the median of each kind of slice."""
+    """Yield a row with the medians for each kind of measurement."""
     for kind in dict.fromkeys(row[0] for row in rows):
         columns = zip(*(map(float, map(str, row[1:])) for row in rows if row[0] == kind), strict=True)
         yield (f"{kind}, median", *(f"{statistics.median(column):.1f}" for column in columns))

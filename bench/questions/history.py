@@ -1,12 +1,13 @@
-"""Measure the cost of a day of 310 series at 10 Hz: to record, to compact, to store and to plot.
+"""The cost of a day of 310 series at 10 Hz: to record, to compact, to store and to plot.
 
 `python -m bench.questions.history DIRECTORY` makes such a day there, in segments of ten minutes. The first
 segment is recorded as .arrows, in batches of 0.2 s, and compacted by the process that a gateway starts for
-it. DuckDB makes the other segments from generated rows with the same queries. After the first hour their rows
-are at 1 Hz, which gives the same number of tens. The last half segment, at 10 Hz, is still growing.
+this. DuckDB makes the other segments from generated rows with the same queries. After the first hour their
+rows are at 1 Hz, which gives the same number of ten-second summaries. The last half segment, at 10 Hz, is
+not compacted, as if it were still recorded.
 
-Then the script makes the queries of the gateway's page. If the directory already has such a day, it only
-makes the queries.
+Then the script makes the queries of the gateway's page. If the directory already has such a day, the script
+only makes the queries.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from multidrop.recording.segments import SegmentWriter
 SECOND = 1_000_000_000
 SEGMENT_S = 600
 MIDNIGHT = 1_795_219_200 * SECOND  # 2026-11-21
-FULL_S = 3600  # seconds of the day with rows at 10 Hz
+FULL_S = 3600  # first part of the day, with rows at 10 Hz
 DRIVES, REGISTERS = 31, 10
 UNIT = "Hz"
 DESCRIBED = {f"value_{number}": {"unit": UNIT} for number in range(REGISTERS)}
@@ -60,7 +61,7 @@ update recorded set status = 'no reply', uncertainty_ns = null where value is nu
 
 
 def made(database: Any, begin_s: int, end_s: int, every: int = 1) -> None:
-    """Make rows of these seconds, at 10 Hz divided by `every`."""
+    """Fill the table `recorded` with rows of these seconds, at 10 Hz divided by `every`."""
     database.execute("drop table if exists recorded")
     database.execute(TABLE)
     insert, update = MADE.split(";")
@@ -70,7 +71,7 @@ def made(database: Any, begin_s: int, end_s: int, every: int = 1) -> None:
 
 
 def recorded(database: Any, folder: Path, after: int) -> None:
-    """Write the rows as a segment, in batches of 0.2 s."""
+    """Write the rows of the table `recorded` as a segment, in batches of 0.2 s."""
     with SegmentWriter(folder / STEM, METADATA, every=1e9, after=after) as writer:
         for batch in rows_of(database, "from recorded order by time", {}):
             pieces: list[Any] = list(batch)
@@ -94,7 +95,7 @@ def make_day(folder: Path, hours: int) -> None:
             "-c",
             COMPACTED,
             str(folder),
-        ]  # a small process in between, whose memory is known
+        ]  # a small intermediate process, to measure the child's memory
         print(subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip())
         segments = hours * 3600 // SEGMENT_S
         for number in range(2, segments + 1):
@@ -103,13 +104,13 @@ def make_day(folder: Path, hours: int) -> None:
             span = MIDNIGHT + begin * SECOND, MIDNIGHT + (begin + SEGMENT_S) * SECOND
             for kind, query in (("tens", TENS.format("told")), ("rows", ROWS)):
                 copy_out(database, query, folder / kind / file_name(number, number, *span), METADATA)
-        made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)  # the last segment, still growing
+        made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)  # the last segment, not closed
         recorded(database, folder, segments)
-    compact(folder, 0)  # one file of tens for each complete hour
+    compact(folder, 0)  # merges the summaries of each complete hour
 
 
 def asked(ask: Callable[[], object]) -> tuple[float, float, float, float]:
-    """Return ms: the first query, the median and the longest of twenty more, and the CPU time of one."""
+    """Measure a query: return ms of the first, median and maximum of 20 more, and the CPU time of one."""
     found = []
     for _ in range(21):
         begun, used = time.perf_counter(), time.process_time()
@@ -144,7 +145,7 @@ def questions(folder: Path, hours: int) -> Iterator[tuple[str, ...]]:
 
 
 def taking() -> None:
-    """Print the cost of `take` for a batch of all series."""
+    """Print the cost of `HistoryWriter.take` for a batch of all series."""
     names = Names([f"drive-{number}" for number in range(DRIVES)]), Names(["value"] * REGISTERS)
     rows = GatheredRows(*names)
     rows._rows = DRIVES * REGISTERS
@@ -191,7 +192,7 @@ def main() -> None:
 
 
 def _merge(folder: Path, hours: int) -> None:
-    """Add a second of the next day and compact, so that the day's tens become one file."""
+    """Add a second of the next day and compact, so that the day's ten-second summaries become one file."""
     with connect("100MB", folder / ".making") as database:
         made(database, 30 * 3600, 30 * 3600 + 1)
         number = hours * 3600 // SEGMENT_S + 5

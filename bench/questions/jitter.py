@@ -1,6 +1,6 @@
-"""Lateness of requests that are due at a fixed rate, on an idle machine.
+"""How late are requests that are due at a fixed rate, on an idle computer?
 
-Compared with a C program that sleeps until each time of the same grid, in alternating slices.
+Compared, in alternating measurements, with a C program that sleeps until each request's time.
 `python -m bench.questions.jitter JOB` is the process that polls.
 """
 
@@ -24,7 +24,7 @@ DELAY_US = 2000
 
 @dataclass(frozen=True)
 class Rate:
-    """One drive on each line, polled so many times per second, for `seconds`."""
+    """A measurement: one drive on each of some lines, polled at a fixed rate for `seconds`."""
 
     ports: list[str]
     hertz: float

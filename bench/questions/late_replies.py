@@ -1,9 +1,9 @@
-"""Late, doubled and lost replies: count those that were taken for another request's reply.
+"""How many late or doubled replies are taken for the reply to another request?
 
-Each line has several drives with four blocks of one length each, and each value encodes its drive and
-register. Replies are late by up to three times the time-out, lost, or doubled. In the first part a drive's
-later reply may come before an earlier one, which no real line does; in the second part they keep their order.
-In the last part all replies come over a path that delays them for longer, and keeps their order.
+Each line has several drives with four blocks of equal length, and each value encodes its drive and register.
+Replies are late by up to three time-outs, lost, or doubled. In the first part, a drive's late reply may come
+after the replies to later requests, which no real line does; in the second part, replies keep their order.
+In the last part, all replies come over a network path that delays them for longer, and keeps their order.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bench.support import tables
 TIMEOUT_MS = 5
 LATE_PERMILLE, LOST_PERMILLE, TWICE_PERMILLE = 100, 20, 50
 PATHS_MS = (10, 100, 1000)
-FEW = 4  # lines, and drives on each
+FEW = 4  # number of lines, and of drives on each line
 
 
 def main() -> None:
@@ -68,7 +68,7 @@ def _told(judged: many_adapter.Judged, seconds: float) -> dict[str, object]:
 
 
 def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
-    """Yield a row for each path, with few lines and drives: each exchange takes as long as the path."""
+    """Yield a row for each path delay, with few lines and drives, because exchanges take as long as the path."""
     for path_ms in PATHS_MS:
         constant = "--path-us", 1000 * path_ms
         stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms

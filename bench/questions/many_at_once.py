@@ -1,9 +1,9 @@
-"""Many lines at once, and many threads that use every function of one poller.
+"""Does one poller with many lines stay correct while many threads use all of its functions?
 
-At the same time, threads take and check rows, start and stop motors, remove and add drives, and read the
-summary. Several times the poller is closed and a new one is opened. Exits with 1 if a value is another
-register's, if a row or a command is lost, if a thread does not end, or if memory, descriptors or threads
-grow.
+Threads concurrently take and check rows, start and stop motors, remove and add drives, and read the summary.
+Several times the poller is closed, and a new one is opened. Exits with 1 if a value belongs to another
+register, if a row or a command is lost, if a thread does not end, or if the use of memory, descriptors or
+threads grows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Wire, simulated
 
-PATIENCE = 30.0  # s, for a thread to end
+PATIENCE = 30.0  # s, limit for a thread's end
 HEAD: tuple[str, ...] = (
     "exchanges",
     "a second",
@@ -46,7 +46,7 @@ HEAD += ("failed", "memory kB", "descriptors", "threads")
 
 
 def plant(ports: Sequence[str], drives: int) -> Plant:
-    """Return a plant with IBDs from address 1 on each line, and a YD1000 whose motor gets commands."""
+    """Return a plant: each line has IBDs with addresses from 1, and a YD1000 whose motor gets commands."""
     lines = []
     for number, port in enumerate(ports, 1):
         found = [InnovertIBD(at, name=f"ibd-{number}-{at}") for at in range(1, drives)]
@@ -58,7 +58,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
 
 
 def wires(lines: int, drives: int) -> list[Wire]:
-    """Return wires without waits, because all processors are too busy to keep a pace."""
+    """Return simulated lines without waits, because all processors are too busy to keep a line's pace."""
     return [
         Wire(
             [
@@ -73,7 +73,7 @@ def wires(lines: int, drives: int) -> list[Wire]:
 
 
 class Round:
-    """One poller from start to end, and the threads around it."""
+    """One poller from start to end, and the threads that use it."""
 
     def __init__(self, declared: Plant, seed: int) -> None:
         self.plant = declared
@@ -84,7 +84,7 @@ class Round:
         self._seed = seed
         self._panels = {line.name: threading.Lock() for line in declared.lines}
         self._leave = threading.Event()
-        self._lock = threading.Lock()  # of the counts
+        self._lock = threading.Lock()  # protects `counts`
 
     def count(self, **numbers: int) -> None:
         with self._lock:
@@ -137,7 +137,7 @@ class Round:
             self.count(rows=len(rows), values=len(values), misattributed=len(wrong))
 
     def come_and_go(self, chance: random.Random) -> None:
-        """Remove and add drives. If two threads choose the same drive, one of them gets an error."""
+        """Remove a drive and add it again. If two threads choose the same drive, one of them gets an error."""
         line = chance.choice(self.plant.lines)
         polled = chance.choice(line.drives[:-1])
         try:
@@ -150,7 +150,7 @@ class Round:
         self.count(moved=1)
 
     def command(self, chance: random.Random) -> None:
-        """Command the motors, one thread for each, because another start would prolong the wait of a stop."""
+        """Command a motor, at most one thread at a time: another start would prolong the wait of a stop."""
         line = chance.choice(self.plant.lines)
         if self._panels[line.name].acquire(blocking=False):
             try:
@@ -162,7 +162,7 @@ class Round:
         self.count(given=1)
         try:
             if chance.random() < 0.3:
-                motor.set_frequency(chance.randrange(1, 5))  # so that it stops soon
+                motor.set_frequency(chance.randrange(1, 5))  # at a low frequency it stops soon
             getattr(motor, chance.choice(["start", "stop", "state"]))()
         except BusError:
             self.count(failed=1)
@@ -176,9 +176,9 @@ class Round:
     # ---- the results ----
 
     def told(self) -> tuple[int, int]:
-        """Return the exchanges, and the number of rows that the summary counts but that were not taken.
+        """Return the number of exchanges, and of rows that the summary counts but that were not taken.
 
-        All drives are back by then, so the summary has every one.
+        At this time all removed drives were added again, so the summary has every drive.
         """
         summary = self.poller.summary()
         lost = summary["samples"] + summary["misses"] - self.counts["rows"]
@@ -232,7 +232,7 @@ def main() -> int:
                     or this_round.counts["given"] != this_round.counts["ended"]
                 ):
                     failures.append(f"round {number + 1}: a value is another's, or a row or command is lost")
-    half = seen[len(seen) // 2]  # by then, reused memory has its final size
+    half = seen[len(seen) // 2]  # half-way, buffers have their final size
     if seen[-1][0] - half[0] > MOST_GROWTH_KB or seen[-1][1:] != seen[0][1:]:
         failures.append(f"memory, descriptors or threads grow: half-way {half}, at last {seen[-1]}")
     print("\n" + ("\n".join(failures) or "nothing misattributed, nothing lost, nothing grows"))

@@ -1,9 +1,9 @@
 """The host's cost of an exchange when one process polls many lines.
 
-A bare epoll loop in C over the same number of lines runs before every slice, and ratios are to that slice.
-The client runs on one processor and the responders on another. On the same one, the scheduler would let the
-responders interrupt a client that takes more time than they do, every few exchanges. Numbers of lines beyond
-a limit of the system are skipped, and the limit is printed. A default run takes a quarter of an hour.
+Before every measurement, a minimal epoll loop in C polls the same number of lines, and ratios are to that
+loop. The client runs on one processor and the responders on another. On the same processor, the responders
+would interrupt a slower client every few exchanges. Numbers of lines beyond a limit of the system are
+skipped, and the limit is printed. A default run takes a quarter of an hour.
 `python -m bench.questions.many_lines JOB` is the process that polls.
 """
 
@@ -31,8 +31,8 @@ from bench.support.programs import FRAMES, compiled, module, on_processor
 
 BAUDRATE = 115200
 DELAY_US = 2000
-SETTLE_S = 2.0  # for the first exchanges of some thousand drives
-DESCRIPTORS = 5  # of a poller for each line: its port and two pipes; the responders need fewer
+SETTLE_S = 2.0  # time for the first exchanges of thousands of drives
+DESCRIPTORS = 5  # a poller's, per line: port and two pipes; the responders need fewer
 OTHERS = 64  # other descriptors of the process
 PTYS = Path("/proc/sys/kernel/pty")
 
@@ -88,7 +88,7 @@ def poll(job: Lines) -> dict[str, Any]:
 
 
 def room(kind: str) -> dict[str, int]:
-    """Return the number of such lines that each limit of the system allows."""
+    """Return the number of lines of this kind (ptys or sockets) that each limit of the system allows."""
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     limits = {f"{DESCRIPTORS} descriptors a line, {files} a process": (files - OTHERS) // DESCRIPTORS}
     if kind == "pty":
@@ -98,7 +98,7 @@ def room(kind: str) -> dict[str, int]:
 
 
 def has_room(kind: str, count: int) -> bool:
-    """Return True if there is room for that many lines; else print the limit."""
+    """Return True if the system allows `count` lines of this kind; otherwise print the limit."""
     why, most = min(room(kind).items(), key=itemgetter(1))
     if count > most:
         print(f"{kind} {count} is skipped: there is room for {most} ({why}).", flush=True)

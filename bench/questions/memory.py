@@ -1,4 +1,4 @@
-"""Resident memory of a process that polls a line without waits, over many exchanges."""
+"""Does the resident memory of a process that polls a line without waits grow over many exchanges?"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.masters.jobs import Job
 from bench.support import tables
 from bench.support.programs import paced_line
 
-WARM_UP = 0.02  # share of the exchanges, after which buffers have their final size
+WARM_UP = 0.02  # share of the exchanges; after them, buffers have their final size
 ROWS = 10
 
 

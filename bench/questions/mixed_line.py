@@ -1,7 +1,7 @@
-"""Utilisation of a line with all families on it: several baud rates, formats and silences.
+"""The utilisation of a line with drives of all families: several baud rates, formats and silences.
 
-Every drive has its documented factory settings, and all its readings are polled. The ideal is the bus cycle
-that is predicted before the port is opened.
+Every drive has its documented factory settings, and all its readings are polled. The measured bus cycle is
+compared with the one that multidrop predicts before the port is opened.
 `python -m bench.questions.mixed_line PORT SECONDS` is the process that polls.
 """
 
@@ -21,7 +21,7 @@ PORT = str(CORE / "termios.c")
 
 
 def measured(line: many_adapter.Mixed, seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the line's report from the drives' side, and from the poll."""
+    """Poll the line for `seconds`; return the report of the simulated drives, and the poller's summary."""
     with talking([compiled("players/mixed_line.c", *FRAMES, PORT), *line.words]) as player:
         told = subprocess.check_output(module("bench.questions.mixed_line", player.said, str(seconds)))
     return player.report, json.loads(told)

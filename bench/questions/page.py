@@ -1,10 +1,10 @@
-"""Measure the age of the gateway's page in Chromium: in one tab, in nine, on a slow network, after a kill.
+"""How old are the values on the gateway's page in Chromium: in 1 or 9 tabs, on a slow network, after a kill?
 
 `multidrop serve` polls 31 drives on three simulated lines, with ten values of each every 0.1 s. A frame's age
-is the viewer's clock minus the frame's time, when it arrives and until the next one arrives. The age of
-values is that of the drive whose newest value is the oldest. All ages are checked every 10 ms. The slow
-network is once Chromium's own (Network.emulateNetworkConditions), which counts whole packets of 1500 bytes,
-and once a relay that counts bytes.
+is the viewer's clock minus the frame's time, at its arrival and until the next frame arrives. The age of
+values is that of the drive whose newest value is the oldest. All ages are sampled every 10 ms. A slow network
+is simulated by Chromium (Network.emulateNetworkConditions), which counts whole packets of 1500 bytes, and
+then by a relay that counts bytes.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from bench.players.slow_way import slow_way
 from bench.support import tables
 from multidrop import InvtCHE
 
-LINES = (11, 10, 10)  # drives
-SLOW = 8000  # bytes a second
+LINES = (11, 10, 10)  # numbers of drives on each line
+SLOW = 8000  # bytes per second
 LOOK_MS = 10
 AGES = """async ([seconds, every]) => {
   const { store } = await import('/page/store.js');
@@ -63,7 +63,7 @@ def plant_text(ports: Path) -> str:
 
 @contextmanager
 def program(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run a multidrop command; yield the first line that it prints."""
+    """Run a multidrop command; yield its process, and the first line that it prints."""
     command = [sys.executable, "-m", "multidrop", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -81,7 +81,7 @@ def until(page: Any, expression: str) -> float:
 
 
 def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
-    """Return a live page; `bytes_a_second` limits its network from then on."""
+    """Open the page, wait until it shows live values, and return it. Then limit its network, if requested."""
     page = context.new_page()
     page.goto(url)
     until(page, LIVE)
@@ -94,7 +94,7 @@ def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
 
 
 def row(what: str, pages: list[Any], seconds: float) -> list[object]:
-    """Measure pages one after another while all are open; return a row of the table."""
+    """Measure each page for `seconds`, one after another, while all are open; return a row of the table."""
     arrived: list[float] = []
     frames: list[float] = []
     values: list[float] = []
@@ -110,13 +110,13 @@ def row(what: str, pages: list[Any], seconds: float) -> list[object]:
 
 
 def figures(ages: list[float]) -> list[str]:
-    """Return median and 99th percentile, in s."""
+    """Return the median and the 99th percentile of the ages, in s."""
     cut = statistics.quantiles(ages, n=100)
     return [f"{statistics.median(ages):.2f}", f"{min(cut[98], max(ages)):.2f}"]
 
 
 def frame_sizes(url: str) -> str:
-    """Return the bytes of a whole frame, and of a frame with changes only, on the wire and unpacked."""
+    """Return a text with the sizes of a whole frame and of one with changes only, compressed and unpacked."""
     import gzip
     import urllib.request
 

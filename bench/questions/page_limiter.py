@@ -1,7 +1,7 @@
-"""Measure the delay that Chromium's network limiter adds, compared with a relay of the same rate.
+"""The delay that Chromium's network limiter adds, compared with a relay of the same rate.
 
-A page in Chromium requests answers of some sizes, one after another, at random times. The limiter is
-Network.emulateNetworkConditions, as `bench.questions.page` uses it.
+A page in Chromium requests answers of several sizes, one after another, at random times. The limiter is
+Network.emulateNetworkConditions, which `bench.questions.page` uses too.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 from bench.players.slow_way import slow_way
 from bench.support import tables
 
-RATES = (8000, 4000)  # bytes a second
-SIZES = (0, 300, 1000, 1300, 1600, 3000)  # bytes of an answer's body; its headers have 80
-PAUSE_MS = 250  # between two requests, at most
+RATES = (8000, 4000)  # bytes per second
+SIZES = (0, 300, 1000, 1300, 1600, 3000)  # bytes of an answer's body; its headers have 80 more
+PAUSE_MS = 250  # longest pause between two requests
 ASK = """async ([size, pauses]) => {
   const took = [];
   for (const pause of pauses) {
@@ -35,7 +35,7 @@ ASK = """async ([size, pauses]) => {
 
 
 class Sized(BaseHTTPRequestHandler):
-    """Answer a path with the number of bytes in it."""
+    """Answers a request with as many bytes as its path states."""
 
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True

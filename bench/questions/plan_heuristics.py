@@ -1,7 +1,7 @@
 """The bus cycle of random plants with multidrop's plan, compared with the usual ways to merge registers.
 
-All plans keep the families' limits and read across the same addresses. They have the same order, except in
-the last row: multidrop's own blocks in the plant file's order of drives.
+All plans keep the families' limits, and read undeclared addresses only where families allow it. All have the
+order of drives that multidrop plans, except the last row: multidrop's blocks in the plant file's order.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Plant = list[tuple[Drive, Registers]]
 
 
 def plant(lot: random.Random) -> Plant:
-    """Return drives of all families with random settings, each with some of its registers."""
+    """Return a plant with drives of all families, random settings, and some registers of each drive."""
     drives: Plant = []
     for address in range(1, lot.randint(1, MOST_DRIVES) + 1):
         family = lot.choice(list(MODELS.values()))
@@ -40,7 +40,7 @@ def plant(lot: random.Random) -> Plant:
     return drives
 
 
-# ---- the rivals ----
+# ---- the usual ways ----
 
 
 def merged(drive: Drive, registers: Registers, most_gap: int) -> list[Block]:
@@ -80,7 +80,7 @@ def end(register: Register[Any]) -> int:
     return register.address + register.words
 
 
-# ---- their duration ----
+# ---- bus cycles ----
 
 
 def cycle(drives: Iterable[Drive], of_drive: dict[Drive, Iterable[Block]]) -> float:

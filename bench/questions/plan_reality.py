@@ -1,8 +1,8 @@
-"""The predicted bus cycle compared with the measured one.
+"""The predicted bus cycle compared with the measured bus cycle.
 
-On paced_line.c, and on simulated drives of all families with their own settings and silences. The measured
-cycle is the time from a drive's first request in one cycle to that in the next. The figure is the median of
-the means of each second, because other programs disturb some seconds.
+Measured on paced_line.c, and on simulated drives of all families with their own settings and silences. A
+measured cycle is the time from a drive's first request in one cycle to its first request in the next. The
+figure is the median of per-second means, because other programs disturb some seconds.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 
 GOAL = 0.02
-SETTLING_S = 0.5  # to measure response delays
+SETTLING_S = 0.5  # time in which the poller learns the response delays
 
-Wanted = list[tuple[Drive, float | None]]  # each with all its readings, and its period in s
+Wanted = list[tuple[Drive, float | None]]  # drives, and the period in s at which all readings are polled
 
 
 @dataclass(frozen=True)
 class Case:
     name: str
-    predicted: float  # s
-    known: float  # the same with the response delays that were measured
+    predicted: float  # predicted cycle in s
+    known: float  # predicted from the response delays that were measured, in s
     measured: float
     missed: int  # missed values; each failed exchange costs a time-out
 
@@ -68,7 +68,7 @@ def exchanges(wanted: Wanted) -> list[Planned]:
 
 
 def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
-    """Return the measured cycle of the drives without a rate."""
+    """Poll a line; return the predicted and the measured cycle of the drives without a rate."""
     drives = tuple(PolledDrive(drive, polls(drive, every)) for drive, every in wanted)
     plant = Plant((PlantLine("line", port, None, None, drives),), Path("plant.toml"))
     watched = next(drive for drive, every in wanted if every is None)
@@ -95,7 +95,7 @@ def middle(times: Sequence[int]) -> float:
 
 
 def cycle(wanted: Wanted, delays: dict[Drive, float]) -> float:
-    """Return the predicted cycle of the drives without a rate, in s."""
+    """Return the predicted cycle of the drives without a rate in s; `delays` has response delays in s."""
     return next(1 / rate.reached for rate in predict(exchanges(wanted), delays).rates if rate.every is None)
 
 

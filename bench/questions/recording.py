@@ -1,4 +1,4 @@
-"""Decoding, batches and writing to disk: values per second, and CPU per value.
+"""Values per second, and CPU time per value, for decoding replies into batches and writing them to disk.
 
 The same 16 replies of 10 registers are decoded again for every batch.
 """

@@ -1,9 +1,9 @@
-"""A plant of every family on hostile lines, polled and recorded for hours: its cost, and its errors.
+"""Poll and record a plant with every family on hostile lines for hours, and report costs and errors.
 
 Exits with 1 in these cases:
 
-- A value is another register's. Exception: the line itself was delayed so long that replies came after the
-  response time-out, and then no client could recognise them.
+- A value belongs to another register. Exception: the simulator was delayed so long that replies came after
+  the response time-out, when no client can recognise them.
 - A value is missing without a row that gives the reason.
 - The recording differs from the polled rows.
 - Memory, descriptors or threads grow.
@@ -36,10 +36,10 @@ from multidrop.sim import load_faults
 from multidrop.toml_check import parse_duration
 
 PLAYERS = Path(__file__).parents[1] / "players"
-MOST_GROWTH_KB = 2048  # of resident memory, from the end of the first period on
+MOST_GROWTH_KB = 2048  # limit for resident memory after the first period
 COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
-IN_FLIGHT = 2  # slots of a register without a row yet
-HELD_UP = 1.0  # s before a value came, in which the line was delayed
+IN_FLIGHT = 2  # latest slots of a register, whose rows may not be taken yet
+HELD_UP = 1.0  # s; a delay of the line in this time before a wrong value excuses it
 HEAD: tuple[str, ...] = (
     "hours",
     "exchanges",
@@ -61,7 +61,7 @@ def resident_kb(pid: int) -> int:
 
 @dataclass
 class Span:
-    """The least and the greatest value of a number."""
+    """The least and the greatest value that a number had."""
 
     least: int = sys.maxsize
     most: int = 0
@@ -75,7 +75,7 @@ class Span:
 
 @dataclass
 class Period:
-    """One row of the table."""
+    """The counters of one row of the table."""
 
     exchanges: int = 0
     values: int = 0
@@ -120,7 +120,7 @@ class Commander(threading.Thread):
 
 
 class Soak:
-    """One run: rows are checked as they come, and counted by period."""
+    """One run: checks the polled rows, and counts them by period."""
 
     def __init__(self, plant: Plant, poller: Poller, out: Path, simulator: plants.RunningPlant) -> None:
         self.plant = plant
@@ -135,7 +135,7 @@ class Soak:
             for poll in drive.polls
             if poll.every
         }
-        self.slots: Counter[tuple[str, str]] = Counter()  # rows of registers with a rate
+        self.slots: Counter[tuple[str, str]] = Counter()  # number of rows of each register with a rate
         self.total = Period()
         self.exchanges = 0
         self.faults: list[str] = []
@@ -181,12 +181,12 @@ class Soak:
         return period
 
     def unexplained(self, overrun: int) -> int:
-        """Return the number of values so far that have no row and are not counted as skipped."""
+        """Return how many due values have neither a row nor are among the `overrun` skipped ones."""
         slots = int((time.monotonic() - self.begun) / plants.EVERY) - IN_FLIGHT
         return max(0, sum(max(0, slots - self.slots[key]) for key in self.timed) - overrun)
 
     def periods(self, hours: float, every: float, commander: Commander) -> Iterator[Period]:
-        """Print the line of each period at its end."""
+        """Poll for `hours`; at the end of each period of `every` s, print its row and yield it."""
         print("  ".join(HEAD), flush=True)
         end = self.begun + hours * 3600
         while (left := end - time.monotonic()) > 1:
@@ -246,7 +246,7 @@ def main() -> int:
         f"faults of {arguments.faults.name}."
     )
     with TemporaryDirectory(prefix="multidrop-soak-") as name:
-        os.environ["XDG_STATE_HOME"] = name  # of the ledger of EEPROM writes
+        os.environ["XDG_STATE_HOME"] = name  # folder of the EEPROM ledger
         directory = Path(name)
         path = plants.write_plant(directory, arguments.lines)
         with plants.running(plants.hostile_wires, path, load_faults(arguments.faults)) as simulator:

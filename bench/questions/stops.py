@@ -1,8 +1,9 @@
 """Stops under attack: does a motor turn after its stop, and how soon is the stop on the wire?
 
-Client processes are attacked from outside by signals, deaf lines, suspensions and cut networks, and from
-inside by threads that start motors. The responders do not use the library. Exits with 1 if a motor turns that
-should not, or if a frame moves it after a stop. The same seed makes the same attacks.
+Client processes are attacked from outside by signals, lines that do not answer, suspensions and cut networks,
+and from inside by threads that start motors. The simulated drives do not use the library. Exits with 1 if a
+motor turns after its stop, or if a drive gets a frame after its stop that moves the motor. The same seed
+makes the same attacks.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from bench.support import tables
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ALL = [(kind, address) for address, kind in enumerate((*KINDS, "yd1000"), 1)]
-LOOKS: dict[str, tuple[int, ...]] = {  # the exceptions in reply to the first reads of a stop
+LOOKS: dict[str, tuple[int, ...]] = {  # by family: exception codes to return to a stop's first reads
     "erman-er-g-220": (2,),
     "invt-che": (0x11, 0x06),
     "innovert-ibd": (6,),
@@ -36,10 +37,10 @@ LOOKS: dict[str, tuple[int, ...]] = {  # the exceptions in reply to the first re
     "yd1000": (4,),
     "fan": (1,),
 }
-MOST_LOOKS = 8  # reads of a start before its write
-LATE, PATIENCE = 0.6, 3.0  # s: delay of the replies; time for a stop that they confirm too late
-CUT_SHORT = "cut short"  # in the output of a client whose stops were aborted
-PAUSE = 2.5  # s: longer than a start's expiry, and than one of its reads
+MOST_LOOKS = 8  # limit of the reads that a start makes before its write
+LATE, PATIENCE = 0.6, 3.0  # s: delay of replies, which is too late to confirm a stop; limit for a stop
+CUT_SHORT = "cut short"  # words in the output of a client whose stops were aborted
+PAUSE = 2.5  # s; longer than the expiry of a start, and than each of its reads
 Attack = Callable[[random.Random, int, bool], Counters]
 
 
@@ -48,9 +49,9 @@ def _in_turn(chance: random.Random) -> Iterator[str]:
 
 
 def signals(number: int, leaving: bool) -> Attack:
-    """Return an attack by signals at random moments, while the client waits or leaves.
+    """Return an attack by `number` signals at random moments, while the client waits or ends.
 
-    Three signals may abort its stops.
+    Three signals may abort the client's stops.
     """
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
@@ -75,7 +76,7 @@ def signals(number: int, leaving: bool) -> Attack:
 
 
 def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Send a signal during an exchange of a thread that starts a motor."""
+    """Send a signal to the client while one of its threads starts a motor."""
     counters, kinds = Counters(), _in_turn(chance)
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], on_exit=True, sets=True) as client:
@@ -92,7 +93,7 @@ def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Co
 
 
 def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Start a motor in one thread, and stop it in another thread during the start."""
+    """Start a motor in one thread of the client, and stop it in another thread during the start."""
     counters = Counters()
     for kind, known in KINDS.items():
         with victim([[(kind, 1)]], sets=True) as client:
@@ -110,7 +111,7 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Make the line deaf for a while from the request to stop."""
+    """Leave the line's requests unanswered for a while after stops are requested."""
     counters = Counters()
     for _ in range(rounds):
         seconds = chance.uniform(2.0, 20.0) if is_long else 1.2
@@ -128,7 +129,7 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def two_lines(*, polls: bool) -> Attack:
-    """Return an attack on two lines of four motors that stop slowly: a signal stops both lines."""
+    """Return an attack by a signal, which must stop the motors of two lines with slowly stopping drives."""
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()
@@ -145,7 +146,7 @@ def two_lines(*, polls: bool) -> Attack:
 
 
 def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Reply to the first reads of a drive with an exception, or delay all its replies by 0.6 s."""
+    """Stop a drive that replies to the first reads with an exception, or 0.6 s late to every request."""
     counters = Counters()
     for _ in range(rounds):
         for kind, codes in LOOKS.items():
@@ -168,7 +169,7 @@ def _stop(client: Victim, counters: Counters, why: str, **more: float) -> None:
 
 
 def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Suspend the client (Ctrl-Z) during a start until its expiry is over; then no motor may move."""
+    """Suspend the client during a start for longer than the start's expiry; then no motor may move."""
     counters, kinds = Counters(), _in_turn(chance)
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], sets=True) as client:
@@ -189,7 +190,7 @@ def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     return counters
 
 
-ATTACKS: dict[str, tuple[Attack, float]] = {  # with its share of the rounds
+ATTACKS: dict[str, tuple[Attack, float]] = {  # by name: the attack, and its share of the rounds
     "a signal while it runs": (signals(1, leaving=False), 0.5),
     "two signals": (signals(2, leaving=False), 1),
     "three signals": (signals(3, leaving=False), 0.5),

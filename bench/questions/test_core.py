@@ -36,7 +36,7 @@ TEN_VALUES = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in rang
 
 
 def unhurried(request: Message) -> Exchange:
-    """Return an exchange without silence and wire time, so that its cost is the host's alone."""
+    """Return an exchange without silence and without time on the wire, to measure only the host's cost."""
     return Exchange(
         Framing.RTU,
         request,
@@ -74,7 +74,7 @@ def fd(responder: str) -> Any:
 
 
 def carry_out(port: Port, exchanges: list[Exchange], row_queue: RowQueue) -> Columns:
-    """Queue the exchanges, and take their rows."""
+    """Carry out the exchanges on the engine's thread; return their rows."""
     last = port.done + len(exchanges)
     port.submit(exchanges, [0] * len(exchanges))
     while port.done != last:

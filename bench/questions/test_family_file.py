@@ -1,4 +1,4 @@
-"""Cost of loading a family from its file, and of a second load without changes."""
+"""The cost of loading a family from its file, and of loading the unchanged file again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEFAULT = '[default]\ntable = "input"\nnumber_format = "F32"\n'
 
 @pytest.fixture
 def meter(tmp_path: Path) -> Path:
-    """A file with 40 float registers, one per line."""
+    """Return a family file with 40 float registers, one per line."""
     entries = (f'value_{at} = {{ at = 0x{2 * at:04X}, unit = "V" }}\n' for at in range(REGISTERS))
     path = tmp_path / "meter.toml"
     path.write_text(f"{HEAD}{DEFAULT}[reading]\n{''.join(entries)}")

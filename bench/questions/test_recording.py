@@ -1,4 +1,4 @@
-"""Cost of converting columns to Arrow, and of writing them to a recording of each format."""
+"""The cost of converting columns to Arrow, and of writing them to a recording of each format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REGISTERS = [f"register_{at}" for at in range(16)]
 
 @pytest.fixture
 def batch() -> Batch:
-    """4096 rows of one drive with sixteen registers."""
+    """Return a batch with 4096 rows of one drive with sixteen registers."""
     found = ffi.new("struct md_completion *")
     found.result, found.sent_ns, found.first_ns = 37, 1, 2
     found.reply.data_len, found.reply.data[0:32] = 32, list(range(32))

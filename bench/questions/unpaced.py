@@ -1,7 +1,7 @@
-"""The host's cost of an exchange: lines without waits, on a pty and over TCP.
+"""The host's CPU time per exchange, on lines without waits: on a pty and over TCP.
 
-A bare write-poll-read loop in C runs before every slice, and ratios are to that slice. Both ends run on one
-processor, because its results vary least. A default run takes six minutes.
+A minimal write-poll-read loop in C runs before every measurement, and ratios are to that loop. Both ends of
+the line run on the same processor, which makes results vary least. A default run takes six minutes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Utilisation of a paced wire by each master, requests that came too early, and the host's cost.
+"""Each master's utilisation of a paced line, its requests that came too early, and its cost on the host.
 
-A bare master in C that keeps multidrop's silence runs before every slice; differences and ratios are to that
-slice. Figures are medians of the slices, and counts are sums over all slices. A default run takes a quarter
-of an hour.
+A minimal master in C with multidrop's silences runs before every measurement; differences and ratios are to
+that master. Figures are medians of all measurements, and counts are sums. A default run takes a quarter of
+an hour.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bench.support import tables
 from bench.support.programs import paced_line
 
 BARE = "bare C"
-ASLEEP = "bare C, asleep"  # until a character and a half before a reply's end, when multidrop wakes
+ASLEEP = "bare C, asleep"  # sleeps until 1.5 characters before a reply's end, as multidrop does
 
 COLUMNS = (
     "baud",
@@ -36,7 +36,7 @@ COLUMNS = (
 
 
 def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
-    """Measure one slice, from the drives' and from the master's side."""
+    """Let a master poll for `seconds`; return what the simulated drives and the master measured."""
     with paced_line(baudrate=baudrate) as line:
         job = Job(line.path, baudrate, seconds)
         if master in (BARE, ASLEEP):

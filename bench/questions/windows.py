@@ -1,7 +1,7 @@
-"""Utilisation of a paced wire, and requests that came too early: on a COM port with Wine, and on Linux.
+"""The utilisation of a paced line, and requests that came too early: on a COM port with Wine, and on Linux.
 
-FOLDER was filled by `tools/wine make`. Wine is not Windows: its timers have a resolution of one millisecond,
-each wait goes through another process (wineserver), and its COM port is a pseudo-terminal.
+`tools/wine make` must have filled FOLDER. Wine is not Windows: its timers have a resolution of 1 ms, each
+wait goes through another process (wineserver), and its COM port is a pseudo-terminal.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ COM = 5
 
 
 def here(job: Job, folder: Path) -> dict[str, Any]:
-    """Return CPU seconds and misses of a poll on this system."""
+    """Run a job on this system; return its CPU seconds and misses."""
     own = rivals.measure("multidrop", job)
     return {"cpu": own["cpu_seconds"], "misses": own["failures"]}
 
 
 def on_windows(job: Job, folder: Path) -> dict[str, Any]:
-    """Return the same for a poll with Wine."""
+    """Run a job with Wine; return the same."""
     link = folder / "wine" / "dosdevices" / f"com{COM}"
     link.unlink(missing_ok=True)
     link.symlink_to(job.port)
@@ -56,7 +56,7 @@ SYSTEMS: dict[str, Callable[[Job, Path], dict[str, Any]]] = {"Linux": here, "Win
 
 
 def measured(system: str, baudrate: int, seconds: float, folder: Path) -> dict[str, Any]:
-    """Measure one slice, from the drives' and from the master's side."""
+    """Poll a line on Linux or with Wine; return what the simulated drives and the master measured."""
     with paced_line(baudrate=baudrate) as line:
         own = SYSTEMS[system](Job(line.path, baudrate, seconds), folder)
     report = line.report

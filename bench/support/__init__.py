@@ -1,1 +1,1 @@
-"""Compiled programs and printed tables."""
+"""Shared by the benchmarks: compiling and running programs, and printing tables."""

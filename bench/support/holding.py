@@ -1,4 +1,4 @@
-"""Find the entries of an imported device that a family can represent, as the library itself decides."""
+"""Find the entries of an imported device that a family can represent, by declaring them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from multidrop.drive.register import Access, Register
 from multidrop.importers.device import ONLY_WRITTEN, ImportedDevice, ImportedRegister
 from multidrop.importers.family_writer import declare
 
-DETAILS = {  # properties of an entry, as printed in the table
+DETAILS = {  # properties that an entry may need: their names in the printed table
     "offset": "offset",
     "invalid": "invalid counts",
     "part": "bits of a word",
@@ -34,11 +34,11 @@ DETAILS = {  # properties of an entry, as printed in the table
 
 @dataclass(frozen=True)
 class Holding:
-    """The answer for one entry: representable, only for reading, or not at all, with the reason."""
+    """Whether an entry is representable, representable only for reading, or not, with the reason."""
 
-    entry: ImportedRegister | None  # None: the importer could not make a register of it
+    entry: ImportedRegister | None  # None: the importer could not convert the entry to a register
     is_held: bool
-    is_written: bool = True  # the other program writes it
+    is_written: bool = True  # True if a register may be written as the other program writes it
     lacks: str = ""
     is_text: bool = False
 
@@ -48,7 +48,7 @@ class Holding:
 
     @property
     def details(self) -> Iterator[str]:
-        """Yield the keys of DETAILS that the entry needs, beyond 16 or 32 bits with a step."""
+        """Yield the keys of DETAILS that the entry needs; 16 or 32 bits with a step need none."""
         if self.entry is None:
             return
         details, number = self.entry.details, str(self.entry.details.get("number_format", "U16"))
@@ -70,7 +70,7 @@ class Holding:
 
 
 def holdings(device: ImportedDevice) -> list[Holding]:
-    """Return the answers for all entries of a device, written as its program writes them."""
+    """Return a Holding for each entry of a device, declared as the other program uses the entry."""
     found = [_held(entry) for entry in device.registers]
     found += [Holding(entry, is_held=True, is_text=True) for entry in device.texts]
     found += [_commanded(entry) for entry in device.commands]
@@ -79,7 +79,7 @@ def holdings(device: ImportedDevice) -> list[Holding]:
 
 
 def family_of(entries: list[Holding]) -> str:
-    """Declare all of these in one class; return the reason for a refusal, or ""."""
+    """Declare all of these entries in one family; return the library's reason for a refusal, or ""."""
     members = {
         f"entry_{number}": _declared(each.entry)
         for number, each in enumerate(entries)
@@ -87,7 +87,7 @@ def family_of(entries: list[Holding]) -> str:
     }
     for name, register in members.items():
         object.__setattr__(register, "name", name)
-        object.__setattr__(register, "scale_register", "")  # has another name here; the importer checked it
+        object.__setattr__(register, "scale_register", "")  # it has another name here; the importer checked it
     return _refusal(members)
 
 
@@ -99,7 +99,7 @@ def _held(entry: ImportedRegister) -> Holding:
 
 
 def _kind_of(lacks: str) -> str:
-    """Return a reason without its quoted parts, so that equal reasons are counted together."""
+    """Return a reason without its quoted parts, so that similar reasons are counted together."""
     return re.sub(r"'[^']*'", "'...'", lacks)
 
 
@@ -109,7 +109,7 @@ def _commanded(entry: ImportedRegister) -> Holding:
 
 
 def _why_not(entry: ImportedRegister) -> str:
-    """Return why the entry cannot be declared as its program uses it; "" if it can."""
+    """Return why the entry cannot be declared as the other program uses it, or "" if it can."""
     try:
         register = _declared(entry)
     except ValueError as refusal:

@@ -1,4 +1,4 @@
-"""The C programs of bench/: compiled once per run, and the paced line as a context manager."""
+"""Compile the C programs of bench/ once per run, and run them and the paced line as context managers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 HERE = Path(__file__).parents[1]
 PROCESSORS = sorted(os.sched_getaffinity(0))
 CORE = HERE.parent / "csrc"
-FRAMES = (f"-I{CORE}", str(CORE / "body.c"), str(CORE / "frame.c"))  # the core's frames and checksums
+FRAMES = (f"-I{CORE}", str(CORE / "body.c"), str(CORE / "frame.c"))  # core files for frames and checksums
 
 
 @cache
@@ -40,9 +40,9 @@ def module(name: str, *words: object) -> list[str]:
 
 @dataclass
 class Talker:
-    """A program that plays one line or many; it has a report when it has ended."""
+    """A running program that plays one or more lines; `report` is set when it has ended."""
 
-    said: str  # its first output: the ports of its lines
+    said: str  # the program's first output: the ports of its lines
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -52,7 +52,7 @@ class Talker:
 
 @contextmanager
 def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
-    """Run a program until its standard input ends; it then prints its report as JSON."""
+    """Run a program during the block; then end its standard input, and read its report, which is JSON."""
     words = [str(word) for word in command]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **pipes, **details) as process:
@@ -79,7 +79,7 @@ def paced_line(**options: Any) -> Iterator[Talker]:
 
 @contextmanager
 def on_processor(number: int) -> Iterator[None]:
-    """Programs that are started within the block stay on that processor, or on the last one."""
+    """Restrict programs started within the block to this processor, or to the last one if there are fewer."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {PROCESSORS[min(number, len(PROCESSORS) - 1)]})
     yield

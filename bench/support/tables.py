@@ -1,4 +1,4 @@
-"""Tables as text, with a heading for judging them: command, date and machine."""
+"""Print tables as text, with a heading: subject, command, date and computer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def heading(what: str) -> None:
-    """Print the heading of a table: its subject, command, date and machine."""
+    """Print the heading of a table: its subject, and the command, date and computer of the measurement."""
     print(what)
     print(f"command  {shlex.join(['python', *sys.orig_argv[1:]])}")
     print(f"date     {datetime.now(UTC):%Y-%m-%d %H:%M} UTC")
