@@ -45,7 +45,7 @@ static struct samples lateness, excess;
 static int64_t settled_ns, first_ns, last_ns; /* times: start of counting, first and last counted request */
 static int64_t pending_ideal_ns, ideal_ns;
 static long answered, unanswered, early, given_up, refused, registers, per_drive[MOST_DRIVES + 1];
-static int is_crossed; /* a request came before the previous reply was complete */
+static int is_crossed; /* the next request came before the reply was complete */
 
 static void add(struct samples *samples, int64_t sample)
 {

@@ -289,7 +289,7 @@ class Hall:
         return min(times) - begun, max(times) - begun, answered - begun
 
     def minutes(self, number: int, seconds: float) -> Iterator[tuple[object, ...]]:
-        """Yield a row per minute: poll alone for a while, then with users for `number` minutes, then alone."""
+        """Yield a row per minute: poll without users, then with users for `number` minutes, then without."""
         with plain_poll(self.plant, self.before) as polling:
             time.sleep(SETTLE_S)
             yield self.slice("poll", polling, seconds)

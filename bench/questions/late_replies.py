@@ -68,7 +68,7 @@ def _told(judged: many_adapter.Judged, seconds: float) -> dict[str, object]:
 
 
 def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
-    """Yield a row for each path delay, with few lines and drives, because exchanges take as long as the path."""
+    """Yield a row for each path delay. Lines and drives are few, because exchanges take long."""
     for path_ms in PATHS_MS:
         constant = "--path-us", 1000 * path_ms
         stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms

@@ -1,6 +1,6 @@
 """The bus cycle of random plants with multidrop's plan, compared with the usual ways to merge registers.
 
-All plans keep the families' limits, and read undeclared addresses only where families allow it. All have the
+All plans keep the families' limits, and merge registers only across addresses that can be read. All have the
 order of drives that multidrop plans, except the last row: multidrop's blocks in the plant file's order.
 """
 
@@ -44,7 +44,7 @@ def plant(lot: random.Random) -> Plant:
 
 
 def merged(drive: Drive, registers: Registers, most_gap: int) -> list[Block]:
-    """Merge registers in order of address, across at most `most_gap` other addresses; -1: never merge."""
+    """Return blocks of registers, merged across at most `most_gap` other addresses; -1: never merged."""
     tables: dict[Table, list[Register[Any]]] = {}
     for register in registers:
         tables.setdefault(register.table, []).append(register)
@@ -84,7 +84,7 @@ def end(register: Register[Any]) -> int:
 
 
 def cycle(drives: Iterable[Drive], of_drive: dict[Drive, Iterable[Block]]) -> float:
-    """Return the seconds to read everything once, in this order of the drives."""
+    """Return the time in s to read all blocks once, in this order of the drives."""
     exchanges = [Planned(drive, block) for drive in drives for block in of_drive[drive]]
     return sum(
         gap(exchanges[at - 1].drive, each.drive) + sending(each.drive, each.block) + each.drive.response_delay

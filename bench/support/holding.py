@@ -87,7 +87,7 @@ def family_of(entries: list[Holding]) -> str:
     }
     for name, register in members.items():
         object.__setattr__(register, "name", name)
-        object.__setattr__(register, "scale_register", "")  # it has another name here; the importer checked it
+        object.__setattr__(register, "scale_register", "")  # its name differs here; the importer checked it
     return _refusal(members)
 
 

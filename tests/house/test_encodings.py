@@ -1,4 +1,4 @@
-"""Other systems: every text states its encoding, and every module can be imported without POSIX."""
+"""Check portability: every opened text file has an encoding, and every module imports without POSIX."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tables import table
 
 import multidrop
 
-pytestmark = pytest.mark.long  # a rule for the package's authors
+pytestmark = pytest.mark.long  # concerns only the package's authors
 
 SOURCE = Path(multidrop.__file__).parent
 TEXT_MODES = frozenset("rwaxt+")

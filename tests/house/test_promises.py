@@ -1,4 +1,4 @@
-"""Check tests/README.md: every promise has a row, and everything it names exists."""
+"""Check tests/README.md: each promise has a row, and the files, tests and commands that it names exist."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ def test_named_files_exist() -> None:
 
 @table("name", named(r"test_\w+(?![\w.])"))
 def test_named_tests_exist(name: str) -> None:
-    """Look for the test in the last file named before it."""
+    """The test must be in the file that is named last before it."""
     for before in re.findall(rf"^(.*)`{name}`", PAGE, re.MULTILINE):
         file = re.findall(r"tests/[\w/]+/test_\w+\.py", before)[-1]
         assert f"def {name}(" in (ROOT / file).read_text("utf-8")
 
 
 def script(command: str) -> Path | None:
-    """Return the project file that a command runs, or None."""
+    """Return the file of this project that a command runs, or None."""
     if module := re.search(r"-m (bench[\w.]+)", command):
         return ROOT / f"{module[1].replace('.', '/')}.py"
     files = [ROOT / file for file in re.findall(FILE, command)]

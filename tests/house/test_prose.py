@@ -32,7 +32,7 @@ def test_no_class_name_stands_for_two_things() -> None:
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
 
 
-# Constructions that readers stumble over, by what to write instead.
+# Patterns of constructions that readers stumble over. Each key says what to write instead.
 CONSTRUCTIONS = {
     "a noun": r"\bwhat (?:is|was|are|were|has|had|it|they|comes|came|leaves|may|must|can|cannot|else)\b",
     "if or when": r", where |\bwhere (?:it|there|none|that|a|the|no|nothing|they|one|its|all|several)\b",
@@ -49,8 +49,8 @@ CONSTRUCTIONS = {
     "because": r", for (?:it|they|there|that|this|the|a|no|which)\b",
 }
 STUMBLES = re.compile("|".join(CONSTRUCTIONS.values()), re.IGNORECASE)
-MOST_STUMBLES = 6.0  # per 1,000 words of a room's text
-# Rooms whose text is older than this rule, with their present limit. Lower it when you rewrite one.
+MOST_STUMBLES = 6.0  # limit of hits per 1,000 words of a room's docstrings and comments
+# Rooms whose text is older than this rule, with a higher limit. Lower the limit when you rewrite a room.
 OLDER_ROOMS = {"tests": 16.0, "bench": 19.0, "docs": 8.0}
 PROSE_ROOMS = sorted(
     {path.name for path in (ROOT / "src" / "multidrop").iterdir() if path.is_dir() and path.name[0] != "_"}
@@ -115,7 +115,7 @@ def test_no_line_is_too_long(room: str) -> None:
 
 
 def is_long_by_nature(path: Path, line: str) -> bool:
-    """Return True for rows of tables, and for code of C programs that are not the core's."""
+    """Return True if the line may be long: a row of a table, or code of a C program outside the core."""
     if path.suffix == ".md":
         return line.startswith("|")
     return path.suffix in (".c", ".h") and path.parts[-2] != "csrc" and not re.search(r"/\*|^ \*", line)

@@ -1,4 +1,4 @@
-"""Public names: one list, loaded lazily, with a readable repr and strict types."""
+"""Check the public names: they are listed once, load lazily, have a readable repr, and are strictly typed."""
 
 from __future__ import annotations
 

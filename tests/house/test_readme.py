@@ -1,4 +1,4 @@
-"""Check that README is short, installs like .ci/run, and that its ten-line example works.
+"""Check that README is short, has the same installation commands as .ci/run, and a working example.
 
 test_docs.py runs the code of all pages.
 """
@@ -94,7 +94,7 @@ PAGES = "\n".join(page.read_text("utf-8") for page in (ROOT / "docs").rglob("*.m
 
 
 def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (patient.__file__,)) -> str:
-    """Return what an example prints."""
+    """Run an example; return the text that it prints."""
     done = subprocess.run(
         [sys.executable, "-W", "error", *through, str(EXAMPLES / name), *words],
         cwd=directory,

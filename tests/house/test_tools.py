@@ -1,4 +1,4 @@
-"""Developer tools: command-line mistakes, fuzzing corpora, mutants, and processes that tests start."""
+"""Check the developer tools: command-line mistakes, fuzzing corpora, mutants, and processes of tests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TOOLS = Path(__file__).parents[2] / "tools"
 LINUX = "multidrop-0.1.0-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl"
 WINDOWS = "multidrop-0.1.0-cp311-abi3-win_amd64.whl"
 
-# Arguments, typed in a folder with two wheels, a file and an empty folder; and the expected message.
+# Arguments to the message that they print, in a folder with two wheels, a file and an empty folder.
 MISTAKES = {
     "bare": "bare: it takes RELEASE WHEEL, and was given nothing",
     f"bare stable {LINUX} {LINUX}": f"bare: it takes RELEASE WHEEL, and was given: stable {LINUX} {LINUX}",

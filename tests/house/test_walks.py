@@ -1,4 +1,4 @@
-"""Check that the architecture page lists every file, and that its two walks name existing code."""
+"""Check that the architecture page lists every file, and that its two walkthroughs name existing code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\
 
 
 def steps(walk: Path) -> list[tuple[str, str]]:
-    """Return each file of a walk with its function or class ("" for a C file)."""
+    """Return the steps of a walkthrough: each file with its function or class ("" for a C file)."""
     return [(file or c_file, name) for file, name, c_file in STEP.findall(walk.read_text("utf-8"))]
 
 
@@ -43,7 +43,7 @@ def missing(walk: Path) -> list[str]:
 
 
 def test_every_file_has_its_row() -> None:
-    """Check the rows; a folder covers its contents, and a pattern covers the matching files."""
+    """Check that a row covers every file; a folder covers its contents, and a pattern the matching files."""
     rows = [line.split("|")[1] for line in ARCHITECTURE.read_text("utf-8").splitlines() if line[:1] == "|"]
     named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
     places = [*PACKAGE.iterdir(), *(ROOT / "csrc").glob("*.c"), ROOT / "csrc" / "windows"]

@@ -1,4 +1,4 @@
-"""Check the import rules between rooms by parsing the sources."""
+"""Check the import rules between rooms (packages of src/multidrop) by parsing the sources."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
 
 import multidrop
 
-pytestmark = pytest.mark.long  # rules for the package's authors
+pytestmark = pytest.mark.long  # concerns only the package's authors
 
 FILES = files("src")
 OUTSIDE = {
     *("os", "time", "select", "selectors", "socket", "serial", "termios", "fcntl", "pty", "tty"),
     *("signal", "subprocess"),
 }
-# lowest first: a room imports from itself and from rooms below it
+# floors, the lowest first: a room may import from itself and from rooms on lower floors
 FLOORS = [
     {"errors", "exposition", "extras", "printable", "iso_time", "interpreter", "supervisor"},
     {"toml_check"},
@@ -88,7 +88,7 @@ OPEN = {
         "toml_check",
     )
 }
-TIED = (  # groups of files that name each other in annotations
+TIED = (  # groups of files whose annotations refer to each other
     {"drive/family.py", "drive/verbs.py"},
     {"polling/batch.py", "polling/tables.py"},
     {"sim/drive.py", "sim/protocol.py"},
@@ -157,13 +157,13 @@ def test_imports_point_downwards() -> None:
 
 
 def test_type_imports_point_downwards() -> None:
-    """Check that annotations, too, name only rooms below."""
+    """Imports for annotations, too, come only from rooms below."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}
 
 
 def test_no_import_cycles_between_files() -> None:
-    """Check for cycles, including imports for annotations. Shared parts belong in one file or below both."""
+    """Check for cycles, including imports for annotations. Two such files need a third one below them."""
     ties = {name: min(group) for group in TIED for name in group}
     graph: dict[str, set[str]] = {}
     for path in FILES:
@@ -179,7 +179,7 @@ def test_no_import_cycles_between_files() -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_clients_use_only_public_names(client: str) -> None:
-    """Check that anyone could write such a client with public names."""
+    """Check that users could write such a client too, because it imports only public names."""
     found = {
         str(path.relative_to(PACKAGE)): {
             name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name, client)
@@ -203,7 +203,7 @@ def test_only_listed_commands_import_a_client(client: str) -> None:
 
 
 def test_files_are_short() -> None:
-    """Check the length limit, or a listed reason: a longer file has two jobs."""
+    """Check that each file keeps the length limit, or is listed with a reason; a longer file has two jobs."""
     lines = {
         path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines())
         for path in [*FILES, *files("csrc", suffixes=(".c", ".h"))]
@@ -214,7 +214,7 @@ def test_files_are_short() -> None:
 def test_no_test_imports_another_test() -> None:
     tests = files("tests")
     names = {path.stem for path in tests if path.name.startswith("test_")}
-    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # saves parsing
+    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # parse only files that may import a test
     assert offenders({str(path.relative_to(ROOT)): _imported(path) & names for path in maybe}) == {}
 
 
@@ -223,7 +223,7 @@ def _imported(path: Path) -> set[str]:
 
 
 def test_drive_and_planning_are_pure() -> None:
-    """Check that these rooms import no clock and no port."""
+    """Check that the rooms `drive` and `planning` import no module for clocks or ports."""
     ports = {"multidrop.core.port", "multidrop.core.capture"}
     outside = OUTSIDE | ports | {"datetime", "random", "threading", "pathlib", "asyncio"}
     pure = [path for path in FILES if room(path) in ("drive", "planning")]
@@ -241,7 +241,7 @@ PURE = ("body", "frame", "line", "reply", "tcp", "late", "stats", "capture")
 
 
 def calls(code: dict[str, str]) -> dict[str, set[str]]:
-    """Return the files that each C file calls; a function belongs to the first file that defines it."""
+    """Return for each C file the files whose functions it calls; a function's file is the first to define it."""
     homes: dict[str, str] = {}
     for name, text in code.items():
         for function in DEFINED.findall(text):
@@ -253,7 +253,7 @@ def calls(code: dict[str, str]) -> dict[str, set[str]]:
 
 
 def core() -> dict[str, str]:
-    """Return the text of each file of the core, without comments."""
+    """Return the text of each C file of the core by name, without comments."""
     found = sorted((ROOT / "csrc").glob("*.c"))
     return {path.stem: re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL) for path in found}
 
