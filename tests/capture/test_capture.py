@@ -140,7 +140,7 @@ def test_captures_of_wireshark_s_tools_are_read(tmp_path: Path, format: str, lin
     assert [span.time_ns for span in found] == [first + n * 10**6 for n in range(len(frames))]
 
 
-def test_a_frame_may_lie_in_several_packets_and_several_in_one(tmp_path: Path) -> None:
+def test_frames_split_over_packets_and_several_in_one_packet_are_read(tmp_path: Path) -> None:
     frames = b"".join(each.request_frame + each.frame for each in RTU)
     packets = [frames[at : at + 7] for at in range(0, len(frames), 7)]
     header = struct.pack(">IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 147)  # big-endian, ns
@@ -172,7 +172,7 @@ def test_a_clock_of_any_resolution_is_read(tmp_path: Path, resolution: bytes, ti
 # ---- write errors ----
 
 
-def test_a_capture_on_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
+def test_a_capture_on_a_full_disk_raises_one_sentence(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     path = tmp_path / "a.pcapng"
@@ -184,7 +184,7 @@ def test_a_capture_on_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
     assert sorted(Path("/proc/self/fd").iterdir()) == files
 
 
-def test_a_capture_in_a_missing_directory_is_one_sentence(tmp_path: Path) -> None:
+def test_a_capture_in_a_missing_directory_raises_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "none" / "a.pcapng"
     with pytest.raises(RecordingError) as failure:
         CaptureWriter(path)

@@ -41,7 +41,9 @@ READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
         ),
     ],
 )
-def test_a_capture_of_something_else_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
+def test_a_file_that_is_not_a_capture_raises_one_sentence(
+    tmp_path: Path, content: bytes, sentence: str
+) -> None:
     path = tmp_path / "a.pcap"
     path.write_bytes(content)
     with pytest.raises(CaptureError) as mistake:
@@ -111,7 +113,7 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         ),
     ],
 )
-def test_an_unreadable_pcapng_file_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
+def test_an_unreadable_pcapng_file_raises_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
     path = tmp_path / "a.pcapng"
     path.write_bytes(content)
     with pytest.raises(CaptureError) as mistake:
@@ -198,7 +200,7 @@ OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024
 
 
 @pytest.mark.slow
-def test_a_capture_truncated_during_reading_is_a_sentence(tmp_path: Path) -> None:
+def test_a_capture_truncated_during_reading_raises_one_sentence(tmp_path: Path) -> None:
     """A separate process reads it: if the file were mapped, reading past its end would kill the process."""
     path = write(tmp_path / "it.pcapng", RTU * 20)
     code = (

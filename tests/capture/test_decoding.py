@@ -87,7 +87,7 @@ def test_without_a_plant_rows_are_raw_registers(tmp_path: Path) -> None:
     ]
 
 
-def test_a_refusal_is_a_miss_with_its_code(tmp_path: Path) -> None:
+def test_an_exception_reply_is_a_miss_with_its_code(tmp_path: Path) -> None:
     exchange = next(each for each in RTU if _text(each.frame) == "01 83 03 01 31")
     found = rows(write(tmp_path / "a.pcapng", [exchange]))
     assert {(row.value, row.status) for row in found} == {(None, "exception 03")}

@@ -389,7 +389,7 @@ def test_pending_anomalies_are_written_at_the_end(tmp_path: Path, monkeypatch: p
     assert [seconds_in(path) for path in one_flight.recorder.written] == [list(range(1001, 1007))]
 
 
-def test_a_directory_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_raises_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="cannot be written"):
         FlightRecorder(tmp_path / "file" / "flights", [])

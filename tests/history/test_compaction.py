@@ -250,7 +250,7 @@ def _readable(path: Path) -> list[Row]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
-def test_a_segment_without_a_head(tmp_path: Path, content: bytes) -> None:
+def test_a_segment_without_a_head_hides_no_other_segment(tmp_path: Path, content: bytes) -> None:
     """After a power cut a file may be empty or contain zeros."""
     rows = segments()
     record(tmp_path, rows)

@@ -25,7 +25,7 @@ from multidrop.recording import open_recording
 MS = 1_000_000
 
 
-def test_all_mistakes_of_its_table_at_once() -> None:
+def test_all_mistakes_of_the_history_table_are_reported_together() -> None:
     with pytest.raises(ValueError, match="invalid time") as failure:
         HistorySettings(keep="for ever", most="20", rotate="0 s")
     lines = str(failure.value).splitlines()
@@ -35,7 +35,7 @@ def test_all_mistakes_of_its_table_at_once() -> None:
     HistorySettings()
 
 
-def test_a_folder_that_cannot_be_created_is_one_sentence(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_raises_one_sentence(tmp_path: Path) -> None:
     """The test uses /sys, where not even root may create a folder."""
     inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
     with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
@@ -43,7 +43,7 @@ def test_a_folder_that_cannot_be_created_is_one_sentence(tmp_path: Path) -> None
     assert "Errno" not in str(failure.value)
 
 
-def test_a_number_without_end_is_null() -> None:
+def test_infinity_and_nan_are_null_in_json() -> None:
     """JSON has no infinity and NaN: with them, a browser could not parse the whole answer."""
     found = as_json(Buckets(0, MS, [1, 2], [0, 0], [-inf, 1.0], [nan, 1.5], [inf, 2.0]))
     assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]

@@ -67,7 +67,7 @@ def test_rows_come_in_the_order_of_recording(folder: Path, rows: list[list[Row]]
 
 @pytest.mark.slow
 @COMPACTED
-def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
+def test_series_are_read_within_a_range(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(5)
     times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:
@@ -139,7 +139,7 @@ def test_an_export_equals_the_rows_read(folder: Path, rows: list[list[Row]]) -> 
 
 @pytest.mark.slow
 @COMPACTED
-def test_a_table(folder: Path, rows: list[list[Row]]) -> None:
+def test_history_rows_convert_to_a_pandas_table(folder: Path, rows: list[list[Row]]) -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     with History(folder) as history:
         frame = history.read("pump-2.current").to_pandas()
@@ -148,7 +148,7 @@ def test_a_table(folder: Path, rows: list[list[Row]]) -> None:
     assert frame.value.dropna().tolist() == [row.value for row in mine if row.value is not None]
 
 
-def test_moments_are_ns_or_datetimes(tmp_path: Path) -> None:
+def test_a_range_may_be_given_in_ns_or_datetimes(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 300)
     record(tmp_path, [rows])
     moment = datetime(2026, 11, 21, 12, 0, 20, tzinfo=UTC)
@@ -193,7 +193,7 @@ def test_a_grid_covers_its_range() -> None:
         assert grid.step < 10 * SECOND or grid.is_of_tens
 
 
-def test_an_hour_is_made_of_tens_from_2_s_a_point_on() -> None:
+def test_buckets_of_2_s_or_more_are_made_of_tens() -> None:
     hour = NOON, NOON + 3600 * SECOND
     assert grid_of(*hour, 1800).is_of_tens
     assert grid_of(*hour, 1801).step < 2 * SECOND
@@ -244,7 +244,7 @@ def test_replaced_files_lose_no_row_for_a_reader(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_later_names_are_found(tmp_path: Path) -> None:
+def test_names_that_first_appear_in_a_later_segment_are_found(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 60)
     later = [row._replace(drive="насос, «новый»", register="torque") for row in random_rows(2, NOON, 60)]
     record(tmp_path, [[*rows, *later], later])
@@ -255,7 +255,7 @@ def test_later_names_are_found(tmp_path: Path) -> None:
             compact(tmp_path, 2)
 
 
-def test_a_recording_in_segments_of_poll(tmp_path: Path) -> None:
+def test_segments_written_by_poll_are_read_as_a_history(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 100)
     with SegmentWriter(tmp_path / "run.arrows", METADATA, every=1e9) as writer:
         for at in (0, 50):
@@ -348,7 +348,7 @@ def test_plots_of_a_growing_segment_have_all_rows(
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
-def test_unknown_names_are_not_cached_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_of_unknown_names_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))

@@ -46,7 +46,8 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
 def check(history: History, written: dict[str, int], begin: int | None = None) -> int:
     """Check that each run has at least its written rows, without gaps; return the number of all rows.
 
-    Rows before `begin` are ignored."""
+    Rows before `begin` are ignored.
+    """
     runs: dict[str, list[int]] = defaultdict(list)
     for rows in history.read(None, begin):
         for row in rows:

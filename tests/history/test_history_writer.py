@@ -188,7 +188,7 @@ def test_a_full_disk_delays_neither_polling_nor_stops(
     assert writer.state().trouble
 
 
-def test_an_unwritable_folder_fails_at_once() -> None:
+def test_an_unwritable_folder_raises_permission_error_immediately() -> None:
     with read_only_directory() as directory, pytest.raises(PermissionError):
         HistoryWriter(directory / "history", METADATA)
 
@@ -275,7 +275,7 @@ def test_a_failed_child_is_reported_and_started_again(
         assert sorted(rows_in(history)) == sorted(rows)
 
 
-def test_a_child_may_say_any_bytes(
+def test_any_bytes_in_a_child_s_output_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     program = tmp_path / "python"

@@ -190,7 +190,7 @@ def test_columns_keep_their_quantity_while_the_history_grows(tmp_path: Path) -> 
         assert columns_of(history.read(SERIES)) == {SERIES: {50.0}, f"{SERIES} [A]": {1.0}}
 
 
-def test_two_tables_of_names_are_two_columns(tmp_path: Path) -> None:
+def test_registers_with_different_value_names_have_two_columns(tmp_path: Path) -> None:
     recorded(tmp_path, STATES, OTHER_STATES, AMPERE)
     with History(tmp_path) as history:
         rows = history.read(SERIES)

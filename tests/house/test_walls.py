@@ -214,7 +214,7 @@ def test_files_are_short() -> None:
 def test_no_test_imports_another_test() -> None:
     tests = files("tests")
     names = {path.stem for path in tests if path.name.startswith("test_")}
-    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # parse only files that may import a test
+    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # spares parsing
     assert offenders({str(path.relative_to(ROOT)): _imported(path) & names for path in maybe}) == {}
 
 
@@ -241,7 +241,7 @@ PURE = ("body", "frame", "line", "reply", "tcp", "late", "stats", "capture")
 
 
 def calls(code: dict[str, str]) -> dict[str, set[str]]:
-    """Return for each C file the files whose functions it calls; a function's file is the first to define it."""
+    """Return the files that each C file calls; a function belongs to the first file that defines it."""
     homes: dict[str, str] = {}
     for name, text in code.items():
         for function in DEFINED.findall(text):

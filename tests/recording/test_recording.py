@@ -78,7 +78,7 @@ def test_an_empty_recording_is_read(tmp_path: Path, suffix: str) -> None:
 
 
 @every_format
-def test_batches_that_are_read_are_arrow_too(tmp_path: Path, suffix: str) -> None:
+def test_batches_from_a_reader_can_be_passed_to_arrow(tmp_path: Path, suffix: str) -> None:
     found = [pa.record_batch(batch) for batch in open_recording(record(tmp_path / f"a{suffix}"))]
     for batch in found:
         batch.validate(full=True)
@@ -133,7 +133,7 @@ def test_pyarrow_opens_arrows(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_polars_opens_all(tmp_path: Path) -> None:
+def test_polars_opens_every_format(tmp_path: Path) -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     physical = polars.col("time").to_physical()
     arrows = polars.read_ipc_stream(record(tmp_path / "a.arrows")).with_columns(physical)
@@ -221,7 +221,7 @@ def test_names_are_dictionaries_in_parquet(tmp_path: Path) -> None:
     assert all("RLE_DICTIONARY" in encodings[name] for name in ("drive", "register", "status"))
 
 
-def test_csv_text_is_exact(tmp_path: Path) -> None:
+def test_csv_file_has_the_documented_text(tmp_path: Path) -> None:
     with open_writer(tmp_path / "a.csv", METADATA) as writer:
         writer.write(example())
     assert (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines() == [
@@ -272,7 +272,7 @@ def test_any_rows_are_read_as_they_were_written(
 @pytest.mark.parametrize("target", FORMATS)
 @settings(max_examples=examples(20), deadline=None)
 @given(batches=st.lists(st.lists(st.one_of(SAMPLE, NO_NUMBER, MISS), max_size=9), max_size=5))
-def test_any_batches_converted(
+def test_converting_keeps_any_rows(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
 ) -> None:
     """Values may be NaN, which does not equal itself, so the test compares texts."""
@@ -333,7 +333,7 @@ def test_no_text_of_a_csv_is_a_formula_and_all_come_back(tmp_path: Path) -> None
 
 @every_format
 @pytest.mark.parametrize("target", FORMATS)
-def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -> None:
+def test_converting_keeps_rows_and_metadata(tmp_path: Path, suffix: str, target: str) -> None:
     assert convert(record(tmp_path / f"a{suffix}"), tmp_path / f"b{target}") == 2505
     reader = open_recording(tmp_path / f"b{target}")
     assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
@@ -427,7 +427,7 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path, act: object, name: str) ->
 
 
 @every_format
-def test_metadata_that_json_cannot_hold(tmp_path: Path, suffix: str) -> None:
+def test_metadata_that_json_cannot_hold_raises_type_error(tmp_path: Path, suffix: str) -> None:
     path = record(tmp_path / f"a{suffix}")
     with pytest.raises(TypeError, match="not JSON serializable"):
         open_writer(path, {"drives": object()})
@@ -543,7 +543,7 @@ def test_a_stream_rewritten_by_another_program_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [255, 256, 257, 1000])
-def test_more_statuses_than_a_byte_has_values(tmp_path: Path, count: int) -> None:
+def test_more_statuses_than_a_byte_has_values_are_recorded(tmp_path: Path, count: int) -> None:
     some = [Row(at, at, None, "a", "b", None, f"status {at % count}") for at in range(2500)]
     path = tmp_path / "a.arrows"
     with open_writer(path, {}) as writer:
@@ -552,7 +552,7 @@ def test_more_statuses_than_a_byte_has_values(tmp_path: Path, count: int) -> Non
     assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == some
 
 
-def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
+def test_all_exception_codes_are_recorded_in_one_batch(tmp_path: Path) -> None:
     """Rows with each of the core's codes for 255 exceptions, and with a good reply between them."""
     columns = Columns(1024)
     for code in range(512):

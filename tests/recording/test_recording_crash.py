@@ -331,7 +331,7 @@ def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: st
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_read_only_directory_is_one_sentence(tmp_path: Path, suffix: str) -> None:
+def test_a_read_only_directory_raises_one_sentence(tmp_path: Path, suffix: str) -> None:
     open_writer(tmp_path / f"a{suffix}", METADATA).close()  # import modules before dropping privileges
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
@@ -342,7 +342,7 @@ def test_a_read_only_directory_is_one_sentence(tmp_path: Path, suffix: str) -> N
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_missing_directory_is_an_error(tmp_path: Path, suffix: str) -> None:
+def test_a_missing_directory_or_file_raises_an_error(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(RecordingError, match="No such file or directory"):
         open_writer(tmp_path / "none" / f"a{suffix}", METADATA)
     with pytest.raises(FileNotFoundError):
@@ -558,7 +558,7 @@ def suppress_mistake_that_names(path: Path) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("rows", [-77, -(1 << 59), 1 << 59])
-def test_a_batch_of_impossibly_many_rows(tmp_path: Path, rows: int) -> None:
+def test_a_batch_of_impossibly_many_rows_is_damage(tmp_path: Path, rows: int) -> None:
     """A size in bytes that is computed from the number of rows would overflow."""
     path = tmp_path / "run.arrows"
     with open_writer(path, METADATA) as writer:

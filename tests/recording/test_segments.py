@@ -240,7 +240,7 @@ def test_a_clock_that_jumps_removes_no_segment() -> None:
     ("text", "seconds"),
     [("30 days", 30 * DAY), ("1 day", DAY), ("1.5 h", 5400.0), ("10min", 600.0), ("2 weeks", 14 * DAY)],
 )
-def test_ages(text: str, seconds: float) -> None:
+def test_ages_are_parsed_to_seconds(text: str, seconds: float) -> None:
     assert parse_age(text) == seconds
 
 
@@ -253,7 +253,7 @@ def test_invalid_ages_are_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(("text", "size"), [("20 GB", 20 * 10**9), ("1.5kB", 1500), ("2 TB", 2 * 10**12)])
-def test_sizes(text: str, size: int) -> None:
+def test_sizes_are_parsed_to_bytes(text: str, size: int) -> None:
     assert parse_size(text) == size
 
 

@@ -140,7 +140,7 @@ def test_misses_do_not_end_a_fault(look: Recording) -> None:
     assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
 
 
-def test_a_fault_without_a_name_and_one_of_flags_are_shown(tmp_path: Path) -> None:
+def test_faults_without_a_name_and_sets_of_fault_bits_are_shown(tmp_path: Path) -> None:
     flags = {"LOW": 1, "HIGH": 2, "HOT": 64}
     about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": flags, "bits": True}}}}}
     rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
@@ -440,7 +440,7 @@ def test_a_constant_value_has_a_wide_axis(tmp_path: Path) -> None:
     assert low <= 0 < 50 < high
 
 
-def test_a_near_zero_is_on_the_axis(tmp_path: Path) -> None:
+def test_the_y_axis_includes_a_zero_near_the_values(tmp_path: Path) -> None:
     for least, bottom in ((10.0, 0.0), (45.0, None)):
         rows = [row(at, "pump", "output_frequency", value) for at, value in enumerate((least, 50.0))]
         (axes,) = plot(load(record(tmp_path / f"{least:g}.arrows", rows)))[0].axes
@@ -578,7 +578,7 @@ def test_drives_without_room_are_counted_and_stay_in_the_tables(tmp_path: Path) 
         ("LONGEST_NAME", 5, "a name has 7 bytes: a recording's have at most 5"),
     ],
 )
-def test_recording_too_large_to_draw_is_one_sentence(
+def test_recording_too_large_to_draw_raises_value_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, mistake: str
 ) -> None:
     path = record(tmp_path / "it.arrows", [row(at, f"pump-{at:02}", "x", at) for at in range(20)], {})
@@ -723,7 +723,7 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", usually(*ODD), ids=lambda odd: repr(odd)[:12])
-def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
+def test_invalid_parts_of_metadata_are_left_out_of_a_report(tmp_path: Path, odd: Any) -> None:
     """All parts are read before a picture is drawn."""
     about = {"plant": "hall.toml", "planned": PLANNED, "drives": ABOUT["drives"]}
     rows = turns()[:30]
@@ -761,7 +761,7 @@ def test_values_too_large_for_an_axis_are_counted(tmp_path: Path, register: str,
 
 
 @pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
-def test_times_outside_the_calendar_are_a_sentence(run: Run, tmp_path: Path, time: int) -> None:
+def test_times_outside_the_calendar_print_one_sentence(run: Run, tmp_path: Path, time: int) -> None:
     rows = [
         row(0, "pump", "output_frequency", 1.0),
         row(1, "pump", "output_frequency", 1.0)._replace(time_ns=time),
@@ -775,7 +775,7 @@ def test_times_outside_the_calendar_are_a_sentence(run: Run, tmp_path: Path, tim
         )
 
 
-def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Path) -> None:
+def test_metadata_that_is_nested_too_deeply_prints_one_sentence(run: Run, tmp_path: Path) -> None:
     path = record(tmp_path / "it.csv", turns())
     (tmp_path / "it.csv.json").write_text("[" * 100_000)
     for command in ("plot", "report"):
@@ -789,7 +789,7 @@ def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_plot_and_report_need_only_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
+def test_plot_and_report_need_only_the_recording(run: Run, ramp: Path, tmp_path: Path) -> None:
     here = tmp_path / "ramp.arrows"
     here.write_bytes(ramp.read_bytes())
     assert run("plot", here) == (0, f"{tmp_path}/ramp.png\n", "")
@@ -823,7 +823,7 @@ def test_mistakes_are_one_sentence(
 
 
 @pytest.mark.parametrize("command", ["plot", "report", "convert"])
-def test_a_folder_of_a_history_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+def test_a_history_s_folder_as_argument_prints_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
     out = () if command != "convert" else (tmp_path / "all.csv",)
     folder = f"multidrop: {tmp_path} is the folder of a history: name one of its files, such as"
     by_program = "or read it from Python with `multidrop.History`\n"
@@ -840,7 +840,9 @@ def test_a_folder_of_a_history_is_one_sentence(run: Run, tmp_path: Path, command
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
-def test_no_recording_or_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+def test_a_file_without_rows_or_not_a_recording_prints_one_sentence(
+    run: Run, tmp_path: Path, command: str
+) -> None:
     assert run(command, ".")[::2] == (2, "multidrop: . is a folder: name the recording in it\n")
     text = tmp_path / "letter.arrows"
     text.write_text("Dear Sir")
