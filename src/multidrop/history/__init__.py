@@ -17,7 +17,7 @@ exactly once:
 3. An incomplete file has a name that starts with a dot. A file gets its final name when it is complete and
    on the disk, in `tens/` before `rows/`. Then the files that it replaces are removed. A reader lists the
    folder, then `rows/`, then `tens/`, so it finds the replaced files or the new one. If it finds both, rules
-   1 and 2 select one of them.
+   1 and 2 select one.
 """
 
 from multidrop.history.buckets import Buckets as Buckets

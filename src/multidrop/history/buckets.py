@@ -78,8 +78,8 @@ class Grid:
 def grid_of(begin: int, end: int, points: int) -> Grid:
     """Return a grid of at most `points` buckets that cover the range from `begin` to `end`, in ns.
 
-    Buckets that would take 2 s or more are rounded up to 10 s or a multiple of it. The first of these may
-    start before `begin`. Raises ValueError for an empty range, or for points outside 1 to 100000.
+    Buckets that would take 2 s or more are rounded up to a multiple of 10 s, and the first may then start
+    before `begin`. Raises ValueError for an empty range, or for points outside 1 to 100000.
     """
     if not 1 <= points <= MOST_POINTS:
         raise ValueError(f"invalid points = {points}: write 1 to {MOST_POINTS}")

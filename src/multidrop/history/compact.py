@@ -172,7 +172,7 @@ def _on_disk(path: Path) -> None:
 
 
 def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
-    """Return the numbers of all segments that none of these files of ten-second summaries covers."""
+    """Return the numbers of all segments without ten-second summaries in the files `tens`."""
     found = {number for number, _ in segments_of(folder / STEM)}
     found |= {file.first for file in parquet_files(folder / "rows")}
     return found - {number for file in tens for number in range(file.first, file.last + 1)}
@@ -218,7 +218,7 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
 
 
 def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> None:
-    """Merge these rows files into one file, which gets the metadata of the last of them."""
+    """Merge these rows files into one file, which gets the metadata of the last file."""
     begin, end = min(file.begin for file in part), max(file.end for file in part)
     name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
     with database.cursor() as cursor:
@@ -230,7 +230,7 @@ def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> No
 
 
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
-    """Write the ten-second summaries of those of these rows files that have none in `tens/`."""
+    """Write the ten-second summaries that `tens/` lacks for these rows files."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:

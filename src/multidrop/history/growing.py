@@ -109,7 +109,7 @@ class GrowingSegment:
     def rows_of(
         self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
     ) -> list[Row]:
-        """Return a batch's rows of these series (None: of all) with begin <= time < end, in ns."""
+        """Return a batch's rows of the series (None: of all) with begin <= time < end, in ns."""
         columns = self._tail.again(batch.place)
         wanted = None if series is None else _codes(columns.drives, columns.registers, series)
         return list(_rows(columns, wanted, begin, end))
@@ -134,7 +134,7 @@ class GrowingSegment:
         return range(found[0], found[-1] + 1) if found else range(0)
 
     def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
-        """Yield the rows of these series in the batch with this number."""
+        """Yield the rows of the series in the batch with this number."""
         columns = self._tail.again(self._batches[number].place)
         for at in _places(columns, _codes(columns.drives, columns.registers, series)):
             name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]
@@ -262,6 +262,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the series' cached rows if they reach to the first of these batches, else an empty entry."""
+        """Return the series' cached rows if they reach to the first batch of `batches`, else an empty entry."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

@@ -1,4 +1,4 @@
-"""Read the files of a history, which compaction may replace meanwhile: segments, and Parquet with DuckDB."""
+"""Read the files of a history, segments and Parquet, while compaction may replace them."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _parsed(text: str) -> object:
 
 @contextmanager
 def while_there(files: Sequence[HistoryFile]) -> Iterator[None]:
-    """Raise Replaced if the `with` block fails and one of these files no longer exists."""
+    """Raise Replaced if the `with` block fails and a file in `files` no longer exists."""
     try:
         yield
     except Exception as failure:
@@ -259,7 +259,7 @@ def write_parquet(
     metadata: Metadata,
     renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write batches, and the files' rows of these series in this range; return the number of rows.
+    """Write batches, and the files' rows of the series in this range; return the number of rows.
 
     `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Raises Replaced.
     """
