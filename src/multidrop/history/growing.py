@@ -262,6 +262,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the series' cached rows if they reach to the first batch of `batches`, else an empty entry."""
+        """Return the series' cached rows if they reach to the first batch, else an empty entry."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)
