@@ -29,7 +29,7 @@ async def count(poller: Poller) -> None:
 
 
 async def tick() -> None:
-    """Do other work at the same time."""
+    """Print "tick" five times a second: other work of the same program."""
     while True:
         await asyncio.sleep(0.2)
         print("tick")

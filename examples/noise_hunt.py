@@ -1,6 +1,6 @@
 """Find the drive that loses values on a noisy line: `python examples/noise_hunt.py [SECONDS]`.
 
-The folder `noise/` gets captures of the whole traffic.
+It writes captures of the whole traffic into the folder `noise/`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Run a pump for some seconds, and stop it however the program ends: `python examples/pump.py [SECONDS]`.
 
-Try Ctrl-C: standard error reports that the pump is being stopped, and the loop ends when it stands still.
+Try Ctrl-C: standard error reports that the pump is being stopped, and the program ends when its motor is at rest.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from multidrop.sim import Simulator, Wire, simulated
 
 def run(port: str, seconds: float) -> None:
     """Start the pump with address 1 at this port, print its state, and stop it."""
-    with Bus(port, audit="pump.jsonl", stop_on_exit=True) as bus:  # also on Ctrl-C and SIGTERM
+    with Bus(port, audit="pump.jsonl", stop_on_exit=True) as bus:  # stops also on Ctrl-C and SIGTERM
         pump = bus.attach(ErmanERG220, address=1, name="pump")
         pump.set_frequency(30.0)
         pump.start()
@@ -30,7 +30,7 @@ def main(seconds: float) -> None:
             run(line.wires[0].path, seconds)
         except BusError as failure:
             print("failed:", failure)
-        except KeyboardInterrupt:  # after the stop
+        except KeyboardInterrupt:  # raised after the stop
             print("interrupted")
         print("the output frequency is now", motor["output_frequency"], "Hz")
 

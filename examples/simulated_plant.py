@@ -13,9 +13,9 @@ from multidrop.sim import Simulator, Wire, simulated
 
 @contextmanager
 def simulated_plant(text: str, wire_of: Callable[..., Wire] = Wire) -> Iterator[Plant]:
-    """Simulate the plant of this plant file's text, and yield it; `{ports}` becomes a temporary directory.
+    """Simulate the plant file `text` and yield its plant; `{ports}` is replaced by a temporary directory.
 
-    `wire_of` makes a wire from simulated drives and `port`, the path of its port.
+    `wire_of` is called with a line's simulated drives and `port`, the path of its port, and returns a Wire.
     """
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"

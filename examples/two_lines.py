@@ -1,4 +1,4 @@
-"""Poll two lines at once, and add a drive while polling: `python examples/two_lines.py [SECONDS]`."""
+"""Poll two lines in parallel, and add a drive while polling: `python examples/two_lines.py [SECONDS]`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def main(seconds: float) -> None:
         poller.remove("hall-1", "pump-2")
         for number, batch in enumerate(poller.batches(seconds=seconds)):
             samples.update(row.drive for row in batch if row.status == "ok")
-            if number == 2:  # after a while: add pump-2 again
+            if number == 2:  # add pump-2 again after the third batch
                 pump = plant.lines[0].drives[1].drive
                 poller.add("hall-1", PolledDrive(pump, (Polled(pump.register("output_current"), None),)))
         lines = poller.statistics()
