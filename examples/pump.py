@@ -1,6 +1,6 @@
 """Run a pump for some seconds, and stop it however the program ends: `python examples/pump.py [SECONDS]`.
 
-Try Ctrl-C: standard error reports that the pump is being stopped, and the program ends when its motor is at rest.
+Try Ctrl-C: standard error names the pump that is being stopped. The program ends when the motor is at rest.
 """
 
 from __future__ import annotations
