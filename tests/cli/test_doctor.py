@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -129,7 +131,34 @@ def test_a_pty_has_no_low_latency_flag_and_no_rs485_mode() -> None:
         os.close(slave)
 
 
+@pytest.mark.parametrize(("settable", "mode"), [(True, RS485Mode(False, False)), (False, None)])
+def test_a_driver_that_refuses_its_own_rs485_mode_has_none(
+    monkeypatch: pytest.MonkeyPatch, settable: bool, mode: RS485Mode | None
+) -> None:
+    """As serial8250 does: TIOCGRS485 returns zeros, TIOCSRS485 fails with ENOTTY."""
+    written: list[bytes] = []
+
+    def ioctl(fd: int, request: int, data: bytearray) -> int:
+        if request == 0x542F:
+            if not settable:
+                raise OSError(errno.ENOTTY, "Inappropriate ioctl for device")
+            written.append(bytes(data))
+        return 0
+
+    monkeypatch.setattr(fcntl, "ioctl", ioctl)
+    assert rs485_mode(0) == mode
+    assert written == [bytes(32)] * settable
+
+
 # ---- sentences ----
+
+
+@pytest.mark.parametrize("driver", ["cp210x", "ch341-uart", "pl2303", "cdc_acm"])
+def test_low_latency_is_not_advised_for_drivers_that_ignore_it(driver: str) -> None:
+    finding = low_latency_finding(False, driver)
+    assert finding.what == f"the driver {driver} does not delay received bytes: nothing to set"
+    assert not finding.advice
+    assert low_latency_finding(False, "ftdi_sio").advice
 
 
 def test_a_long_latency_timer_gets_advice(sysfs: Path) -> None:

@@ -245,7 +245,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
     yield adapter_finding(adapter, port, lasting_name(port))
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
-        yield low_latency_finding(low_latency(fd))
+        yield low_latency_finding(low_latency(fd), adapter.driver)
         yield latency_finding(adapter)
         yield rs485_finding(rs485_mode(fd), rs485)
     finally:

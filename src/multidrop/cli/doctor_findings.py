@@ -56,7 +56,14 @@ def latency_finding(adapter: Adapter) -> Finding:
     )
 
 
-def low_latency_finding(low: bool | None) -> Finding:
+# Drivers that delay received bytes unless the low-latency flag is set; others store the flag and ignore it.
+HEEDING_LOW_LATENCY = ("", "ftdi_sio", "serial8250")  # "": unknown
+
+
+def low_latency_finding(low: bool | None, driver: str = "") -> Finding:
+    """Describe the flag of a sysfs driver."""
+    if driver not in HEEDING_LOW_LATENCY:
+        return Finding("low latency", f"the driver {driver} does not delay received bytes: nothing to set")
     if low is None:
         return Finding("low latency", "the driver has no such flag")
     if low:
@@ -183,7 +190,7 @@ def round_trip_finding(
 SYSFS = Path("/sys")
 
 # ioctl requests from linux/serial.h and asm-generic/ioctls.h
-TIOCGSERIAL, TIOCGRS485 = 0x541E, 0x542E
+TIOCGSERIAL, TIOCGRS485, TIOCSRS485 = 0x541E, 0x542E, 0x542F
 SERIAL_STRUCT = 72  # upper limit of the size of struct serial_struct, in bytes
 FLAGS_AT = 4  # index of the field `flags` among the ints of struct serial_struct
 LOW_LATENCY = 1 << 13
@@ -257,9 +264,14 @@ def _text(path: Path) -> str:
 
 
 def rs485_mode(fd: int) -> RS485Mode | None:
-    """Return the RS-485 mode that the driver reports; None if the driver has none."""
-    answer = _ask(fd, TIOCGRS485, RS485_STRUCT.size)
-    return None if answer is None else decoded_rs485(answer)
+    """Return the RS-485 mode that the driver reports; None if the driver has none.
+
+    A plain 8250 states a mode but refuses to set one, so the mode is written back as read.
+    """
+    answer = _ask(fd, TIOCGRS485, bytes(RS485_STRUCT.size))
+    if answer is None or _ask(fd, TIOCSRS485, answer) is None:
+        return None
+    return decoded_rs485(answer)
 
 
 def decoded_rs485(answer: bytes) -> RS485Mode:
@@ -270,17 +282,17 @@ def decoded_rs485(answer: bytes) -> RS485Mode:
 
 def low_latency(fd: int) -> bool | None:
     """Return the low-latency flag that the driver reports; None if the driver has none."""
-    answer = _ask(fd, TIOCGSERIAL, SERIAL_STRUCT)
+    answer = _ask(fd, TIOCGSERIAL, bytes(SERIAL_STRUCT))
     return None if answer is None else bool(array.array("i", answer)[FLAGS_AT] & LOW_LATENCY)
 
 
-def _ask(fd: int, request: int, size: int) -> bytes | None:
-    """Return the driver's answer to an ioctl; None if it does not know the request."""
+def _ask(fd: int, request: int, data: bytes) -> bytes | None:
+    """Return the driver's answer to an ioctl with this data; None if it does not know the request."""
     if sys.platform != "linux":
         return None
     import fcntl  # Windows has no fcntl
 
-    answer = bytearray(size)
+    answer = bytearray(data)
     try:
         fcntl.ioctl(fd, request, answer)
     except OSError as failure:

@@ -56,6 +56,7 @@ _REASONS = {
     errno.EAGAIN: "it is in use by another program",
     errno.EBUSY: "it is in use by another program",
     errno.ENOTTY: "it is not a serial port",
+    errno.EIO: "it does not work: there is no UART behind this name, or its adapter failed",
     errno.EISDIR: "it is a directory, not a serial port",
     errno.ECONNREFUSED: "nothing listens there",
 }
