@@ -172,7 +172,7 @@ def test_servers_that_cannot_decide_are_reported_as_no_quorum(
 ) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
 
-    async def refuse(self: ServerPath, subject: str, *rest: object) -> SimpleNamespace:
+    async def refuse(self: ServerPath, subject: str, *rest: object, **more: object) -> SimpleNamespace:
         return SimpleNamespace(data=NO_LEADER)
 
     monkeypatch.setattr(ServerPath, "request", refuse)
