@@ -248,8 +248,9 @@ class Bus:
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: its reads, writes and verbs raise NotAttached from then on.
 
-        Its motor continues as it is. Cancels the drive's verbs with CancelledByStop, or with Unconfirmed if
-        they were sent, and waits for its pending stops.
+        Its motor continues as it is. The drive's pending verbs raise CancelledByStop, or Unconfirmed if they
+        were sent already. Waits for the drive's pending stops.
+
         """
         self._latches.remove(drive)
         with self._attached.lock:

@@ -46,7 +46,7 @@ class NoReply(BusError, TimeoutError):
 
 
 class BadReply(BusError):
-    """Bytes came that are not the reply to the request."""
+    """Bytes were received that are not the reply to the request."""
 
     def __init__(self, drive: str, reason: str, frame: bytes) -> None:
         super().__init__(f"{drive}: {reason} (received {frame.hex(' ').upper() or 'nothing'})")

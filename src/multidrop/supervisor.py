@@ -28,7 +28,7 @@ _log = logging.getLogger("multidrop.supervisor")
 
 
 class Hung(OSError):
-    """Work that exceeded its time limit; its thread continues."""
+    """Raised for work that exceeded its time limit; the work's thread continues."""
 
 
 class Ended(OSError):
@@ -170,9 +170,9 @@ class Supervisor:
     async def within(self, name: str, limit_s: float, work: Callable[[], R], *, most: int = 4) -> R:
         """Return the result of work, which is done in its own thread.
 
-        At most `most` works of this name run concurrently; others wait for them. Raises Hung if the work
+        At most `most` calls with this name work concurrently; further calls wait. Raises Hung if the work
         cannot start within `limit_s` seconds, or is not done `limit_s` seconds after its start. Once it is
-        done, works of this name that started earlier no longer count as hanging, because the disk answers.
+        done, earlier work with this name no longer counts as hanging, because the disk answers again.
         """
         begin_by = monotonic() + limit_s
         while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:
@@ -200,7 +200,7 @@ class Supervisor:
 
     @property
     def under_way(self) -> list[str]:
-        """The names of the works whose threads have not ended."""
+        """The names of all work whose thread has not ended."""
         return [one.name for one in self._works.values()]
 
 
