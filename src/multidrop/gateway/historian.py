@@ -70,7 +70,10 @@ def build(settings: HistorySettings, context: PartContext) -> Historian:
 
 
 class Historian:
-    """Records rows and answers queries. The constructor raises the errors of HistoryWriter."""
+    """Records rows and answers queries.
+
+    Raises ValueError if another process records in the folder, OSError if the folder cannot be written.
+    """
 
     def __init__(self, plant: Plant, folder: Path, settings: HistorySettings) -> None:
         self._writer = HistoryWriter(

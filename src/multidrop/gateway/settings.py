@@ -133,7 +133,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
         place.wrong('look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
-    is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()  # files: checked above
+    is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()  # files are checked above
     if not is_loopback(host) and not is_safe and "listen" in given:
         place.wrong(
             f'listen = "{given["listen"]}" is open to other machines: that needs tokens, certificate and '

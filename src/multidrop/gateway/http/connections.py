@@ -198,7 +198,7 @@ class Turns:
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that notes whether its client reads each answer before it sends the next request."""
+    """A connection that notes if its client sends requests ahead of answers, or does not read answers."""
 
     @property
     def _connections(self) -> Connections:
