@@ -35,8 +35,8 @@ static uint32_t number(const struct md_capture *capture, const uint8_t *at)
     return value;
 }
 
-/* Return the length of the link type's header before a frame. If the header's tags name the sender, set
- * `side`; if they name Modbus TCP, mark the channel as such. */
+/* Return the length of the capture's header before a frame. If its tags name the sender, set `side`; if they
+ * name Modbus TCP, set the stream's `is_tcp`. */
 static size_t skip_header(struct md_channel *channel, const uint8_t *packet, size_t len, uint8_t *side)
 {
     uint32_t link = channel->link;

@@ -1,8 +1,8 @@
 /* The functions of the C core that Python calls: frames, drives, ports and rows. Those of captures are in
  * capture.h, and those that only C calls in internal.h, line.h and engine.h.
  *
- * Each section starts with its one return rule. Times are in ns; moments are of CLOCK_MONOTONIC. All
- * functions are pure except those of ports, engine, row queue and clock: no I/O, no callbacks, no globals. */
+ * Each section starts with the return rule of its functions. Times are in ns; moments are of CLOCK_MONOTONIC.
+ * Functions are pure (no I/O, callbacks or globals), except those of ports, engine, row queue and clock. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
@@ -184,7 +184,7 @@ enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 enum md_transactions {
     MD_NO_TRANSACTIONS, /* every framing except MD_TCP */
     MD_MATCHED,         /* MD_TCP: a reply has the id of its request */
-    MD_IGNORED          /* MD_TCP through a gateway that replies with its own ids */
+    MD_IGNORED          /* MD_TCP through a gateway that replies with its own transaction ids */
 };
 
 /* The owner of the transceiver's direction. */

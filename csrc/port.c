@@ -109,7 +109,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     int64_t begun_ns = md_now_ns();
     int refused = md_port_set(port->fd, settings);
     int64_t now_ns = md_now_ns();
-    port->turn.line.wake_ns += now_ns - begun_ns; /* extend the wait: meanwhile the port took no bytes */
+    port->turn.line.wake_ns += now_ns - begun_ns; /* add the time in which the port took no bytes */
     progress->switching_ns += now_ns - begun_ns;
     md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;

@@ -134,7 +134,7 @@ void md_count_stop(uint32_t *stops)
 
 enum {
     POLLED = 20,            /* polling gets 1/20 of a line that urgent requests keep busy */
-    MOST_OWED_NS = 50000000 /* limit of the line time owed to polling */
+    MOST_OWED_NS = 50000000 /* most line time that may be owed to polling */
 };
 
 static uint32_t pending(const struct md_turn *turn)

@@ -150,10 +150,10 @@ class Poller(RowSource):
     def close(self) -> None:
         """Stop polling and close the ports. Rows that are not taken yet can still be taken.
 
-        Waits up to a second for exchanges in flight; every value that was due by then has a row. If a signal
+        Waits up to a second for exchanges in flight; every value due before the call has a row. If a signal
         interrupts the wait, the closing still completes; a second call of `close` waits until the closing is
         complete. The function given to `on_batch` gets its last batches first. Raises that function's
-        failure, and PollingFailed if polling had failed; each only once.
+        failure, and PollingFailed if polling had failed; neither is raised a second time.
         """
         self._end()
         give_signals_back()

@@ -50,7 +50,7 @@ def test_a_table_line_that_is_cut_ends_with_a_mark(tmp_path: Path, size: list[in
 
 
 def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, size: list[int]) -> None:
-    """On 40 columns, the 51 columns of values take two rows, and the 38 columns of the head one."""
+    """On a terminal of 40 columns, a line of 51 columns takes two rows, and the heading of 38 takes one."""
     again = [text[: text.index("J") + 1] for text in drawings(tmp_path, "utf-8", size, 80, 80, 40)[1:]]
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
 

@@ -333,7 +333,7 @@ def test_an_access_that_the_table_does_not_allow_is_reported() -> None:
     assert HOLDING.read == 3
 
 
-# ---- facts of the line, of the manual, and verbs ----
+# ---- line settings, manual references, verbs ----
 
 WRONG_FACTS: list[tuple[str, Any, str]] = [
     ("silence", "x", "silence = 'x' is not a number of s from 0 to 1"),

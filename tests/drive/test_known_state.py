@@ -43,7 +43,7 @@ class Noting(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return stopped after two readings of 0 in a row."""
+        """Return the state `stopped` after two successive readings of output frequency 0."""
         speed = yield from read(self.speed)
         self.zeros = 0 if speed else self.zeros + 1
         return STANDS if self.zeros > 1 else RUNS

@@ -144,7 +144,7 @@ def test_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
     assert wire.sent == [STOP[Framing.RTU]]
 
 
-def test_setpoint_wears_the_eeprom_and_a_differing_one_is_reported() -> None:
+def test_setpoint_write_wears_the_eeprom_and_a_mismatch_is_reported() -> None:
     assert DelixiModbus.frequency.kept is Kept.EEPROM
     assert "EEPROM" in DelixiModbus.frequency.note
     wire = Wire(DelixiModbus(1), {"frequency": 40.0})

@@ -430,7 +430,7 @@ def test_device_with_only_texts_gets_no_plant_file(run: Run, tmp_path: Path) -> 
     source, family, plant = (tmp_path / name for name in ("c.csv", "label.toml", "plant.toml"))
     source.write_text("name,address,type\nlabel,1!400001.8,STRING\n")
     status, _, err = run("import", source, "--out", family, "--plant", plant)
-    assert (status, "texts alone, which are never polled" in err) == (2, True)
+    assert (status, "only text registers, which are never polled" in err) == (2, True)
     assert not family.exists()
 
 

@@ -463,7 +463,7 @@ def test_an_unopenable_audit_log_raises_and_changes_nothing() -> None:
 
 def test_adopting_drives_of_another_open_poller_raises() -> None:
     with clocked(hall(*pumps())) as made:
-        sentence = "it is on another bus: detach it there first, or make another"
+        sentence = "it is on another bus: detach it there first, or create another drive object"
         with clocked(hall(*pumps())) as other, pytest.raises(PlantError, match=sentence):
             made.poller.adopt(other.poller.plant)
         assert list(made.poller.buses) == ["hall"]

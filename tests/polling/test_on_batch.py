@@ -96,7 +96,7 @@ def test_a_failure_of_the_function_is_logged_immediately_and_raised_by_close(
     poller.close()  # the failure is raised only once
 
 
-def test_a_failure_of_the_with_block_takes_precedence_over_the_function_s(
+def test_an_exception_of_the_with_block_takes_precedence_over_the_callback_s(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(batch: Batch) -> None:

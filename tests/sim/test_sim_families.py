@@ -635,7 +635,7 @@ def test_native_refuses_parameter_writes_while_locked(native: Bench) -> None:
     assert native.say(":0106000200001388A4") == ":0106000200001388A4"
 
 
-def test_native_refuses_commands_without_line_control(native: Bench) -> None:
+def test_native_drive_refuses_commands_unless_its_run_source_is_the_line(native: Bench) -> None:
     native.sim["run_source"] = 0  # P00.00
     assert native.say(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised

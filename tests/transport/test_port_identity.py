@@ -94,7 +94,7 @@ def test_adapter_of_returns_place_and_serial_number(
         (("1-1", "A1"), ("1-1", "A1"), True),
         (("1-1", "A1"), ("1-2", "A1"), True),  # the same adapter in another USB socket
         (("1-1", "A1"), ("1-2", "B2"), False),  # two adapters came back in another order
-        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter in this socket, perhaps of another line
+        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter in the same USB port may serve another line
         (("1-1", ""), ("1-1", ""), True),
         (("1-1", ""), ("1-2", ""), False),
         (("1-1", "A1"), ("1-2", ""), False),

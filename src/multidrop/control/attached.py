@@ -108,7 +108,8 @@ class Attached:
             owner = vars(drive).setdefault("bus", self._bus)  # atomic: two buses cannot both take the drive
             if owner is not self._bus and owner.is_open:
                 raise ValueError(
-                    f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or make another"
+                    f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or create "
+                    "another drive object"
                 )
             self._exchanges.add(drive)
             self._give_verbs(drive, self._latches.add(drive))

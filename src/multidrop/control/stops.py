@@ -386,7 +386,7 @@ class StopRun:
     def interrupted(self, interruption: BaseException) -> None:
         """Send each unfinished stop again, once, and add a note on its progress to the interruption.
 
-        A second interruption ends this method, and then gets the notes.
+        A second interruption, such as Ctrl-C, ends this method; the notes are then added to that exception.
         """
         latest = interruption
         try:

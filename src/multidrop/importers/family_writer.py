@@ -81,7 +81,7 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
     """
     if not device.registers:
         raise ValueError(
-            "the device has texts alone, which are never polled: no plant file can be made of it"
+            "the device has only text registers, which are never polled: no plant file can be made of it"
         )
     if device.address is None:
         raise ValueError("the file does not say the device's address: no plant file can be made of it")

@@ -59,7 +59,9 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
             address = f"address {drive.address} is already used by {{first}}; give each drive its own"
             once(at, "address", (wire, drive.address), address)
             if not is_free(drive):
-                found.append(f"{at}: it is on another bus: detach it there first, or make another")
+                found.append(
+                    f"{at}: it is on another bus: detach it there first, or create another drive object"
+                )
             else:
                 framed = copy(drive) if drive.bus and drive.bus.is_open else drive
                 found += _mistakes(at, partial(framed.take_framing_of, line.port))

@@ -69,7 +69,7 @@ def test_servers_are_checked_only_while_lines_wait_for_release(
     assert trial.releases.due(LINES) == set()
 
 
-def test_lines_are_not_released_while_a_server_of_two_buckets_is_silent(
+def test_lines_are_not_released_while_two_ownership_buckets_do_not_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trial = Trial(monkeypatch)

@@ -1,4 +1,4 @@
-"""The rights of callers over HTTP, for every route and from one table; requests from foreign pages."""
+"""Check the rights of callers on every HTTP route against one table; refuse requests from foreign pages."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_command_that_names_an_unknown_frame_is_refused(times: Times) -> None:
+def test_command_for_an_unknown_live_frame_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 

@@ -194,7 +194,7 @@ def _one_of(known: Mapping[str, Any], spelling: Callable[[str], str] = str) -> C
 
 def _named(value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError("is no table of names with their numbers")
+        raise ValueError("must be a table of names and numbers, such as { off = 0, on = 1 }")
     return value
 
 

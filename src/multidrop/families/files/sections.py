@@ -412,7 +412,7 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
 
 
 def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
-    """Return an `identify` method that checks these proofs."""
+    """Return an `identify` method that compares registers with the values that prove the family."""
 
     @verb
     def identify(self: Drive) -> Script[None]:

@@ -30,7 +30,7 @@ class SourceCheck:
     """Checks that no message of a log is missing or repeated. Alarms are logged as errors and counted."""
 
     def __init__(self, last: Mapping[str, int]) -> None:
-        self.last = dict(last)  # sequence number of the last message, by "gateway.log id"
+        self.last = dict(last)  # sequence number of the last message, by gateway and log
         self.alarms = 0
         self.missing = 0  # number of missing messages
         self.doubled = 0  # number of repeated messages, which are ignored

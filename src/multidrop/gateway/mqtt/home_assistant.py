@@ -191,7 +191,10 @@ def _choices(register: Register[Any]) -> dict[str, int]:
 
 
 def _value_template(register: Register[Any]) -> str:
-    """Return the template of a polled register's value; a raw count without a name becomes unknown."""
+    """Return the template of a polled register's value.
+
+    If the register's values have names, a raw count without a name becomes the state `unknown`.
+    """
     value = f"value_json['values']['{register.name}']"
     if names := list(_choices(register)):
         return f"{{{{ {value} if {value} in {json.dumps(names)} else 'None' }}}}"
