@@ -137,7 +137,7 @@ def test_a_driver_without_rs485_raises_before_any_frame_is_sent(driver: Path) ->
 @pytest.mark.long
 def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -> None:
     said, events = play(driver, "rts-up", 9, RS485_CALLS=6)
-    assert said[-1].endswith(os.strerror(errno.EIO))
+    assert said[-1].endswith("its adapter failed")
     broken = [event.what for event in events].index("broken")
     assert "write" in [event.what for event in events[:broken]]
     assert "write" not in [event.what for event in events[broken:]]
