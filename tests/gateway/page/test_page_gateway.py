@@ -65,7 +65,7 @@ def test_a_killed_gateway_is_reported(page: Any) -> None:
         url = next(found[0] for line in process.stdout if (found := re.search(r"http://\S+", line)))
         page.goto(url)
         until(page, LIVE)
-        assert page.locator("tr.drive").count() == 8
+        assert page.locator("tr.drive").count() == 17
         tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
         simulators = " ".join(task.read_text() for task in tasks).split()
         process.send_signal(signal.SIGKILL)
