@@ -7,20 +7,17 @@ import json
 import os
 import time
 from collections.abc import Callable
-from functools import partial
-from math import inf
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_desks import LINE, PATIENCE_S, Desks, desks
 from examples import every_third
-from lines import PATIENCE, patient
+from lines import patient
 from tables import table
 
 from multidrop import InvtCHE, Stopped
 from multidrop.control import Seen, audit_log, read_audit
-from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
 from multidrop.fleet.commands.messages import (
@@ -518,40 +515,6 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 def test_a_sender_rejects_invalid_answers(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)
-
-
-@pytest.mark.slow
-def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Each stop is sent after its call. All calls get the answer of the stop that is repeated."""
-    repeated: list[float | None] = []
-
-    def noted(*details: Any, stop: Callable[..., Results]) -> Results:
-        repeated.append(details[-1])
-        return stop(*details)
-
-    monkeypatch.setattr(desk_module, "stop_line", partial(noted, stop=stop_line))
-    monkeypatch.setattr(
-        RepeatedStops.__init__, "__defaults__", (partial(noted, stop=stop_drive), begin_stops)
-    )
-
-    async def stopped(desk: Desks) -> list[CommandAnswer | None]:
-        desk.sim.deaf_until = inf
-        called = [asyncio.create_task(desk.stop())]
-        async with asyncio.timeout(PATIENCE):
-            while not desk.lines.for_stop(LINE).bus.stops_under_way():  # type: ignore[union-attr]
-                await asyncio.sleep(0.002)
-            called += [asyncio.create_task(desk.stop()) for _ in range(8)]
-            while len(repeated) < 3 or desk.stops._repeated._sent:
-                await asyncio.sleep(0.002)
-        desk.sim.deaf_until = 0.0
-        return await asyncio.gather(*called)
-
-    with desks(tmp_path) as desk:
-        answers = asyncio.run(stopped(desk))
-    assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
-    assert repeated == [None, 0.0, 0.0]  # the last stop answers seven calls
 
 
 def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
