@@ -15,7 +15,7 @@ import pytest
 from commands import Run
 from parameter_drives import with_parameters
 
-from multidrop import ErmanERG220, cli
+from multidrop import YD1000, ErmanERG220, cli
 from multidrop.sim import MotorDrive, Simulator, Wire
 
 pytestmark = pytest.mark.usefixtures("_patient")
@@ -66,6 +66,24 @@ def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...
     status, _, err = run("params", "apply", "pump.toml", *drive)
     assert (status, sim["acceleration_time"]) == (1, 25.0)
     assert "Write 1 parameter to" in err
+
+
+def test_a_refused_second_write_names_the_option_that_permits_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    sim = with_parameters(YD1000(1))
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        drive = simulator.wires[0].path, "yd1000", 1
+        Path("fan.toml").write_text('format = 1\nmodel = "yd1000"\n\n[parameters]\n"0009" = 100\n')
+        for seconds in (25.0, 30.0):
+            sim["acceleration_time"] = seconds
+            status, out, _ = run("params", "apply", "fan.toml", *drive, "--yes")
+    assert (status, sim["acceleration_time"]) == (1, 30.0)
+    assert "not written: acceleration_time of " in out
+    assert "`multidrop params apply --commissioning`" in out
+    assert "params.apply(" not in out
 
 
 def test_commissioning_needs_a_terminal_for_confirmation(

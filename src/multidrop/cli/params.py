@@ -26,7 +26,7 @@ from multidrop.cli.support.writing import confirm, reporting_interruption
 from multidrop.drive.parameters import parameters_of
 from multidrop.errors import Unsupported, WriteForbidden
 from multidrop.families.registry import find_model
-from multidrop.params import ParameterSet, files
+from multidrop.params import NotWritten, ParameterSet, files
 from multidrop.printable import printable
 
 ACTIONS = {  # by action: its module in this package ("" for this module), and its help
@@ -197,10 +197,13 @@ def _apply(arguments: argparse.Namespace) -> int:
             count = counted(len(made.writes), "parameter")
             confirm(f"Write {count} to {drive.name} on {target.port}?", arguments)
 
-        def report(number: int, total: int, change: params.ParameterChange, said: str) -> None:
+        def report(
+            number: int, total: int, change: params.ParameterChange, not_written: NotWritten | None
+        ) -> None:
             known[:] = [f"{drive.name}: {number} of {counted(total, 'parameter')} done, up to {change}"]
             if not arguments.json:
-                print_text(f"{number}/{total} {change}: {said}", flush=True)
+                outcome = "written" if not_written is None else f"not written: {_reason(not_written)}"
+                print_text(f"{number}/{total} {change}: {outcome}", flush=True)
 
         result = params.apply_plan(made, commissioning=arguments.commissioning, report=report)
     if arguments.json:
@@ -321,13 +324,23 @@ def _change_as_json(change: params.ParameterChange) -> dict[str, Any]:
     return {"code": change.parameter.code, "before": change.before, "after": change.after}
 
 
+def _reason(not_written: NotWritten) -> str:
+    """Return why a parameter was not written, with advice in words of the command line."""
+    if isinstance(not_written, WriteForbidden):
+        return not_written.for_command_line()
+    return str(not_written)
+
+
 def _applied_as_json(result: params.Applied) -> dict[str, Any]:
     return {
         "drive": result.plan.drive.name,
         "written": [_change_as_json(change) for change in result.written],
-        "not_written": dict(result.plan.left) | result.refused,
+        "not_written": {
+            **result.plan.left,
+            **{code: _reason(why) for code, why in result.refused.items()},
+        },
         "earlier": result.earlier,
-        "failure": "" if result.failure is None else str(result.failure),
+        "failure": "" if result.failure is None else _reason(result.failure),
     }
 
 

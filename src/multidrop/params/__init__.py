@@ -1,6 +1,7 @@
 """Parameters of a drive: read them all, compare them, and write those that differ."""
 
 from multidrop.params.apply import Applied as Applied
+from multidrop.params.apply import NotWritten as NotWritten
 from multidrop.params.apply import apply as apply
 from multidrop.params.apply import apply_plan as apply_plan
 from multidrop.params.files import is_parameter_file as is_parameter_file

@@ -19,9 +19,9 @@ from multidrop.params.plan import ApplyPlan, ParameterChange, check_stands, plan
 from multidrop.params.values import ParameterSet
 from multidrop.transport import clock
 
-Report = Callable[
-    [int, int, ParameterChange, str], None
-]  # called with the write's number, the total, the change and its outcome in words
+NotWritten = BusError | Outcome  # why a parameter was not written; `str` has the sentence
+# Called after each write with its number, the total, the change, and why it was not written (None: it was).
+Report = Callable[[int, int, ParameterChange, NotWritten | None], None]
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Applied:
 
     plan: ApplyPlan
     written: list[ParameterChange] = field(default_factory=list)
-    refused: dict[str, str] = field(default_factory=dict)  # reasons by parameter code
+    refused: dict[str, NotWritten] = field(default_factory=dict)  # by code
     earlier: list[str] = field(default_factory=list)
     failure: BusError | None = None
 
@@ -75,45 +75,42 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
         journal.begin(made)
     with commissioning_block() if commissioning else nullcontext():
         for number, change in enumerate(made.writes, 1):
-            said = _write(change, made.drive, result, journal)
+            not_written = _write(change, made.drive, result, journal)
             if report:
-                report(number, len(made.writes), change, said)
+                report(number, len(made.writes), change, not_written)
             if result.failure:
                 return result
     journal.end()
     return result
 
 
-def _write(change: ParameterChange, drive: Drive, result: Applied, journal: _Journal) -> str:
-    """Write one parameter; record the outcome in `result`, and return it in words."""
+def _write(change: ParameterChange, drive: Drive, result: Applied, journal: _Journal) -> NotWritten | None:
+    """Write one parameter and note the outcome in `result`; return why it was not written, or None."""
     parameter = change.parameter
     try:
         check_stands(drive)
         journal.note(code=parameter.code, before=change.before, after=change.after)
         outcome: Outcome = drive.try_write(parameter, parameter.decode(change.after))
-    except WriteForbidden as refusal:
-        if not refusal.is_budget:
-            result.failure = refusal
-            return str(refusal)
-        return _refused(change, str(refusal), result, journal)
     except BusError as failure:
+        if isinstance(failure, WriteForbidden) and failure.is_budget:
+            return _refused(change, failure, result, journal)
         result.failure = failure
-        return str(failure)
+        return failure
     if outcome.effect is Effect.DONE:
         journal.note(code=parameter.code, outcome="written")
         result.written.append(change)
-        return "written"
+        return None
     if outcome.effect is Effect.UNCONFIRMED:
         result.failure = outcome.failure
-        return str(outcome.failure)
-    return _refused(change, str(outcome.failure or outcome), result, journal)
+        return outcome.failure
+    return _refused(change, outcome.failure or outcome, result, journal)
 
 
-def _refused(change: ParameterChange, why: str, result: Applied, journal: _Journal) -> str:
+def _refused(change: ParameterChange, why: NotWritten, result: Applied, journal: _Journal) -> NotWritten:
     code = change.parameter.code
     journal.note(code=code, outcome="not written")
     result.refused[code] = why
-    return f"not written: {why}"
+    return why
 
 
 class _Journal:

@@ -88,7 +88,7 @@ def to_toml(found: ParameterSet, family: Any = None) -> str:
     facts = {name: getattr(found, name) for name in FACTS}
     lines = [f"format = {FORMAT}"]
     lines += [f'{name} = "{_plain(value)}"' for name, value in facts.items() if value]
-    lines += ["", "[parameters]  # raw counts; only these are read"]
+    lines += ["", "[parameters]  # raw counts; the comments are not read back"]
     known = _known(family)
     for code, raw in found.values.items():
         name, value, factory = _words(known.get(code), raw)
