@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from batches import counting
+from disks import full_at
 
 from multidrop import Plant
 from multidrop.cli.support import polling
@@ -16,22 +15,10 @@ from multidrop.cli.support.polling import polling_session
 from multidrop.polling.batch import Batch
 from multidrop.recording import RecordingError, open_recording
 
-resource = pytest.importorskip("resource")
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
 
 def test_a_page_that_does_not_fit_on_the_disk_leaves_no_file(tmp_path: Path) -> None:
     page = tmp_path / "report.html"
-    with files_of_at_most(100), pytest.raises(OSError, match=f"^{page}: cannot be written: File too large"):
+    with full_at(100), pytest.raises(OSError, match=f"^{page}: cannot be written: File too large"):
         write_new(page, "x" * 101)
     assert not page.exists()
     write_new(page, "x" * 101)
@@ -63,7 +50,7 @@ def test_the_error_of_a_full_disk_counts_the_readable_rows(
     monkeypatch.setattr(polling, "Poller", PollerOf)
     out = tmp_path / "run.arrows"
     with (
-        files_of_at_most(20_000),
+        full_at(20_000),
         pytest.raises(RecordingError, match="the 20 rows before that can be read"),
         polling_session(Plant((), Path()), out) as session,
     ):
