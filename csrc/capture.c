@@ -157,7 +157,7 @@ static int is_echoed(int framing, uint8_t function)
     return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
-/* Return 1 for a Delixi request. A reply looks alike, but the value in a query is 0. */
+/* Return 1 for a Delixi request. A reply has the same form, but only a query always has the value 0. */
 static int is_delixi_request(const struct md_message *message)
 {
     static const uint8_t zeros[4];

@@ -100,7 +100,7 @@ static void count_reply(struct md_block *block, uint8_t exception)
     if (exception) {
         block->refusals++;
         block->refusal = exception;
-    } else if (block->refusals || !block->is_answered) { /* usually nothing changes: avoid the memory write */
+    } else if (block->refusals || !block->is_answered) { /* write only changed memory */
         block->refusals = 0;
         block->is_answered = 1;
     }

@@ -264,7 +264,7 @@ struct md_progress {
     uint32_t switches;    /* number of changes of baud rate or format */
     uint32_t echo;        /* enum md_echo: whether the adapter echoes */
     uint32_t foreign;     /* another master's bytes, received while listening */
-    int64_t switching_ns; /* total time of these changes */
+    int64_t switching_ns; /* total time spent on switches, in ns */
 };
 
 struct md_engine;

@@ -139,7 +139,7 @@ size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len, int64_
 /* Append the current frame to rx and return its index in rx. Do not pass a byte to the tap twice. */
 static size_t keep(struct md_line *line)
 {
-    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* too many frames that were no reply */
+    if (line->rx_len + line->frame_len > MD_RX_ROOM) { /* discard frames that were not replies */
         md_tap_put(line->tap, MD_NOISE, line->completion->last_ns, line->rx, line->rx_len);
         line->rx_len = 0;
     }

@@ -1,7 +1,7 @@
 """Measure the CPU time of each kind of work of `multidrop serve`, alone and with warm caches.
 
-A gateway's hub, which polls nothing, has 31 drives with 10 values each. The script calls its protocols as
-asyncio would. Before each measurement the hub gets new rows with other values. The table has the least time
+A gateway's hub without polling has 31 drives with 10 values each. The script calls its protocols as asyncio
+would. Before each measurement the hub gets new rows with other values. The table has the least time
 of many measurements, which other processes disturbed least. It includes neither the kernel's time nor the
 effect of cold caches: see `gateway_load` for these.
 """

@@ -79,7 +79,7 @@ def holdings(device: ImportedDevice) -> list[Holding]:
 
 
 def family_of(entries: list[Holding]) -> str:
-    """Declare all of these entries in one family; return the library's reason for a refusal, or ""."""
+    """Declare these entries in one family; return the library's reason for a refusal, or ""."""
     members = {
         f"entry_{number}": _declared(each.entry)
         for number, each in enumerate(entries)

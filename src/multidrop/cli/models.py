@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _installed() -> Iterator[type[Drive]]:
-    """Yield the families that other packages have installed; warn of those that cannot be loaded."""
+    """Yield the families of installed packages; print a warning for each that cannot be loaded."""
     for name in installed_models():
         try:
             yield find_model(name)
