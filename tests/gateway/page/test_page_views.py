@@ -298,6 +298,9 @@ def test_an_unpolled_register_has_no_empty_plot(opened: Opener, gateway: FakeGat
     heads = page.locator("#trend-plots .plothead b")
     until_met(page, lambda: heads.all_inner_texts() == ["output current, A"])
     assert page.get_by_label("output frequency, Hz").count() == 0
+    page = opened("#/drives/pump-1")
+    until_met(page, lambda: "output current, A" in page.locator("#plots .legend").all_inner_texts())
+    assert "output frequency, Hz" not in page.locator("#plots .legend").all_inner_texts()
 
 
 def test_dates_are_chosen_and_an_end_before_the_begin_is_refused(opened: Opener) -> None:

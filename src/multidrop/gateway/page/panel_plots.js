@@ -92,7 +92,7 @@ export function begin(drive) {
   const isOneUnit = unitOf(frequency) === unitOf(setpoint);
   const first = isOneUnit ? [[frequency, setpoint]] : [[frequency], [setpoint]];
   const stack = [...first, [current], [third]]
-    .map(names => names.filter(Boolean))
+    .map(names => names.filter(name => numbers.some(r => r.name === name))) // others would have empty plots
     .filter(names => names.length);
   plots = stack.map((names, i) =>
     one(place, names, i, i === stack.length - 1, names[0] === third ? rest : null),
