@@ -161,7 +161,7 @@ def test_two_files_and_two_drives_are_compared(run: Run, drive: tuple[object, ..
         (("diff", "--defaults", "DRIVE"), "prints no factory values"),
         (("save", "DRIVE", "other.toml"), "other.toml exists already, and is not replaced"),
         (("save", "DRIVE"), "give the drive, and one file to write"),
-        (("list", "invt-che"), "follow no known rule"),
+        (("list", "invt-che"), "no reliable rule"),
     ],
 )
 def test_mistaken_params_arguments_are_one_sentence(

@@ -33,8 +33,8 @@ EXTRA: dict[type[Drive], list[str]] = {
     DelixiModbus: ["P00.03", "P00.04", "P01.00", "P01.01"],
     DelixiNative: ["P00.03", "P00.04", "P01.00", "P01.01"],
     ErmanERG220: [],
-    GOODRIVE: ["P00.03", "P00.11", "P01.20", "P05.12", "P08.28", "P14.03"],
-    DELIXI_E: ["P0.0.08", "P0.1.00", "P3.2.05", "P4.1.04"],
+    GOODRIVE: ["P00.03", "P00.11", "P01.20", "P05.14", "P08.28", "P14.03"],
+    DELIXI_E: ["P0.0.08", "P0.0.14", "P1.0.00", "P2.0.00", "P4.1.04"],
 }
 FAMILIES = [pytest.param(family, id=family.model) for family in EXTRA]
 
@@ -131,7 +131,7 @@ def test_drive_that_obeys_its_panel_makes_apply_raise(
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"9999": 1}, "YD1000 has no parameter 9999"),
+        ({"9999": 1}, "yd1000 has no parameter 9999"),
         ({"0009": 65000}, r"0009: acceleration_time = 6500 is outside 0\.1 to 3600 s"),
         ({"0009": 0, "0010": 1}, "values that are not written, and nothing was"),
     ],

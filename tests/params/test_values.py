@@ -6,11 +6,13 @@ from typing import ClassVar
 
 import pytest
 from simulated_bus import SimulatedBus, one
+from tables import table
 
 from multidrop import YD1000, DelixiModbus, DelixiNative, Drive, InvtCHE, NoReply, Unsupported, params
 from multidrop.core import Message
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace, parameters_of
 from multidrop.drive.register import HOLDING
+from multidrop.families.registry import find_model
 from multidrop.sim import SimulatedDrive
 
 
@@ -94,9 +96,58 @@ def test_silent_drive_raises_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
         params.read(drive)
 
 
+# Typed from the sources: model, code, address of the holding register.
+ADDRESSES = [
+    ("delta-cp2000", "04-10", 0x040A),  # CP2000 manual p. 12.1-09-8
+    ("powtran-pi130", "F0.01", 0xF001),  # PI130 manual p. 112
+    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, as the following
+    ("powtran-pi130", "E3.21", 0xA315),
+    ("powtran-pi130", "y1.30", 0xC11E),
+    ("invt-goodrive", "P14.02", 0x0E02),  # Goodrive200A manual p. 138
+    ("delixi-e", "P4.1.02", 0x4102),  # DelixiProtocol.h
+    ("erman-er-g-220-05", "P136", 1136),  # erman.py
+]
+
+
+@table("model, code, address", ADDRESSES)
+def test_addresses_of_parameters_are_those_of_the_sources(model: str, code: str, address: int) -> None:
+    assert parameters_of(find_model(model))[code].address == address
+
+
+# Codes that start a motor, let a panel, a terminal or the drive itself start one, or are of unknown function.
+NEVER_WRITTEN = {
+    "invt-goodrive": "P00.01 P00.02 P00.15 P00.18 P01.18 P01.21 P02.01 P05.00 P05.01 P05.09 P05.10 P05.12 "
+    "P05.13 P07.00 P07.01 P07.02 P07.03 P07.04 P08.28",
+    "delixi-e": "P0.0.03 P0.0.04 P0.0.24 P0.0.00 P0.0.19 P0.1.00 P1.0.01 P1.1.00 P2.0.00 P3.0.00 P4.0.00 "
+    "P4.1.07 P8.3.49",
+    "delta-cp2000": "00-02 00-07 00-21 02-01 05-00 09-00",
+    "powtran-pi130": "F0.11 F1.00 b0.27 y0.00 F9.02",
+}
+
+
+@table("model, codes", NEVER_WRITTEN.items())
+def test_hazardous_and_unexplained_parameters_are_not_written(model: str, codes: str) -> None:
+    known = parameters_of(find_model(model))
+    assert [code for code in codes.split() if not known[code].never] == []
+
+
+def test_explained_parameters_of_a_delixi_e_are_written() -> None:
+    """The codes that DelixiCDIE100.cpp names, without those of command, identification and line."""
+    named = [f"P0.0.{index:02}" for index in (7, 8, *range(11, 19))] + [
+        "P0.0.02",
+        "P1.0.00",
+        "P4.1.03",
+        "P4.1.04",
+    ]
+    known = parameters_of(find_model("delixi-e"))
+    assert {code for code, one in known.items() if not one.never} == {*named}
+
+
 def test_family_without_an_address_rule_raises_unsupported(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = one(monkeypatch, InvtCHE(1))
-    with pytest.raises(Unsupported, match="follow no known rule"):
+    with pytest.raises(
+        Unsupported, match=r"no reliable rule .* invt-che: read and write its declared registers instead"
+    ):
         params.read(drive)
 
 

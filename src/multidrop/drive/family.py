@@ -97,7 +97,7 @@ class Drive(RegisterAccess):
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # what to set on its keypad
     line_parameters: ClassVar[str] = ""  # names of the parameters for address, baud rate and format
-    parameter_space: ClassVar[ParameterSpace | None] = None  # None: addresses follow no known rule
+    parameter_space: ClassVar[ParameterSpace | None] = None  # None: no known rule for addresses
     no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 

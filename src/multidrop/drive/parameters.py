@@ -134,8 +134,8 @@ def _parameters_of(family: Any) -> Mapping[str, Parameter]:
     space: ParameterSpace | None = family.parameter_space
     if space is None:
         raise Unsupported(
-            f"the addresses of {family.title or family.__name__}'s parameters follow no known rule, so only "
-            "its registers can be read and written"
+            f"there is no reliable rule for the parameter addresses of {family.model or family.__name__}: "
+            "read and write its declared registers instead"
         )
     declared = {
         (register.table.read_space, register.address): register

@@ -41,7 +41,7 @@ EDITIONS = {
     "delta-ms300": ("MS300",),
     "optidrive-e3": ("ODE-3", "E3 advanced technical manual"),
     "invt-goodrive": ("Goodrive200A", "Goodrive10", "Goodrive350", "GD100-PV"),
-    "invt-chf100a": ("CHE100", "energy-management"),
+    "invt-chf100a": ("CHF100A", "CHE100", "energy-management"),
     "fuling-dzb": ("modbus.c", "manual, sheet 5"),
     "delixi-e": ("DelixiProtocol.h", "DelixiCDIE100.cpp", "vfd_controller.c"),
     "powtran-pi130": ("PI130", "PI500", "MD500", "H300"),

@@ -44,5 +44,5 @@ def test_parameters_of_a_family_without_known_addresses_are_refused(tmp_path: Pa
     with served(tmp_path) as gateway:
         gateway.get(f"{PATH}?read=1")
         until(lambda: state(gateway) == "failed")
-        assert "follow no known rule" in gateway.get(PATH).json["error"]
+        assert "no reliable rule" in gateway.get(PATH).json["error"]
         assert gateway.get("/api/parameters/nobody").status == 404
