@@ -33,6 +33,18 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
     return parse_document(data)
 
 
+def read_bounded(path: Path, most: int, what: str) -> bytes:
+    """Return a file's bytes. Raises ValueError, without the path, if it has over `most` or cannot be read."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except OSError as failure:
+        raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
+    if len(data) > most:
+        raise ValueError(f"the {what} has more than {most} bytes")
+    return data
+
+
 def parse_document(data: bytes) -> dict[str, Any]:
     """Return the tables of a TOML file's bytes. Raises ValueError if they are not valid TOML."""
     try:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from multidrop import YD1000, params
+from multidrop.params import files
 
 FOUND = params.ParameterSet(
     "yd1000", {"0009": 100, "F240": 7}, source="pump-1", title="YD1000", firmware="104", saved="2026-11-29"
@@ -32,6 +33,18 @@ def test_saving_to_an_existing_file_raises(tmp_path: Path) -> None:
         params.save(FOUND, tmp_path / "pump.toml")
     with pytest.raises(ValueError, match=r"name ends in \.toml or \.csv"):
         params.save(FOUND, tmp_path / "pump.txt")
+
+
+def test_a_set_without_parameters_is_not_saved(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"pump-1 answers for none of its parameters, so .* is not written"):
+        params.save(params.ParameterSet("yd1000", {}, source="pump-1"), tmp_path / "pump.toml")
+    assert not (tmp_path / "pump.toml").exists()
+
+
+def test_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"#" * (files.MOST_BYTES + 1))
+    with pytest.raises(ValueError, match="the parameter file has more than 1000000 bytes"):
+        params.load(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize("quote", ["", '"'])

@@ -18,7 +18,7 @@ from multidrop.importers.telegraf import read_telegraf
 from multidrop.importers.wb import json_without_comments, read_wb
 from multidrop.importers.yaml_text import parse_yaml
 from multidrop.printable import printable
-from multidrop.toml_check import parse_document
+from multidrop.toml_check import parse_document, read_bounded
 
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
@@ -63,14 +63,7 @@ def all_devices(path: Path) -> list[ImportedDevice]:
     if read is None:
         raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-    except OSError as failure:
-        raise ValueError(f"{path} cannot be read: {failure.strerror}") from failure
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"{path} has more than {MOST_BYTES} bytes")
-    try:
-        devices = read(data, path)
+        devices = read(read_bounded(path, MOST_BYTES, "file"), path)
         for device in devices:
             settle(device)
     except KeyError as missing:

@@ -13,7 +13,7 @@ from multidrop.drive.parameters import Parameter, parameters_of
 from multidrop.errors import Unsupported
 from multidrop.params.values import ParameterSet
 from multidrop.printable import plain_whole, printable
-from multidrop.toml_check import parse_document
+from multidrop.toml_check import parse_document, read_bounded
 
 FORMAT = 1  # version of the file format; files with a higher number are refused
 MOST_BYTES = 1_000_000
@@ -32,8 +32,8 @@ def is_parameter_file(path: Path | str) -> bool:
     if path.suffix.lower() != ".toml" or not path.is_file():
         return False
     try:
-        return "parameters" in parse_document(path.read_bytes())
-    except (OSError, ValueError):
+        return "parameters" in parse_document(read_bounded(path, MOST_BYTES, "parameter file"))
+    except ValueError:
         return False
 
 
@@ -41,13 +41,7 @@ def load(path: Path | str) -> ParameterSet:
     """Return the parameters in a TOML or CSV file. Raises ValueError if the file is invalid."""
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-    except OSError as failure:
-        raise ValueError(f"{path}: the parameter file cannot be read: {failure.strerror}") from failure
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"{path}: is too long for a parameter file")
-    try:
+        data = read_bounded(path, MOST_BYTES, "parameter file")
         facts, values = _from_csv(data) if path.suffix.lower() == ".csv" else _from_toml(data)
     except ValueError as mistake:
         raise ValueError(f"{path}: {mistake}") from mistake
@@ -59,11 +53,13 @@ def load(path: Path | str) -> ParameterSet:
 def save(found: ParameterSet, path: Path | str, family: Any = None) -> None:
     """Write the parameters to a new TOML or CSV file; the path's suffix selects the format.
 
-    Raises ValueError for another suffix, or if the file exists. With `family`, a drive class, the file also
-    shows names, units and factory values.
+    Raises ValueError for another suffix, if the file exists, or if the set is empty. With `family`, a drive
+    class, the file also shows names, units and factory values.
     """
     path = Path(path)
     check_name(path)
+    if not found.values:
+        raise ValueError(f"{found.source} answers for none of its parameters, so {path} is not written")
     text = to_csv(found, family) if path.suffix.lower() == ".csv" else to_toml(found, family)
     try:
         with path.open("x", encoding="utf-8", newline="\n") as file:
