@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import usually
 from profile_families import COMMANDED, READ_ONLY, shipped
 from simulated_bus import SimulatedBus
 from tables import table
@@ -30,6 +31,7 @@ BUILT_IN: dict[str, Callable[[int], Drive]] = {
     "yd1000": YD1000,
 }
 DECLARED = {**BUILT_IN, **{name: partial(shipped, name) for name in COMMANDED}}
+every_declaration = pytest.mark.parametrize("declared", [*BUILT_IN, *usually(*COMMANDED)])
 THERE: dict[str, Callable[[int], Any]] = {
     **DECLARED,
     **{name: shipped_family(name) for name in READ_ONLY},
@@ -80,7 +82,7 @@ class Pair:
         return bool(motor and (motor.energised or motor.frequency))
 
 
-@pytest.mark.parametrize("declared", DECLARED)
+@every_declaration
 @table("there", THERE)
 def test_no_command_is_sent_to_another_make(
     monkeypatch: pytest.MonkeyPatch, declared: str, there: str
@@ -96,7 +98,7 @@ def test_no_command_is_sent_to_another_make(
 
 
 @pytest.mark.parametrize("turns", [False, True], ids=["at rest", "turning"])
-@pytest.mark.parametrize("declared", DECLARED)
+@every_declaration
 @table("there", THERE)
 def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
     monkeypatch: pytest.MonkeyPatch, declared: str, turns: bool, there: str
