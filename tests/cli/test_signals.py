@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from terminals import closing_terminal
 
 from multidrop import cli
 from multidrop.cli.support import signals
-from multidrop.cli.support.signals import end_signals_interrupt, noting_signals, on_end_signals
+from multidrop.cli.support.signals import end_signals_interrupt, noting_signals, on_end_signals, run_loop
 
 PATIENCE = 60.0
 
@@ -53,6 +54,26 @@ def test_a_closed_terminal_interrupts_a_command_once(hangup_is_deadly: None) -> 
             hang_up()
         hang_up()
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_event_loop_is_made_leaves_no_traceback(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python would print a traceback for an incomplete loop, and a warning for work that never ran."""
+    make = asyncio.SelectorEventLoop._make_self_pipe  # type: ignore[attr-defined]
+
+    def interrupted(loop: asyncio.SelectorEventLoop) -> None:
+        signal.raise_signal(number)
+        make(loop)
+
+    async def work() -> None:
+        raise AssertionError("this never runs")
+
+    monkeypatch.setattr(asyncio.SelectorEventLoop, "_make_self_pipe", interrupted)
+    with end_signals_interrupt(), pytest.raises(KeyboardInterrupt):
+        run_loop(work())
+    gc.collect()  # pytest turns what Python would print into errors
 
 
 def test_under_nohup_sighup_is_ignored() -> None:

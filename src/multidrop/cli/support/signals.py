@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -131,9 +131,16 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
     import asyncio
 
     try:
-        return asyncio.run(work)
+        with ExitStack() as stack:
+            with noting_signals() as interruption:  # Python prints a traceback for an incomplete event loop
+                runner = stack.enter_context(asyncio.Runner())
+            if interruption.came:
+                raise KeyboardInterrupt
+            return runner.run(work)
     except asyncio.CancelledError:
         raise KeyboardInterrupt from None
+    finally:
+        work.close()  # Python prints a warning for a coroutine that never started
 
 
 @contextmanager
