@@ -1,7 +1,8 @@
-"""Check the developer tools: command-line mistakes, fuzzing corpora, mutants, and processes of tests."""
+"""Check the developer tools: command-line mistakes, names in .ci/run, corpora, mutants, tests' processes."""
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -20,7 +21,9 @@ from tables import table
 
 pytestmark = pytest.mark.long
 
-TOOLS = Path(__file__).parents[2] / "tools"
+ROOT = Path(__file__).parents[2]
+TESTS = ROOT / "tests"
+TOOLS = ROOT / "tools"
 LINUX = "multidrop-0.1.0-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl"
 WINDOWS = "multidrop-0.1.0-cp311-abi3-win_amd64.whl"
 
@@ -97,6 +100,44 @@ def test_help_is_the_header_of_the_tool(tool: str) -> None:
     assert ran.stderr == ""
 
 
+# ---- .ci/run ----
+
+
+CI = (ROOT / ".ci" / "run").read_text("utf-8")
+
+
+def test_paths_in_ci_run_exist() -> None:
+    """A pattern without a file, and a name that a brace expands to, must not be left behind by a rename."""
+    code = re.sub(r"(?m)^ *#.*", "", CI)
+    patterns = re.findall(r"(?<![\w/$])(?:bench|csrc|docs|tests)/[\w*.,{}/-]+", code)
+    echo = subprocess.run(
+        ["bash", "-c", f"printf '%s\\n' {' '.join(patterns)}"], cwd=ROOT, capture_output=True, text=True
+    )
+    paths = {*echo.stdout.splitlines(), *(f"bench/questions/{name}.py" for name in benchmarks())}
+    assert len(paths) > 100
+    assert [path for path in sorted(paths) if not (ROOT / path).exists()] == []
+
+
+def benchmarks() -> list[str]:
+    here_document = CI.partition("<< END\n")[2].partition("\nEND")[0]
+    return [line.split()[0] for line in here_document.splitlines()]
+
+
+def test_test_names_in_ci_run_exist() -> None:
+    tests = {
+        name
+        for path in TESTS.glob("**/test_*.py")
+        for name in re.findall(r"def (test_\w+)", path.read_text())
+    }
+    named = set(re.findall(r"(?:::|=)(test_\w+)", CI))
+    assert len(named) >= 3
+    assert named - tests == set()
+    chosen = re.findall(r"""(?:-k |measured=|no_room=)["']([^"']+)""", CI)
+    words = {word for part in chosen for word in re.findall(r"(?<!\$)\b\w+\b", part)} - {"and", "or", "not"}
+    assert len(words) >= 6
+    assert [word for word in words if not any(word in test for test in tests)] == []
+
+
 # ---- fuzzing ----
 
 
@@ -142,9 +183,6 @@ def test_a_reader_survives_its_corpus(tmp_path: Path, name: str) -> None:
 
 
 # ---- mutation ----
-
-
-ROOT = Path(__file__).parents[2]
 
 
 EXPLAINED = tomllib.loads((ROOT / "tests" / "mutation" / "explained.toml").read_text("utf-8"))["mutant"]
@@ -235,9 +273,6 @@ def test_mutation_trials_compile_existing_files() -> None:
 
 
 # ---- processes of tests ----
-
-
-TESTS = Path(__file__).parents[1]
 
 
 SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
