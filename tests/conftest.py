@@ -27,7 +27,7 @@ from multidrop.cli import main
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-gc.disable()  # until all is collected: it stays, and to look for garbage in it takes a fifth of the time
+gc.disable()  # until all tests are collected: searching them for garbage takes a fifth of the time
 
 ALL_TESTS = sorted(Path(__file__).parent.glob("*/test_*.py"))
 COMPILED_BEFORE = any((test.parent / "__pycache__").exists() for test in ALL_TESTS)
@@ -44,8 +44,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """Two for each processor: many tests wait for a line; 12 at most, for each collects all."""
-    return min(2 * len(os.sched_getaffinity(0)), 12)
+    """Return one more than the processors, at most 12: some tests wait, and each worker collects all."""
+    return min(len(os.sched_getaffinity(0)) + 1, 12)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
@@ -85,8 +85,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spare every collection of garbage, and every child of a fork, all that pytest keeps to the end."""
-    gc.collect()
+    """Exclude all that pytest keeps to the end from garbage collections, also in forked children."""
     gc.freeze()
     gc.enable()
 

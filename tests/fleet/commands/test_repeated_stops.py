@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable
 from functools import partial
 from math import inf
@@ -28,8 +29,12 @@ def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     """Each stop is sent after its call. All calls get the answer of the stop that is repeated."""
     repeated: list[float | None] = []
 
+    are_all_called = threading.Event()
+
     def noted(*details: Any, stop: Callable[..., Results]) -> Results:
         repeated.append(details[-1])
+        if repeated[1:]:
+            are_all_called.wait(PATIENCE)
         return stop(*details)
 
     monkeypatch.setattr(desk_module, "stop_line", partial(noted, stop=stop_line))
@@ -44,6 +49,9 @@ def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
             while not desk.lines.for_stop(LINE).bus.stops_under_way():  # type: ignore[union-attr]
                 await asyncio.sleep(0.002)
             called += [asyncio.create_task(desk.stop()) for _ in range(8)]
+            while len(desk.stops._repeated._tasks) < 8:
+                await asyncio.sleep(0.002)
+            are_all_called.set()
             while len(repeated) < 3 or desk.stops._repeated._sent:
                 await asyncio.sleep(0.002)
         desk.sim.deaf_until = 0.0
