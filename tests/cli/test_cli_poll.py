@@ -66,6 +66,7 @@ def test_simulate_does_not_replace_a_file_by_a_port_link(run: Run, tmp_path: Pat
     assert link.read_text() == "mine"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
 def test_simulate_replaces_the_link_of_a_killed_simulator(tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"

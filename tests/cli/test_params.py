@@ -86,6 +86,7 @@ def test_a_refused_second_write_names_the_option_that_permits_it(
     assert "params.apply(" not in out
 
 
+@pytest.mark.slow
 def test_commissioning_needs_a_terminal_for_confirmation(
     run: Run, drive: tuple[object, ...], sim: MotorDrive
 ) -> None:

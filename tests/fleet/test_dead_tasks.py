@@ -347,6 +347,7 @@ async def test_lines_are_closed_after_polling_has_failed(taken: Taken) -> None:
     taken.lines.poller._is_failure_raised = True
 
 
+@pytest.mark.long
 def test_lines_with_failing_polls_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failures = {"hall": "Ill: of its class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures))

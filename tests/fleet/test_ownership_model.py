@@ -248,6 +248,7 @@ MUTATIONS = {
 }
 
 
+@pytest.mark.slow
 @table("mutation", MUTATIONS)
 def test_each_mutation_of_the_rules_has_two_masters_or_a_lost_line(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search()

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import serial
+from examples import usually
 from lines import PATIENCE, line, patient, plant, polled, until
 from toy import Toy
 
@@ -70,7 +71,7 @@ class Two:
         raise Ill("of this line")
 
 
-@pytest.fixture(params=[None, 0.01], ids=["as fast as it goes", "at a rate"])
+@pytest.fixture(params=usually(0.01, None), ids=["at a rate", "as fast as it goes"])
 def two(request: pytest.FixtureRequest) -> Iterator[Two]:
     with Simulator([Wire([simulated(Toy(1))]) for _ in range(2)]) as simulator:
         made = Two(simulator, request.param)

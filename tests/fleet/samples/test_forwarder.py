@@ -251,6 +251,7 @@ async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pyte
     assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
 
 
+@pytest.mark.slow
 async def test_the_largest_message_is_stored_and_read_back(running: Cluster) -> None:
     async with empty_stream(running) as path:
         data = random.Random(1).randbytes(MOST_BYTES)

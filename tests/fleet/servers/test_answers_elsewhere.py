@@ -136,6 +136,7 @@ async def stored(client: Client, stream: str) -> set[str]:
     return set(json.loads(answer.data)["state"].get("subjects", ()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_no_answer_leaves_the_requesters_account(tmp_path: Path, number: int) -> None:
     with secured_cluster(tmp_path, number, GATEWAYS) as servers:

@@ -108,6 +108,7 @@ def test_servers_that_ignore_other_writers_records_are_refused(
         asyncio.run(_init(nats.urls))
 
 
+@pytest.mark.slow
 @table(("is_carried_out",), [(True,), (False,)])
 def test_an_unanswered_removal_is_checked_and_repeated(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch

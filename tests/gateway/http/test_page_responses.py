@@ -29,11 +29,11 @@ def test_page_files_have_types_and_a_known_etag_is_answered_with_304(tmp_path: P
             assert (head.status, head.headers["content-length"]) == (200, str(len(answer.body)))
 
 
-@pytest.mark.parametrize("name", ["", "app", "../gateway.py", "%2e%2e/gateway.py", "vendor", "/etc/passwd"])
-def test_files_outside_the_page_folder_are_not_served(tmp_path: Path, name: str) -> None:
+def test_files_outside_the_page_folder_are_not_served(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
-        answer = gateway.get(f"/page/{name}")
-        assert (answer.status, answer.json) == (404, {"error": "unknown path"})
+        for name in ("", "app", "../gateway.py", "%2e%2e/gateway.py", "vendor", "/etc/passwd"):
+            answer = gateway.get(f"/page/{name}")
+            assert (answer.status, answer.json) == (404, {"error": "unknown path"}), name
 
 
 def test_installation_without_a_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
