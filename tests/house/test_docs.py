@@ -65,7 +65,6 @@ NOT_RUN = {
     "multidrop demo": "takes eight seconds: tests/cli and .ci/run run it",
     "multidrop plot demo.arrows": "needs the demo's recording",
     "multidrop report demo.arrows": "needs the demo's recording",
-    "multidrop serve --new-token": "prints a secret: tests/gateway/test_serve.py",
     "multidrop serve --demo": "runs until it is stopped: tests/gateway/test_serve.py",
     "multidrop serve plant.toml": "runs until it is stopped: tests/gateway/test_serve.py",
     "pip install '.[fleet]'": "installs",
@@ -82,6 +81,7 @@ NOT_RUN = {
     "multidrop read /dev/ttyUSB0 invt-goodrive": "needs that drive: tests/families/test_responders.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line with another master: tests/cli/test_cli_sniff.py",
 }
+PROGRAMS = ("openssl", "chmod")  # other programs that are run
 COMPUTED = "multidrop plan"  # deterministic figures; those of other commands are measured
 STATUS = {"multidrop plan full.toml": 1}  # expected exit status, if not 0
 SHORTER = (  # replacements that shorten long runs
@@ -186,7 +186,7 @@ class Session:
 
     def _run_commands(self, text: str, *, has_prompt: bool) -> None:
         commands: list[tuple[str, list[str]]] = []
-        for line in text.splitlines():
+        for line in text.replace("\\\n", "").splitlines():
             if line.startswith("$ ") or not has_prompt:
                 commands.append((line.removeprefix("$ "), []))
             elif commands:
@@ -197,14 +197,20 @@ class Session:
                 compare(shown, self._run_command(command), form)
 
     def _run_command(self, command: str) -> str:
+        command, _, added_to = command.partition(" >> ")
         words = shlex.split(self._with_ports(command), comments=True)
+        if words[0] in PROGRAMS:
+            return subprocess.run(words, check=True, capture_output=True, text=True).stdout
         assert words[0] == "multidrop", f"{command!r} is neither run nor listed in NOT_RUN"
         if words[1] == "simulate":
             return self._simulate(words[1:])
-        printed = StringIO()
-        with redirect_stdout(printed), redirect_stderr(printed):
+        printed, errors = StringIO(), StringIO()
+        with redirect_stdout(printed), redirect_stderr(errors if added_to else printed):
             status = main(words[1:])
-        assert status == STATUS.get(command, 0), printed.getvalue()
+        assert status == STATUS.get(command, 0), printed.getvalue() + errors.getvalue()
+        if added_to:
+            with Path(added_to).open("a") as file:
+                file.write(printed.getvalue())
         return printed.getvalue()
 
     def _simulate(self, words: list[str]) -> str:

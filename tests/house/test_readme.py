@@ -123,6 +123,13 @@ def test_a_logger_to_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_test_bench_measures_each_step_and_records(tmp_path: Path) -> None:
+    lines = run(tmp_path, "test_bench.py", "0.5").splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["10.0 Hz", "20.0 Hz", "30.0 Hz"]
+    assert {row.drive for batch in open_recording(tmp_path / "bench.arrows") for row in batch} == {"fan"}
+
+
+@pytest.mark.slow
 def test_own_device(tmp_path: Path) -> None:
     printed = run(tmp_path, "own_device.py")
     assert "temperature  21.4 degC" in printed
