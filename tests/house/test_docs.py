@@ -81,7 +81,7 @@ NOT_RUN = {
     "multidrop read /dev/ttyUSB0 invt-goodrive": "needs that drive: tests/families/test_responders.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line with another master: tests/cli/test_cli_sniff.py",
 }
-PROGRAMS = ("openssl", "chmod")  # other programs that are run
+PROGRAMS = ("openssl", "chmod", "echo")  # other programs that are run
 COMPUTED = "multidrop plan"  # deterministic figures; those of other commands are measured
 STATUS = {"multidrop plan full.toml": 1}  # expected exit status, if not 0
 SHORTER = (  # replacements that shorten long runs
@@ -197,21 +197,24 @@ class Session:
                 compare(shown, self._run_command(command), form)
 
     def _run_command(self, command: str) -> str:
+        """Run a command, and return what it prints; with `>> FILE`, add the output to the file."""
         command, _, added_to = command.partition(" >> ")
         words = shlex.split(self._with_ports(command), comments=True)
         if words[0] in PROGRAMS:
-            return subprocess.run(words, check=True, capture_output=True, text=True).stdout
-        assert words[0] == "multidrop", f"{command!r} is neither run nor listed in NOT_RUN"
-        if words[1] == "simulate":
-            return self._simulate(words[1:])
-        printed, errors = StringIO(), StringIO()
-        with redirect_stdout(printed), redirect_stderr(errors if added_to else printed):
-            status = main(words[1:])
-        assert status == STATUS.get(command, 0), printed.getvalue() + errors.getvalue()
+            printed = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+        else:
+            assert words[0] == "multidrop", f"{command!r} is neither run nor listed in NOT_RUN"
+            if words[1] == "simulate":
+                return self._simulate(words[1:])
+            output, errors = StringIO(), StringIO()
+            with redirect_stdout(output), redirect_stderr(errors if added_to else output):
+                status = main(words[1:])
+            printed = output.getvalue()
+            assert status == STATUS.get(command, 0), printed + errors.getvalue()
         if added_to:
             with Path(added_to).open("a") as file:
-                file.write(printed.getvalue())
-        return printed.getvalue()
+                file.write(printed)
+        return printed
 
     def _simulate(self, words: list[str]) -> str:
         """Start the simulator, which runs until the page ends; return its first line."""

@@ -30,6 +30,7 @@ from multidrop.gateway.live.alarms import Alarm, Alarms
 from multidrop.gateway.live.drive_reads import Identities, SideReads
 from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub
+from multidrop.gateway.live.limits import Limits, current_values
 from multidrop.gateway.live.parameter_reads import ParameterReads
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 from multidrop.gateway.live.views import troubles_of
@@ -88,6 +89,7 @@ class Gateway:
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant, now_and_slept_ns)
+        self.limits = Limits(settings.limits)
         self.alarms = Alarms(utc_ms(), self._note_alarm)
         self.alarm_file = AlarmFile(settings.alarms) if settings.alarms else None
         self._is_restored = self.alarm_file is None
@@ -266,6 +268,8 @@ class Gateway:
         for name in self.hub.drives:
             stops = None if self.hub.is_set_to_zero(name) else self.commands.halts(name)
             self.alarms.look(now, name, self.hub.seen(name), stops)
+            values = current_values(self.hub, name) if name in self.limits else {}
+            self.alarms.look_at_limits(now, name, partial(self.limits.exceeded, self.clock(), name, values))
         for line in self.plant.lines:
             lost = lost_of(self.hub, line.name)
             self.alarms.look_at_line(now, line.name, lost)
@@ -297,6 +301,9 @@ class Gateway:
             _log.warning("alarm of %s: %s: %s", where, alarm.kind, alarm.text)
         if self.alarm_file is not None:
             self.alarm_file.note(alarm)
+        for name, feed in self.feeds.items():
+            if hasattr(feed, "note_alarm"):
+                self.guarded(name, feed.note_alarm, alarm)
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
@@ -379,7 +386,7 @@ class Gateway:
     def part_context(self, plant: Plant) -> PartContext:
         """Return the objects of the gateway that a part built for this plant may use."""
         folder, page = self.settings.folder, self.settings.page
-        return PartContext(plant, self.hub, self.commands, self.ask, folder, self.version, page)
+        return PartContext(plant, self.hub, self.commands, self.ask, folder, self.version, self.alarms, page)
 
     def _frame(self, n: int) -> dict[str, Any]:
         self.seen_frames.note(n)

@@ -1,4 +1,4 @@
-"""The four optional parts of the gateway: fleet view, history, Modbus server and MQTT.
+"""The five optional parts of the gateway: fleet view, history, Modbus server, MQTT and notifications.
 
 Each part has a table in `[serve]` and receives every batch of rows. If a part fails, the failure is counted
 and logged, and the other parts continue.
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop import Batch, Plant
 from multidrop.extras import install_command
 from multidrop.gateway.commands import Commands
+from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
 
@@ -30,6 +31,7 @@ PARTS: Mapping[str, str] = {
     "history": "multidrop.gateway.historian",
     "modbus": "multidrop.gateway.modbus_server.server",
     "mqtt": "multidrop.gateway.mqtt.part",
+    "notify": "multidrop.gateway.notifications",
 }
 
 # Reads registers that need not be in the drive's table: drive, function, first address, count, expiry in s.
@@ -47,14 +49,15 @@ class PartContext(NamedTuple):
     ask: Ask
     folder: Path  # base of relative paths in the settings
     version: str
+    alarms: Alarms
     page: str = ""  # address of the gateway's page; "": unknown
 
 
 class Part(Protocol):
     """The methods of a part.
 
-    Three more methods are optional: `adopt(plant)` is called after a reload, `health()` returns a problem or
-    "", and `figures()` returns metric families.
+    Four more methods are optional: `adopt(plant)` is called after a reload, `note_alarm(alarm)` when an alarm
+    starts, changes or ends; `health()` returns a problem or "", and `figures()` returns metric families.
     """
 
     def take(self, batch: Batch) -> None:

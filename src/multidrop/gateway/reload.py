@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from multidrop import Batch, Plant, PlantError, Poller
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import drives_of
+from multidrop.gateway.live.limits import Limits
 from multidrop.gateway.parts import PARTS
 from multidrop.gateway.settings import AUDIT_S, check_writable
 from multidrop.supervisor import Hung, supervisor
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from multidrop.gateway.settings import ServeSettings
 
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
-AT_ONCE = ("names", "tokens", "may", *PARTS)  # keys of [serve] that need no restart
+AT_ONCE = ("names", "tokens", "may", "limit", *PARTS)  # keys of [serve] that need no restart
 READ_S = 10.0  # time limit for reading the file
 QUICK_S = 1.0  # least time that reading gets before a later reload cancels it
 MOST_READS = 8  # concurrent reads, all of which may hang
@@ -193,7 +194,10 @@ class Reload:
         now = gateway.settings
         if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
             may = may.bounded_by(now.may)  # a restart changes which clients can connect
-        gateway.settings = replace(gateway.settings, names=settings.names, tokens=settings.tokens, may=may)
+        gateway.settings = replace(
+            gateway.settings, names=settings.names, tokens=settings.tokens, may=may, limits=settings.limits
+        )
+        gateway.limits = Limits(settings.limits)
         gateway.commands.may = may
         gateway.own_names.replace(settings.names)
         gateway.tokens.replace(settings.tokens)

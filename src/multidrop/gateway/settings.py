@@ -16,6 +16,7 @@ from typing import Any
 
 from multidrop import Plant, PlantError
 from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
+from multidrop.gateway.live.limits import Limit, read_limits
 from multidrop.gateway.parts import PARTS
 from multidrop.plant import MAY_LISTS, check_listed
 from multidrop.supervisor import Hung, in_time
@@ -44,6 +45,7 @@ _SERVE = {
     "audit": Key(str, 'audit = "audit.jsonl"'),
     "alarms": Key(str, 'alarms = "alarms.jsonl"'),
     "may": Key(dict, "[serve.may], a table"),
+    "limit": Key(list, "[[serve.limit]], a table for each limit"),
 } | {name: Key(dict, f"[serve.{name}], a table") for name in PARTS}
 
 _MAY = {
@@ -67,6 +69,7 @@ class ServeSettings:
     may: May = May()  # noqa: RUF009 (it cannot change)
     audit: Path | None = None
     alarms: Path | None = None
+    limits: tuple[Limit, ...] = ()
     folder: Path = Path()
     parts: Mapping[str, Any] = field(default_factory=dict)
     is_demo: bool = False
@@ -141,6 +144,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
         )
     audit = folders.state / given.get("audit", "audit.jsonl")
     place.attempt(_check_audit, audit)
+    limits = read_limits(given.get("limit", ()), plant, place)
     parts = {
         name: _part(name, given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
         for name in PARTS
@@ -151,7 +155,19 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     digest = _digest(folders.find(given[key]) for key in ("certificate", "key")) if tls else ""
     alarms = folders.state / given.get("alarms", "alarms.jsonl")
     return ServeSettings(
-        host, port, names, tls, digest, behind_proxy, tuple(tokens), may, audit, alarms, folders.state, parts
+        host,
+        port,
+        names,
+        tls,
+        digest,
+        behind_proxy,
+        tuple(tokens),
+        may,
+        audit,
+        alarms,
+        limits,
+        folders.state,
+        parts,
     )
 
 

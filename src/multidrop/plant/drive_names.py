@@ -10,6 +10,7 @@ from unicodedata import normalize
 RESERVED_NAMES: Final[Mapping[str, str]] = {
     "gateway": "the MQTT topic PREFIX/gateway",
     "stop": "the MQTT topic PREFIX/stop, which stops all drives",
+    "alarms": "the MQTT topic PREFIX/alarms",
     "act": "the MQTT topic PREFIX/DRIVE/act, which takes verbs",
     "set": "the MQTT topics PREFIX/DRIVE/set/REGISTER, which take writes",
     "available": "the MQTT topic PREFIX/DRIVE/available",

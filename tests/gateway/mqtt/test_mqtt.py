@@ -759,7 +759,7 @@ def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
     said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
     words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
     ours = words - {"+", FAN.name, "pump-1"}
-    assert ours == {"gateway", "stop", "act", "set", "available", "told"}
+    assert ours == {"gateway", "alarms", "stop", "act", "set", "available", "told"}
     assert ours <= RESERVED_NAMES.keys()
 
 

@@ -152,7 +152,7 @@ def test_messages_left_by_a_killed_gateway_are_deleted(broker: Broker, tmp_path:
                 waited.discard(listener.wait_for(lambda one: one.topic in waited and not one.payload).topic)
             assert kept_at(broker) == {
                 *("elsewhere/old/available", "multidrop/hall/old/available", foreign),
-                *("multidrop/gateway", "multidrop/pump-1", "multidrop/pump-1/available"),
+                *("multidrop/gateway", "multidrop/alarms", "multidrop/pump-1", "multidrop/pump-1/available"),
                 discovery_topic("multidrop", "pump-1"),
             }
     finally:

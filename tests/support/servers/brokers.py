@@ -23,6 +23,7 @@ from peers import require_module, require_program
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.http.rights import Caller, May
+from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import KeptRow, Known, Shown
 from multidrop.gateway.parts import PartContext
 
@@ -262,7 +263,7 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
     hub: Any = ScriptedHub(fan.name)
     commands: Any = RecordedCommands()
-    return PartContext(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
+    return PartContext(plant, hub, commands, SimpleNamespace(), folder, "0.2", Alarms())  # type: ignore[arg-type]
 
 
 def without_fan(known: Any) -> Plant:

@@ -18,8 +18,8 @@ from multidrop.gateway.live.hub import (
     Shown,
 )
 
-STOPPED, PORT = "stopped", "port"  # kinds of alarms in addition to FAULT and SILENT
-KINDS = (FAULT, STOPPED, PORT, SILENT)  # the most serious kind first
+STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms in addition to FAULT and SILENT
+KINDS = (FAULT, STOPPED, LIMIT, PORT, SILENT)  # the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
 STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
 MOST_ENDED = 1000  # ended alarms kept
@@ -117,6 +117,15 @@ class Alarms:
         else:
             self._begin(time, line, "", PORT, lost)
 
+    def look_at_limits(self, time: int, drive: str, exceeded: Callable[[str], str]) -> None:
+        """Note a drive's exceeded limits, which `exceeded` returns as a text from the text before."""
+        lasting = self._lasting.get(("", drive, LIMIT))
+        text = exceeded(lasting.text if lasting else "")
+        if text:
+            self._begin(time, "", drive, LIMIT, text)
+        else:
+            self._end(time, "", drive, LIMIT)
+
     def note_there(self, line: str) -> None:
         """Note that a line works, so that a later loss has an exact start."""
         self._known.add((line, ""))
@@ -206,7 +215,7 @@ class Alarms:
         self._known.add(key[:2])
         if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
             return
-        if before is not None and (before.text == UNNAMED or kind == PORT):
+        if before is not None and (before.text == UNNAMED or kind in (PORT, LIMIT)):
             # This is the same alarm, with a better text.
             self._lasting[key] = before._replace(text=text)
             self._note(self._lasting[key])

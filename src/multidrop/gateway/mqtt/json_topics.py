@@ -156,6 +156,7 @@ class JsonTopics:
         if self._settings.home_assistant:
             for drive in self._hub.drives:
                 self._discover(drive)
+        self.publish_alarms()
         self.publish()
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
@@ -228,6 +229,13 @@ class JsonTopics:
                 self.outbox.put(self._kept(topic, NOTHING))
 
     # ---- published messages ----
+
+    def publish_alarms(self) -> None:
+        """Publish the list of active alarms."""
+        self.outbox.put(Publication(self._topic("alarms"), self._active_alarms, is_retained=True))
+
+    def _active_alarms(self) -> bytes:
+        return json.dumps([one.as_json() for one in self._context.alarms.lasting]).encode()
 
     def publish(self) -> None:
         """Publish the newest values of each drive."""

@@ -9,6 +9,7 @@ from typing import Any
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.clock import utc_ms
+from multidrop.gateway.live.alarms import Alarm
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt.broker import Broker, parse_broker
 from multidrop.gateway.mqtt.json_topics import JsonTopics
@@ -21,18 +22,22 @@ Settings = MqttSettings
 
 def build(settings: MqttSettings, context: PartContext) -> Mqtt:
     """Return the part. Raises ImportError without paho."""
-    speakers: list[Any] = [JsonTopics(settings, context, utc_ms)]
+    topics = JsonTopics(settings, context, utc_ms)
+    speakers: list[Any] = [topics]
     if settings.sparkplug:
         speakers.append(SparkplugNode(settings, context, utc_ms))
-    return Mqtt(settings, context, speakers)
+    return Mqtt(settings, context, topics, speakers)
 
 
 class Mqtt:
     """The formats (`Speaker`), each with its own connection because a connection has only one will."""
 
-    def __init__(self, settings: MqttSettings, context: PartContext, speakers: list[Any]) -> None:
+    def __init__(
+        self, settings: MqttSettings, context: PartContext, topics: JsonTopics, speakers: list[Any]
+    ) -> None:
         address, login = parse_broker(settings.broker), settings.login(context.plant)
         self._every = settings.every_s
+        self._topics = topics
         self._speakers = speakers
         self._brokers = []
         for speaker in speakers:
@@ -43,6 +48,11 @@ class Mqtt:
 
     def take(self, batch: Batch) -> None:
         """Ignore the batch: the hub has the newest rows."""
+
+    def note_alarm(self, alarm: Alarm) -> None:
+        """Publish the active alarms, because one began, changed or ended."""
+        if self._brokers[0].is_connected:
+            self._topics.publish_alarms()
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant, and announce all drives again."""

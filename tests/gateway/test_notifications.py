@@ -1,0 +1,280 @@
+"""Notifications: one message for each alarm that begins or ends, whatever its targets do."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from math import inf
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from gateways import served
+from lines import until
+from tables import table
+
+from multidrop.gateway.live.alarms import FAULT, SILENT, Alarm, Alarms
+from multidrop.gateway.live.hub import RUNS, Shown
+from multidrop.gateway.notifications import (
+    MOST_RETRY_S,
+    MOST_WAITING,
+    Notifications,
+    Outbox,
+    Sender,
+    Target,
+    message_of,
+    read_targets,
+    sender_to,
+)
+from multidrop.gateway.parts import build
+
+BEGUN = Alarm(1_000, "pump", "overcurrent", None, FAULT)
+
+
+def over(alarm: Alarm, ended: int = 2_000) -> Alarm:
+    return alarm._replace(ended=ended)
+
+
+def flaps(number: int) -> list[Alarm]:
+    """Return an alarm that begins and ends this many times."""
+    return [
+        one for at in range(number) for one in (BEGUN._replace(time=at), over(BEGUN._replace(time=at), at))
+    ]
+
+
+def described(alarm: Alarm, left_out: int) -> dict[str, Any]:
+    return message_of("plant", "http://page/", alarm, left_out)
+
+
+class Clocked:
+    """A sender whose time is `now_s`; it records messages, or fails while `failure` is set."""
+
+    def __init__(self, most: int = 3600) -> None:
+        self.now_s = 0.0
+        self.failure: Exception | None = None
+        self.messages: list[dict[str, Any]] = []
+        self.sender = Sender("target", self._send, Outbox(most, 0.0), described, lambda: self.now_s)
+
+    def _send(self, message: dict[str, Any]) -> None:
+        if self.failure:
+            raise self.failure
+        self.messages.append(message)
+
+    def send_all(self) -> float:
+        """Send all messages that are allowed now; return the seconds until the next attempt."""
+        while (pause_s := self.sender.step()) == 0:
+            pass
+        return pause_s
+
+
+# ---- which alarms are sent ----
+
+
+def test_thousand_flaps_are_sent_as_one_message_for_each_begin_and_end() -> None:
+    target, alarms = Clocked(), flaps(1000)
+    part = Notifications([target.sender], [FAULT])
+    for alarm in alarms:
+        part.note_alarm(alarm)
+        target.now_s += 2  # within the limit of 3600 an hour
+        target.send_all()
+    assert [(one["event"], one["id"]) for one in target.messages] == [
+        ("begin" if alarm.ended is None else "end", alarm.id) for alarm in alarms
+    ]
+
+
+def test_acknowledgements_new_texts_and_other_kinds_are_not_sent() -> None:
+    target = Clocked()
+    part = Notifications([target.sender], [FAULT])
+    better, seen = BEGUN._replace(text="overcurrent at start"), BEGUN._replace(acknowledged=1_500, by="anna")
+    for alarm in (BEGUN, better, seen, BEGUN._replace(kind=SILENT), over(seen)):
+        part.note_alarm(alarm)
+    target.send_all()
+    assert [one["event"] for one in target.messages] == ["begin", "end"]
+
+
+def test_restart_repeats_no_message() -> None:
+    target = Clocked()
+    part = Notifications([target.sender], [FAULT])
+    alarms = Alarms(note=part.note_alarm)
+    alarms.restore([BEGUN], 1_500, ["pump"])
+    alarms.look(1_600, "pump", Shown(FAULT, BEGUN.text))
+    assert target.send_all() == inf
+    alarms.look(2_000, "pump", Shown(RUNS, ""))
+    target.send_all()
+    assert [one["event"] for one in target.messages] == ["end"]
+
+
+# ---- limits ----
+
+
+def test_beyond_the_hourly_limit_the_newest_message_is_sent_when_allowed() -> None:
+    target = Clocked(most=60)
+    for alarm in (*flaps(100), BEGUN._replace(time=100)):
+        target.sender.put(alarm)
+    assert target.send_all() == pytest.approx(60.0)
+    assert len(target.messages) == 60
+    target.now_s += 61
+    target.send_all()
+    [newest] = target.messages[60:]
+    assert (newest["event"], newest["time"]) == ("begin", "1970-01-01T00:00:00.100+00:00")
+    assert newest["text"] == "pump: fault: overcurrent (140 earlier messages were left out)"
+
+
+def test_waiting_messages_are_bounded() -> None:
+    outbox = Outbox(60, 0.0)
+    for number in range(3 * MOST_WAITING):
+        outbox.put(BEGUN._replace(drive=f"pump-{number}"))
+    assert (len(outbox), outbox.left_out) == (MOST_WAITING, 2 * MOST_WAITING)
+
+
+def test_failed_message_is_sent_again_after_growing_pauses() -> None:
+    target = Clocked()
+    target.sender.put(BEGUN)
+    target.failure = OSError("500")
+    pauses = [target.send_all() for _ in range(8)]
+    assert (pauses[:3], pauses[-1]) == ([5, 10, 20], MOST_RETRY_S)
+    assert target.sender.trouble == "target takes no messages: 500"
+    target.failure = None
+    assert target.send_all() == inf
+    assert (len(target.messages), target.sender.trouble) == (1, "")
+
+
+def test_target_that_hangs_delays_no_other_target() -> None:
+    hang, other = threading.Event(), Clocked()
+    hanging = Sender("hanging", lambda message: hang.wait() and None, Outbox(60, 0.0), described)
+    threads = [threading.Thread(target=one.run, daemon=True) for one in (hanging, other.sender)]
+    for thread in threads:
+        thread.start()
+    part = Notifications([hanging, other.sender], [FAULT])
+    for alarm in flaps(500):
+        part.note_alarm(alarm)
+    until(lambda: len(other.messages) == 1000)
+    assert hanging.sent == 0
+    hang.set()
+    for sender in (hanging, other.sender):
+        sender.close()
+    for thread in threads:
+        thread.join()
+
+
+# ---- targets ----
+
+
+@pytest.fixture
+def webhook() -> Iterator[SimpleNamespace]:
+    """A web server that records what is posted; it answers with `status`."""
+    state = SimpleNamespace(status=200, posted=[], url="")
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            state.posted.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+            self.send_response(state.status)
+            self.send_header("location", state.url)
+            self.send_header("content-length", "0")
+            self.end_headers()
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        state.url = f"http://127.0.0.1:{server.server_port}/secret-path"
+        thread = threading.Thread(target=server.serve_forever, args=[0.01])
+        thread.start()
+        yield state
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize("status", [302, 404, 500])
+def test_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace, status: int) -> None:
+    send = sender_to(Target("target", webhook.url))
+    send(described(BEGUN, 0))
+    webhook.status = status
+    with pytest.raises(OSError, match=str(status)):
+        send(described(over(BEGUN), 0))
+    assert [one["event"] for one in webhook.posted] == ["begin", "end"]
+    assert webhook.posted[0] == {
+        "event": "begin",
+        "title": "plant: pump",
+        "text": "pump: fault: overcurrent",
+        "plant": "plant",
+        "line": "",
+        "drive": "pump",
+        "kind": "fault",
+        "alarm": "overcurrent",
+        "id": "1000 fault pump",
+        "time": "1970-01-01T00:00:01.000+00:00",
+        "ended": None,
+        "page": "http://page/",
+    }
+
+
+@table(
+    ("line", "sentence"),
+    [
+        ("hooks.example/T0K3N", "is not a URL"),
+        ("https://", "is not a URL"),
+        ("https:///T0K3N", "a webhook is"),
+        ("https://[T0K3N/x", "a webhook is"),
+        ("https://anna:T0K3N@hooks.example/", "a webhook is"),
+        ("", "has no target"),
+        ("# https://hooks.example/T0K3N", "has no target"),
+    ],
+)
+def test_wrong_target_is_refused_without_its_secret(tmp_path: Path, line: str, sentence: str) -> None:
+    (tmp_path / "targets").write_text(f"{line}\n")
+    found, [mistake] = read_targets(tmp_path / "targets")
+    assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)
+
+
+def test_name_of_a_target_shows_no_secret(tmp_path: Path) -> None:
+    (tmp_path / "targets").write_text("https://hooks.example/T0K3N?key=T0K3N\ntgram://T0K3N/1\n")
+    found, _ = read_targets(tmp_path / "targets")
+    assert [one.name for one in found] == [
+        "target https://hooks.example in line 1 of targets",
+        "target tgram:// in line 2 of targets",
+    ]
+
+
+def test_missing_apprise_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "apprise", None)
+    (tmp_path / "targets").write_text("ntfy://alarms\n")
+    context: Any = SimpleNamespace(plant=SimpleNamespace(path=tmp_path / "plant.toml"), page="")
+    settings = SimpleNamespace(targets="targets", most=60, on=[FAULT])
+    with pytest.raises(ValueError, match=r"it needs apprise, which is not installed: pip install .*notify"):
+        build("notify", settings, context)
+
+
+@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # which Apprise imports
+def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
+    pytest.importorskip("apprise")
+    send = sender_to(Target("target", webhook.url.replace("http://", "json://")))
+    send(described(BEGUN, 0))
+    [posted] = webhook.posted
+    assert (posted["title"], posted["message"]) == ("plant: pump", "pump: fault: overcurrent")
+    webhook.status = 500
+    with pytest.raises(OSError, match="did not take"):
+        send(described(BEGUN, 0))
+
+
+@pytest.mark.slow
+def test_gateway_sends_faults_and_exceeded_limits(tmp_path: Path, webhook: SimpleNamespace) -> None:
+    (tmp_path / "targets").write_text(webhook.url)
+    limit = '[[serve.limit]]\ndrive = "pump-1"\nregister = "output_frequency"\nabove = 100.0\n'
+    below = limit.replace("above = 100.0", "below = 1.0")
+    with served(tmp_path, f"[serve.notify]\n{limit}{below}") as gateway:
+        gateway.await_state("pump-1", "stands")
+        gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
+        until(lambda: len(webhook.posted) == 2)
+        webhook.status = 500
+        gateway.sims["pump-1"].motor.reset()  # type: ignore[attr-defined]
+        until(lambda: "500" in gateway.get("/health").json["parts"].get("notify", ""))
+        assert "secret-path" not in gateway.get("/health").body.decode()
+    assert {(one["drive"], one["kind"], one["alarm"]) for one in webhook.posted[:2]} == {
+        ("pump-1", "limit", "output_frequency below 1 Hz"),
+        ("pump-1", "fault", "overcurrent while accelerating (OC1)"),
+    }
