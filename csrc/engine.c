@@ -208,6 +208,19 @@ static int may_have_news(const struct md_port *port)
     return port->turn.source == MD_NO_SOURCE || port->turn.line.listened_ns;
 }
 
+/* Begin or end realtime scheduling, for which a client waits. */
+static void change_realtime(struct md_engine *engine)
+{
+    if (engine->is_realtime_changed)
+        return;
+    engine->realtime_failure = 0;
+    if (engine->wants_realtime)
+        engine->realtime_failure = md_realtime_begin(&engine->realtime);
+    else
+        md_realtime_end(&engine->realtime);
+    engine->is_realtime_changed = engine->has_news = 1;
+}
+
 /* Block SIGPIPE: writing to a port whose far end is closed must not end the process. */
 static void ignore_broken_pipes(void)
 {
@@ -219,15 +232,21 @@ static void ignore_broken_pipes(void)
 #endif
 }
 
+/* Let this thread's sleeps end in time. */
+static void make_punctual(void)
+{
+#ifdef __linux__
+    prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
+#endif
+}
+
 static void *run(void *argument)
 {
     struct md_engine *engine = argument;
     void *ready[READY];
     int is_woken;
     ignore_broken_pipes();
-#ifdef __linux__
-    prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
-#endif
+    make_punctual();
     pthread_mutex_lock(&engine->mutex);
     for (;;) {
         int64_t until_ns = earliest(engine);
@@ -236,7 +255,9 @@ static void *run(void *argument)
         pthread_mutex_unlock(&engine->mutex);
         if (has_news) /* after unlocking: the waiting clients get the mutex immediately */
             pthread_cond_broadcast(&engine->changed);
-        while (atomic_load(&engine->callers)) /* yield: otherwise this thread would always win the mutex */
+        /* Yield, otherwise this thread would always win the mutex. A realtime thread would only yield to other
+         * realtime threads; a thread that holds the mutex inherits its priority instead. */
+        while (atomic_load(&engine->callers) && !engine->realtime.is_on)
             sched_yield();
         int n = wait_until(engine, ready, until_ns);
         pthread_mutex_lock(&engine->mutex);
@@ -245,9 +266,11 @@ static void *run(void *argument)
             md_wakeup_silence(&engine->wakeup);
             open_ports(engine);
             close_ports(engine);
+            change_realtime(engine);
         }
         if (!now_ns)
             now_ns = md_now_ns();
+        md_realtime_check(&engine->realtime, now_ns);
         for (unsigned i = 0; i < engine->count; i++)
             if (engine->wakes[i] <= now_ns || (is_woken && may_have_news(engine->ports[i])))
                 md_port_advance(engine->ports[i], md_now_ns());
@@ -255,26 +278,66 @@ static void *run(void *argument)
     return NULL;
 }
 
-struct md_engine *md_engine_start(void)
+static void free_engine(struct md_engine *engine)
 {
-    struct md_engine *engine = calloc(1, sizeof *engine);
-    if (!engine)
-        return NULL;
-    pthread_mutex_init(&engine->mutex, NULL);
-    pthread_cond_init(&engine->changed, NULL);
-    engine->waiter = md_waiter_new();
-    if (engine->waiter && md_wakeup_make(&engine->wakeup) == 0) {
-        if (md_waiter_add(engine->waiter, engine->wakeup.fd, NULL) == 0 &&
-            pthread_create(&engine->thread, NULL, run, engine) == 0)
-            return engine;
-        md_wakeup_destroy(&engine->wakeup);
-    }
-    if (engine->waiter)
-        md_waiter_free(engine->waiter);
+    md_wakeup_destroy(&engine->wakeup);
+    md_waiter_free(engine->waiter);
     pthread_mutex_destroy(&engine->mutex);
     pthread_cond_destroy(&engine->changed);
     free(engine);
+}
+
+/* Return an engine without a thread; NULL: see errno. */
+static struct md_engine *new_engine(void)
+{
+    struct md_engine *engine = calloc(1, sizeof *engine);
+    struct md_waiter *waiter = md_waiter_new();
+    if (engine && waiter && md_wakeup_make(&engine->wakeup) == 0) {
+        engine->waiter = waiter;
+        engine->is_realtime_changed = 1;
+        md_mutex_init(&engine->mutex);
+        pthread_cond_init(&engine->changed, NULL);
+        if (md_waiter_add(waiter, engine->wakeup.fd, NULL) == 0)
+            return engine;
+        free_engine(engine);
+        return NULL;
+    }
+    if (waiter)
+        md_waiter_free(waiter);
+    free(engine);
     return NULL;
+}
+
+struct md_engine *md_engine_start(void)
+{
+    struct md_engine *engine = new_engine();
+    if (!engine)
+        return NULL;
+    int failure = pthread_create(&engine->thread, NULL, run, engine);
+    if (!failure)
+        return engine;
+    free_engine(engine);
+    errno = failure;
+    return NULL;
+}
+
+int md_wake_lateness(int is_realtime, int64_t period_ns, int64_t *late_ns, int n)
+{
+    struct md_engine *engine = new_engine();
+    if (!engine)
+        return -errno;
+    void *ready[READY];
+    make_punctual();
+    int failure = is_realtime ? md_realtime_begin(&engine->realtime) : 0;
+    int64_t until_ns = md_now_ns();
+    for (int i = 0; i < n && !failure; i++) {
+        until_ns = later(until_ns, md_now_ns()) + period_ns;
+        wait_until(engine, ready, until_ns);
+        late_ns[i] = md_now_ns() - until_ns;
+    }
+    md_realtime_end(&engine->realtime);
+    free_engine(engine);
+    return failure;
 }
 
 /* ---- for clients ---- */
@@ -289,6 +352,23 @@ void md_engine_enter(struct md_engine *engine)
 void md_engine_leave(struct md_engine *engine)
 {
     pthread_mutex_unlock(&engine->mutex);
+}
+
+int md_engine_realtime(struct md_engine *engine, int wanted)
+{
+    md_engine_enter(engine);
+    engine->wants_realtime = wanted;
+    engine->is_realtime_changed = 0;
+    md_engine_wake(engine);
+    md_engine_await(engine, &engine->is_realtime_changed);
+    int failure = engine->realtime_failure;
+    md_engine_leave(engine);
+    return failure;
+}
+
+int md_engine_is_realtime(struct md_engine *engine)
+{
+    return engine->realtime.is_on;
 }
 
 void md_engine_wake(struct md_engine *engine)

@@ -6,6 +6,7 @@
 #include "capture.h"
 #include "multidrop.h"
 
+#include <pthread.h>
 #include <stdatomic.h>
 #include <time.h>
 
@@ -164,6 +165,42 @@ int md_wakeup_make(struct md_wakeup *wakeup); /* -1: see errno */
 void md_wakeup_destroy(struct md_wakeup *wakeup);
 void md_wakeup_ring(struct md_wakeup *wakeup);
 void md_wakeup_silence(struct md_wakeup *wakeup);
+
+/* ---- realtime.c: on the thread itself ---- */
+
+struct md_realtime {
+    atomic_int is_on;
+    int64_t checked_ns, used_ns; /* time of the last check, and the thread's CPU time then */
+#ifdef __linux__
+    timer_t timer;
+#elif defined _WIN32
+    void *task;
+#endif
+};
+
+int md_realtime_begin(struct md_realtime *realtime); /* 0, -errno */
+void md_realtime_end(struct md_realtime *realtime);
+/* End realtime scheduling if the thread used more than half of a processor. Call this at least twice a second
+ * of the thread's CPU time. */
+void md_realtime_check(struct md_realtime *realtime, int64_t now_ns);
+
+/* ---- mutexes ---- */
+
+/* Initialise a mutex between the engine's thread and clients. If the system can, a client that holds it
+ * inherits the priority of a realtime thread that waits for it. */
+static inline void md_mutex_init(pthread_mutex_t *mutex)
+{
+#ifdef __linux__
+    pthread_mutexattr_t inherits;
+    pthread_mutexattr_init(&inherits);
+    pthread_mutexattr_setprotocol(&inherits, PTHREAD_PRIO_INHERIT);
+    int failure = pthread_mutex_init(mutex, &inherits);
+    pthread_mutexattr_destroy(&inherits);
+    if (!failure)
+        return;
+#endif
+    pthread_mutex_init(mutex, NULL);
+}
 
 /* ---- times ---- */
 

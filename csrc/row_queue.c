@@ -5,7 +5,6 @@
 #define _GNU_SOURCE
 #include "internal.h"
 
-#include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -70,7 +69,7 @@ struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks)
     queue->chunks = chunks;
     queue->chunk_rows = chunk_rows;
     queue->most_chunks = most_chunks;
-    pthread_mutex_init(&queue->mutex, NULL);
+    md_mutex_init(&queue->mutex);
     init_condition(&queue->is_called);
     return queue;
 }

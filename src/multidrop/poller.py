@@ -17,7 +17,7 @@ from typing import Any, TypeVar, overload
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import exit_hook, give_signals_back, without_internals
-from multidrop.core import Mastership, RowQueue
+from multidrop.core import REALTIME_ENDED, Mastership, Realtime, RowQueue, why_not_realtime
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
 from multidrop.drive.family import Drive
@@ -58,6 +58,10 @@ class Poller(RowSource):
     may take batches, and add or remove drives. Reads, writes and verbs of its drives are sent before queued
     polling. `ledger`, `audit`, `stop_on_exit` and `mastership` are as in Bus.
 
+    With `realtime`, or with that key in the plant file, the core's thread is scheduled before all normal
+    threads until the poller is closed. If the system refuses this, a warning is logged, and the poller works
+    without it.
+
     Raises LineError if a port cannot be opened. Later failures appear as rows with the reason why a value is
     missing. If an exception occurs on one line, such as one in a user's own class, it is logged and the line
     is tried again (see `line_failures`). If polling itself fails, `take`, `batches` and `close` raise
@@ -76,9 +80,12 @@ class Poller(RowSource):
         audit: Path | str | None = None,
         stop_on_exit: bool = False,
         mastership: Mastership | None = None,
+        realtime: bool = False,
     ) -> None:
         plant = _plant_of(plant)
         row_queue = RowQueue()
+        self._is_realtime_given = realtime
+        self._realtime = Realtime()
         self._lines = LineSet(row_queue, ledger, audit, mastership)
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
@@ -88,6 +95,7 @@ class Poller(RowSource):
         self._ending = threading.Lock()
         register_at_fork(self)
         try:
+            self._want_realtime(plant)
             self._fill(plant)
             if stop_on_exit:
                 self.stop_on_exit()
@@ -100,6 +108,12 @@ class Poller(RowSource):
         with self._changing:
             self._check_polling()  # an interruption may have closed the poller already
             self._lines.fill(plant.lines)
+
+    def _want_realtime(self, plant: Plant) -> None:
+        try:
+            self._realtime.want(self._is_realtime_given or plant.realtime)
+        except OSError as failure:
+            log_aside(_log, logging.WARNING, "polling without realtime: %s", why_not_realtime(failure))
 
     def forked(self) -> None:
         """Mark the poller closed in a forked child, which gets no rows."""
@@ -180,6 +194,7 @@ class Poller(RowSource):
                 self._call_thread()
                 self._thread.join()
             self._lines.end(self._lines, "it is closed")
+            self._realtime.want(False)
         self._wakeup.close()
         self._over.set()
 
@@ -220,6 +235,8 @@ class Poller(RowSource):
             called = list(dict.fromkeys([*restless, *called]))
             needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
             self._look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
+            if self._realtime.has_ended():
+                log_aside(_log, logging.WARNING, REALTIME_ENDED)
         for line in called:
             line.tend(clock.now_ns())
         if self._is_watched and self._row_queue.chunks:
@@ -231,7 +248,7 @@ class Poller(RowSource):
     def plant(self) -> Plant:
         """The plant as it is polled now, with the drive objects that are on the buses."""
         lines = tuple(replace(line.declared, drives=line.polled) for line in self._lines)
-        return Plant(lines, self._path)
+        return Plant(lines, self._path, realtime=self._realtime.is_wanted)
 
     @property
     def polled_since(self) -> dict[str, int]:
@@ -268,6 +285,7 @@ class Poller(RowSource):
             self._check_polling()
             adoption = Adoption(self._lines, plant)
             self._path = plant.path
+            self._want_realtime(plant)
             return adoption.carry_out(start=self._thread.is_alive())
 
     def add_line(self, line: PlantLine) -> None:

@@ -42,6 +42,20 @@ with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
 """
 
 
+def test_poll_asks_for_realtime_by_option_or_by_plant_file(
+    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+    monkeypatch.setattr("multidrop.core.port._Engine.set_realtime", lambda *words: asked.append(words[-1]))
+    run("poll", plant, "--seconds", 0.1, "--json")
+    assert asked == []
+    run("poll", plant, "--seconds", 0.1, "--json", "--realtime")
+    assert asked == [True, False]
+    plant.write_text("realtime = true\n" + plant.read_text())
+    run("poll", plant, "--seconds", 0.1, "--json")
+    assert asked == [True, False, True, False]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
 def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, number: int) -> None:

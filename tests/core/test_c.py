@@ -104,3 +104,9 @@ def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..
     replaced = ("waiter_poll", "port", "rs485", "mastership")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
     build("test_mastership", *core)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="realtime scheduling is limited by Linux's timers")
+def test_realtime_scheduling_ends_before_it_starves_the_computer(build: Callable[..., None]) -> None:
+    build("test_realtime", "clock")

@@ -14,6 +14,7 @@ PROMISES = (
     "the host costs almost nothing",
     "Python never disturbs the cadence",
     "many lines",
+    "a busy computer",
     "dead drives cost nothing",
     "noise costs one exchange",
     "a late reply is never taken for another's answer",

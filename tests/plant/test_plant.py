@@ -193,6 +193,12 @@ def test_a_line_s_echo_is_detected_unless_it_is_declared(load: Load) -> None:
     assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
 
 
+def test_realtime_is_a_key_of_the_whole_plant(load: Load, mistakes: Mistakes) -> None:
+    assert load(GOOD).realtime is False
+    assert load("realtime = true\n" + GOOD).realtime is True
+    assert mistakes("realtime = 1\n" + GOOD) == ["realtime = 1 is not right; write realtime = true"]
+
+
 def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert [(poll.register.name, poll.every) for poll in pump.polls] == [

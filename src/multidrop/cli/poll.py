@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any, TextIO
@@ -42,6 +43,9 @@ _TAKE_S = 0.1  # pause between two deliveries of new rows, in s
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
     add_port_option(parser)
+    parser.add_argument(
+        "--realtime", action="store_true", help="schedule polling before this computer's normal programs"
+    )
     add_polling_arguments(parser, out=None, seconds=None)
     add_rotation_arguments(parser)
 
@@ -79,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out and not rotation:
         refuse_overwriting(arguments.out)
     plant = plant_of(arguments.plant, arguments)
+    plant = replace(plant, realtime=arguments.realtime or plant.realtime)
     return conclude(plant, follow(plant, arguments, rotation), arguments)
 
 

@@ -48,14 +48,18 @@ from multidrop.core.frame import (
 )
 from multidrop.core.permissions import Latch, Mastership, Permit, boottime_ns
 from multidrop.core.port import (
+    REALTIME_ENDED,
     RS485,
     Echo,
     Port,
+    Realtime,
     RowQueue,
     TransactionIds,
     Transactions,
     now_ns,
     utc_minus_monotonic_ns,
+    wake_lateness,
+    why_not_realtime,
 )
 from multidrop.core.port_settings import (
     REFUSALS,
@@ -77,6 +81,7 @@ __all__ = [
     "MODBUS",
     "MOST_INVALID",
     "PAUSE_NS",
+    "REALTIME_ENDED",
     "REFUSALS",
     "RS485",
     "STATUSES",
@@ -105,6 +110,7 @@ __all__ = [
     "Peer",
     "Permit",
     "Port",
+    "Realtime",
     "RowLayout",
     "RowQueue",
     "Side",
@@ -138,4 +144,6 @@ __all__ = [
     "spell",
     "sum8",
     "utc_minus_monotonic_ns",
+    "wake_lateness",
+    "why_not_realtime",
 ]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +22,7 @@ from multidrop.core.permissions import Mastership
 from multidrop.core.result import Status
 
 CHUNK_ROWS = 1 << 12
+WAKE_PERIOD_S = 2e-3  # sleep between two measured wake-ups
 MOST_CHUNKS = 256  # when all chunks are full, the queue drops new rows and counts them
 
 
@@ -152,6 +156,8 @@ class _Engine:
         """Forget the thread in a forked child: the next port starts another one."""
         self._starting = threading.Lock()  # several threads may open the first port
         self._c: Any = None
+        self._changing = threading.Lock()
+        self._realtime: set[Realtime] = set()
 
     @property
     def c(self) -> Any:
@@ -163,6 +169,72 @@ class _Engine:
                     raise OSError(ffi.errno, "the core's thread cannot be started")
                 self._c = started
             return self._c
+
+    def set_realtime(self, client: Realtime, wanted: bool) -> None:
+        """Run the thread under realtime scheduling while any client wants it. Raises OSError if refused."""
+        with self._changing:
+            (self._realtime.add if wanted else self._realtime.discard)(client)
+            failure = lib.md_engine_realtime(self.c, bool(self._realtime))
+            if failure:
+                self._realtime.discard(client)
+                raise OSError(-failure, os.strerror(-failure))
+
+    @property
+    def is_realtime(self) -> bool:
+        return self._c is not None and bool(lib.md_engine_is_realtime(self._c))
+
+
+class Realtime:
+    """A client's wish to run the core's thread under realtime scheduling, before all normal threads.
+
+    The thread does so while any client wants it. It returns to normal scheduling by itself if it uses more
+    than half of a processor.
+    """
+
+    def __init__(self) -> None:
+        self.is_wanted = False
+        self.is_held = False  # the system did not refuse, and the thread has not ended it
+
+    def want(self, wanted: bool) -> None:
+        """Begin or end the wish. Raises OSError if the system refuses realtime scheduling."""
+        if wanted != self.is_wanted:
+            self.is_wanted = wanted
+            _engine.set_realtime(self, wanted)
+            self.is_held = wanted
+
+    def has_ended(self) -> bool:
+        """Return True, once, if the thread has returned to normal scheduling by itself."""
+        has_ended = self.is_held and not _engine.is_realtime
+        self.is_held &= not has_ended
+        return has_ended
+
+
+REALTIME_ENDED = "realtime has ended: the lines took more than half of a processor; poll fewer or slower"
+
+
+def why_not_realtime(failure: OSError) -> str:
+    """Return why the system refused realtime scheduling, with what would permit it."""
+    if failure.errno == errno.ENOSYS:
+        return "this system is neither Linux nor Windows"
+    if sys.platform == "win32":
+        return "the multimedia class scheduler refuses it; start the service MMCSS"
+    return (
+        f"the system refuses it ({failure.strerror}); permit it with LimitRTPRIO=1 and RestrictRealtime=no "
+        'in the systemd unit, or with "USER - rtprio 1" in /etc/security/limits.conf and a new login'
+    )
+
+
+def wake_lateness(seconds: float, *, realtime: bool) -> list[float]:
+    """Sleep again and again for `seconds` s in all, as the core does; return how late each sleep ended, in s.
+
+    Raises OSError if `realtime` scheduling is refused.
+    """
+    count = round(seconds / WAKE_PERIOD_S)
+    late = ffi.new("int64_t[]", count)
+    failure = lib.md_wake_lateness(realtime, round(WAKE_PERIOD_S * 1e9), late, count)
+    if failure:
+        raise OSError(-failure, os.strerror(-failure))
+    return [max(0, each) / 1e9 for each in ffi.unpack(late, count)]
 
 
 class _PortMemory:

@@ -41,7 +41,7 @@ def load_plant(path: Path | str) -> Plant:
     document = place.attempt(read_document, path, "plant file")
     given = {} if document is None else place.check(document, _PLANT)
     lines = tuple(_line(table, at) for table, at in place.inside("line", given.get("line", [])))
-    plant = Plant(lines, path, given.get("serve", {}))
+    plant = Plant(lines, path, given.get("serve", {}), given.get("realtime", False))
     if place.config_errors:
         raise PlantError(grouped(place.config_errors), None if document is None else replace(plant, lines=()))
     return plant
@@ -64,6 +64,7 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # Path redu
 _PORTS = ("tcp", "socket", "rfc2217")
 
 _PLANT = {
+    "realtime": Key(bool, "realtime = true"),
     "line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True),
     "serve": Key(dict, "[serve], a table that `multidrop serve` reads"),
     "fleet": Key(dict, "[fleet], a table that `multidrop fleet init` reads"),

@@ -116,11 +116,15 @@ class PlantLine:
 
 @dataclass(frozen=True)
 class Plant:
-    """All lines of a plant file, and its table `serve`, unchecked, which only the gateway reads."""
+    """All lines of a plant file, and its table `serve`, unchecked, which only the gateway reads.
+
+    With `realtime`, the core's thread is scheduled before all normal threads; see Poller.
+    """
 
     lines: Sequence[PlantLine]  # kept as a tuple
     path: Path = Path("plant")  # the plant file
     serve: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    realtime: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lines", tuple(self.lines))

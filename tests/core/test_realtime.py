@@ -1,0 +1,142 @@
+"""Realtime scheduling: only the core's thread has it, only if the user wants it and the system permits it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from lines import until
+
+from multidrop import Plant, Poller
+from multidrop.core import Port, Realtime, wake_lateness
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems show no thread's scheduling")
+
+
+def threads() -> list[int]:
+    return [int(task.name) for task in Path("/proc/self/task").iterdir()]
+
+
+def policies() -> dict[int, int]:
+    """Return the scheduling policy of each of this process's threads."""
+    return {thread: os.sched_getscheduler(thread) for thread in threads()}
+
+
+@pytest.fixture
+def realtime() -> Iterator[Realtime]:
+    """Yield a client for which the core's thread has realtime scheduling."""
+    client = Realtime()
+    try:
+        client.want(True)
+    except PermissionError:
+        pytest.skip("this process may not use realtime scheduling")
+    yield client
+    client.want(False)
+
+
+def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> None:
+    found = policies()
+    (core,) = (thread for thread, policy in found.items() if policy != os.SCHED_OTHER)
+    assert found[core] == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    assert os.sched_getparam(core).sched_priority == 1
+    assert core != os.getpid()
+    show = [sys.executable, "-ISc", "import os; print(os.sched_getscheduler(0))"]
+    assert int(subprocess.check_output(show)) == os.SCHED_OTHER
+
+    second = Realtime()
+    second.want(True)
+    realtime.want(False)
+    assert policies()[core] & os.SCHED_FIFO
+    second.want(False)
+    assert not policies()[core] & os.SCHED_FIFO
+    assert not second.has_ended()  # because a client ended it
+
+
+def locked_kb() -> int:
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if "VmLck" in line)
+    return int(line.split()[1])
+
+
+def test_the_cores_code_is_locked_in_memory(realtime: Realtime) -> None:
+    assert 64 < locked_kb() < 4096  # of a library, not the whole process
+    realtime.want(False)
+    assert locked_kb() == 0
+
+
+def test_without_permission_the_poller_works_and_one_warning_says_what_to_do() -> None:
+    program = """
+import logging, os, resource
+from multidrop import Plant, Poller
+from multidrop.core import Realtime, wake_lateness
+from multidrop.transport import aside_log
+logging.basicConfig(format="%(message)s")
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.geteuid() == 0:
+    os.setresuid(65534, 65534, 65534)
+for attempt in (lambda: Realtime().want(True), lambda: wake_lateness(0.01, realtime=True)):
+    try:
+        attempt()
+    except PermissionError:
+        print("refused")
+with Poller(Plant(()), realtime=True) as poller:
+    poller.adopt(poller.plant)
+    print({os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")})
+aside_log.flush(10)
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert run.stdout.splitlines() == ["refused", "refused", str({os.SCHED_OTHER})], run.stderr
+    assert run.stderr == (
+        "polling without realtime: the system refuses it (Operation not permitted); permit it with "
+        "LimitRTPRIO=1 and RestrictRealtime=no in the systemd unit, or with "
+        '"USER - rtprio 1" in /etc/security/limits.conf and a new login\n'
+    )
+
+
+@pytest.mark.long
+def test_a_flooded_port_ends_realtime_scheduling(
+    realtime: Realtime, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The core's thread discards bytes that a program sends as fast as the computer can."""
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    flood = [sys.executable, "-c", f"import os\nwhile True: os.write({far.fileno()}, bytes(1000))"]
+    with Poller(Plant(()), realtime=True), near, far:
+        port = Port(near.fileno(), -1)
+        program = subprocess.Popen(flood, pass_fds=[far.fileno()])
+        try:
+            os.sched_setscheduler(program.pid, os.SCHED_RR, os.sched_param(1))
+            until(lambda: "realtime has ended" in caplog.text)
+        finally:
+            program.kill()
+            program.wait()
+        assert realtime.has_ended()
+        assert not realtime.has_ended()
+        assert set(policies().values()) <= {os.SCHED_OTHER, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK}
+        del port
+
+
+@pytest.mark.parametrize("how", ["plant file", "argument"])
+def test_a_plant_or_an_argument_asks_for_realtime(
+    how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+    monkeypatch.setattr("multidrop.core.port._Engine.set_realtime", lambda *words: asked.append(words[-1]))
+    wanted = Plant((), realtime=how == "plant file")
+    with Poller(wanted, realtime=how == "argument") as poller:
+        assert asked == [True]
+        poller.adopt(poller.plant)
+        poller.adopt(Plant(()))
+        assert asked == ([True] if how == "argument" else [True, False])
+        poller.adopt(wanted)
+    assert asked[-2:] == [True, False]
+
+
+def test_wake_ups_are_measured() -> None:
+    late = wake_lateness(0.02, realtime=False)
+    assert len(late) == 10
+    assert all(each >= 0 for each in late)
