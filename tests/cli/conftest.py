@@ -23,3 +23,9 @@ def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     port.parent.mkdir()
     with Simulator([Wire([simulated(Toy(1))], port=str(port))]):
         yield plant_file(tmp_path, dead=True)
+
+
+@pytest.fixture(autouse=True)
+def _short_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `doctor` measure wake-ups for a moment instead of five seconds."""
+    monkeypatch.setattr("multidrop.cli.doctor.WAKE_S", 0.02)

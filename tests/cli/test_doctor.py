@@ -29,6 +29,7 @@ from multidrop.cli.doctor_findings import (
     RS485_RX_DURING_TX,
     Adapter,
     RS485Mode,
+    WakeLateness,
     adapter_finding,
     decoded_rs485,
     echo_finding,
@@ -39,6 +40,7 @@ from multidrop.cli.doctor_findings import (
     round_trip_finding,
     rs485_finding,
     rs485_mode,
+    wake_finding,
 )
 from multidrop.core import RS485, Completion, Failure, Framing, Message, build_reply
 from multidrop.drive.line_settings import Settings
@@ -291,6 +293,44 @@ def test_a_round_trip_over_a_network_includes_the_wires_time() -> None:
     assert told.advice == ""
     assert round_trip_finding(InvtCHE(1), [0.0140], 1, 0.0094).advice == ""
     assert "the adapter or the network" in round_trip_finding(InvtCHE(1), [0.0240], 1, 0.0094).advice
+
+
+# ---- wake-ups ----
+
+EARLY, LATE = WakeLateness(0.0001, 0.0005, 0.003), WakeLateness(0.0001, 0.004, 0.05)
+REFUSED = "the system refuses it; permit it so"
+
+
+@pytest.mark.parametrize(
+    ("realtime", "options", "verdict", "advice"),
+    [
+        (EARLY, {}, "too late for 9600 8N1: p99 must be below 3.65 ms", "set realtime = true at the top"),
+        (EARLY, {"is_realtime": True}, "good enough for 9600 8N1", ""),
+        (EARLY, {"is_realtime": True, "switch": RS485.RTS_UP}, "good enough for 9600 8N1: max must be", ""),
+        (LATE, {"is_realtime": True}, "too late for 9600 8N1", "stop other programs on this computer"),
+        (LATE, {}, "too late for 9600 8N1", "stop other programs on this computer"),
+        (REFUSED, {}, "realtime: refused; too late", REFUSED),
+    ],
+)
+def test_wake_ups_are_judged_by_the_lines_silence(
+    realtime: WakeLateness | str, options: dict[str, Any], verdict: str, advice: str
+) -> None:
+    found = wake_finding(LATE, realtime, USUAL, **options)
+    assert found.what.startswith("the core wakes 0.10 ms late (p50), 4.00 (p99), 50.00 (max); ")
+    assert verdict in found.what
+    assert found.advice.startswith(advice) if advice else not found.advice
+
+
+def test_a_computer_that_is_in_time_needs_no_permission_unless_the_plant_asks() -> None:
+    assert wake_finding(EARLY, REFUSED, USUAL).advice == ""
+    assert wake_finding(EARLY, REFUSED, USUAL, is_realtime=True).advice == REFUSED
+    switched = wake_finding(WakeLateness(0.0001, 0.0005, 0.004), EARLY, USUAL, RS485.RTS_DOWN)
+    assert "too late" in switched.what
+
+
+def test_doctor_measures_wake_ups(run: Run, port: str) -> None:
+    told = " ".join(run("doctor", port)[1].split())
+    assert re.search(r"wake-ups the core wakes \d+\.\d\d ms late \(p50\), .* for 9600 8N1: p99 must be", told)
 
 
 # ---- the command ----

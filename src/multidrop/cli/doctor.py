@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from multidrop.bus import Bus
 from multidrop.cli.doctor_findings import (
     ROUNDS,
     Finding,
+    WakeLateness,
     adapter_finding,
     com_description,
     echo_finding,
@@ -26,6 +28,7 @@ from multidrop.cli.doctor_findings import (
     round_trip_finding,
     rs485_finding,
     rs485_mode,
+    wake_finding,
 )
 from multidrop.cli.support.arguments import (
     add_json_argument,
@@ -51,6 +54,8 @@ from multidrop.core import (
     characters_on_wire,
     is_pseudo_terminal,
     parse_reply,
+    wake_lateness,
+    why_not_realtime,
 )
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings, speaks_tcp
@@ -64,6 +69,7 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange
 
+WAKE_S = 5.0  # how long the wake-ups of this computer are measured
 NOBODY = 247  # an address without a drive: only an echo of the request may come back
 SETTING_UP_COM = "while the port is open, multidrop makes it raw and sets each drive's baud rate and format"
 SETTING_UP = (
@@ -95,12 +101,14 @@ class _Target:
     rs485: RS485
     settle: float
     line: str = ""  # the line's name in the plant file
+    is_realtime: bool = False
 
 
 def run(arguments: argparse.Namespace) -> int:
     plant = plant_at(arguments)
     targets = list(_of_plant(plant, arguments)) if plant else [_by_hand(arguments)]
     found = [(target, list(_examined(target, is_alone=len(targets) == 1))) for target in targets]
+    _add_wake_findings(found)
     if arguments.json:
         records = [
             {"port": target.port, "findings": [asdict(finding) for finding in findings]}
@@ -127,10 +135,12 @@ def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
         opening = opening_of(arguments, line)
         if arguments.name in (None, line.name):
             drives = [polled.drive for polled in line.drives]
-            yield _Target(line.port, drives, usual_settings(line), *opening, line.name)
+            yield _Target(line.port, drives, usual_settings(line), *opening, line.name, plant.realtime)
     if arguments.name not in {None, *(line.name for line in plant.lines)}:
         line, drive = plant.find_drive(arguments.name)
-        yield _Target(line.port, [drive], drive.settings, *opening_of(arguments, line), line.name)
+        yield _Target(
+            line.port, [drive], drive.settings, *opening_of(arguments, line), line.name, plant.realtime
+        )
 
 
 def _by_hand(arguments: argparse.Namespace) -> _Target:
@@ -152,6 +162,24 @@ def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
         if is_alone:
             raise
         yield Finding("port", str(failure), is_failure=True)
+
+
+def _add_wake_findings(found: list[tuple[_Target, list[Finding]]]) -> None:
+    """Measure how late this computer wakes the core; add the finding for each line with a silence."""
+    if all(speaks_tcp(target.port) for target, _ in found):
+        return
+    with ThreadPoolExecutor(2) as threads:  # side by side, for the same load
+        normal = threads.submit(wake_lateness, WAKE_S, realtime=False)
+        realtime = threads.submit(wake_lateness, WAKE_S, realtime=True)
+    usual = WakeLateness.of(normal.result())
+    try:
+        best: WakeLateness | str = WakeLateness.of(realtime.result())
+    except OSError as failure:
+        best = why_not_realtime(failure)
+    for target, findings in found:
+        if not speaks_tcp(target.port):
+            is_realtime = target.is_realtime
+            findings.append(wake_finding(usual, best, target.settings, target.rs485, is_realtime=is_realtime))
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:

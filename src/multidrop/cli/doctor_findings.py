@@ -6,10 +6,11 @@ import array
 import errno
 import struct
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from multidrop.cli.support.values import counted
 from multidrop.core import RS485, Completion
@@ -185,6 +186,59 @@ def round_trip_finding(
             "or from the drive's response delay parameter",
         )
     return Finding("round trip", what)
+
+
+class WakeLateness(NamedTuple):
+    """How late a computer wakes a thread: the median, the 99th percentile and the greatest, in s."""
+
+    p50: float
+    p99: float
+    most: float
+
+    @classmethod
+    def of(cls, late: Sequence[float]) -> WakeLateness:
+        ordered = sorted(late)
+        return cls(ordered[len(ordered) // 2], ordered[len(ordered) * 99 // 100], ordered[-1])
+
+    def __str__(self) -> str:
+        return f"{self.p50 * 1e3:.2f} ms late (p50), {self.p99 * 1e3:.2f} (p99), {self.most * 1e3:.2f} (max)"
+
+
+def wake_finding(
+    normal: WakeLateness,
+    realtime: WakeLateness | str,
+    settings: Settings,
+    switch: RS485 = RS485.OFF,
+    *,
+    is_realtime: bool = False,
+) -> Finding:
+    """Return a finding: whether this computer wakes the core in time for a line with these settings.
+
+    `realtime` is the lateness under realtime scheduling, or the reason why the system refuses it.
+    `is_realtime` is that key of the plant file. Good enough is a p99 below t3.5, the silence that precedes
+    each request anyway. If multidrop switches RTS, the maximum must be below that: a drive may answer after
+    t3.5, and a later switch would cut off its first bytes.
+    """
+    limit, kind = settings.t3_5, "max" if switch in _LEVELS else "p99"
+
+    def is_in_time(late: WakeLateness) -> bool:
+        return (late.most if kind == "max" else late.p99) < limit
+
+    used = realtime if is_realtime and not isinstance(realtime, str) else normal
+    what = (
+        f"the core wakes {normal}; realtime: {'refused' if isinstance(realtime, str) else realtime}; "
+        f"{'good enough' if is_in_time(used) else 'too late'} for {settings}: "
+        f"{kind} must be below {limit * 1e3:.2f} ms, the silence between two frames"
+    )
+    if isinstance(realtime, str):
+        advice = realtime if is_realtime or not is_in_time(used) else ""
+    elif is_in_time(used):
+        advice = ""
+    elif used is normal and is_in_time(realtime):
+        advice = "set realtime = true at the top of the plant file"
+    else:
+        advice = "stop other programs on this computer, or lower the baud rate"
+    return Finding("wake-ups", what, advice)
 
 
 SYSFS = Path("/sys")
