@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import select
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -46,13 +47,15 @@ def _plant_text(job: Job) -> str:
 
 
 @contextmanager
-def polling(job: Job, mastership: Mastership | None = None) -> Iterator[Poller]:
+def polling(job: Job, mastership: Mastership | None = None, *, realtime: bool = False) -> Iterator[Poller]:
     """Yield a poller of all registers of all drives, which polls as fast as the line allows."""
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
         path.write_text(_plant_text(job))
         plant = load_plant(path)
-    with Poller(plant, mastership=mastership) as poller:
+    with Poller(plant, mastership=mastership, realtime=realtime) as poller:
+        if realtime and not poller._realtime.is_held:
+            sys.exit("realtime is refused: run this as root, or see `multidrop doctor`")
         yield poller
 
 
@@ -73,7 +76,9 @@ def dropped(poller: Poller) -> int:
 
 
 @contextmanager
-def multidrop(job: Job, mastership: Mastership | None = None) -> Iterator[Callable[[], tuple[int, int]]]:
+def multidrop(
+    job: Job, mastership: Mastership | None = None, *, realtime: bool = False
+) -> Iterator[Callable[[], tuple[int, int]]]:
     """Yield a function that polls with a Poller, and returns the numbers of good and of failed exchanges.
 
     It takes batches ten times a second, and checks the values of the last batch."""
@@ -88,7 +93,7 @@ def multidrop(job: Job, mastership: Mastership | None = None) -> Iterator[Callab
     def last(batches: Iterable[Batch]) -> Iterable[Row]:
         return deque(batches, 1).pop()
 
-    with polling(job, mastership) as poller:
+    with polling(job, mastership, realtime=realtime) as poller:
         yield poll
 
 
@@ -114,14 +119,14 @@ def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
         yield lambda address: drives[address].read_many(registers)
 
 
-def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
+def lateness_ms(job: Job, *, realtime: bool = False) -> tuple[int, numpy.ndarray]:
     """Return the number of good exchanges, and each value's delay in ms from its reply's first byte.
 
     The consumer sleeps on the poller's descriptor, and takes the rows as soon as it wakes.
     """
     _replied_ns(decoder(1)())  # imports modules now, which would delay the first values
     late = [numpy.empty(0)]
-    with polling(job) as poller:
+    with polling(job, realtime=realtime) as poller:
         end = time.monotonic() + job.seconds
         while (left := end - time.monotonic()) > 0:
             select.select([poller], [], [], left)

@@ -33,6 +33,14 @@ def multidrop(job: Job) -> Iterator[Poll]:
 
 
 @contextmanager
+def realtime(job: Job) -> Iterator[Poll]:
+    from bench.masters import adapter
+
+    with adapter.multidrop(job, realtime=True) as poll:
+        yield poll
+
+
+@contextmanager
 def leased(job: Job) -> Iterator[Poll]:
     from bench.masters import adapter
 
@@ -169,6 +177,7 @@ READERS = {
 }
 IN_PYTHON = {
     "multidrop": multidrop,
+    "multidrop, realtime": realtime,
     **{name: in_turn(reader) for name, reader in READERS.items()},
     "pymodbus-async": pymodbus_async,
     "read_many": in_turn(reading_by_hand),
@@ -179,6 +188,7 @@ MASTERS = (*IN_PYTHON, "libmodbus")
 INSTALL = {
     "read_many": "multidrop",
     "multidrop, leased": "multidrop",
+    "multidrop, realtime": "multidrop",
     "pymodbus": "pymodbus==3.16.1",
     "pymodbus-async": "pymodbus==3.16.1",
     "minimalmodbus": "minimalmodbus==2.1.1",

@@ -11,6 +11,7 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
+#include <sched.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -28,7 +29,7 @@ static const int64_t STALE_NS = 50000000;  /* a request that takes longer to arr
 
 static struct {
     long baudrate, bits, drives, registers, delay_us, settle_ms; /* baudrate 0: no waits at all */
-    int stray, whole, tcp;
+    int stray, whole, tcp, realtime;
     char silent[MOST_DRIVES + 1];
 } options = {.baudrate = 38400, .bits = 10, .drives = 16, .registers = 10, .delay_us = 2000};
 
@@ -297,7 +298,7 @@ static void read_options(int argc, char **argv)
                                                             'r'},
         {"delay-us", 1, NULL, 'd'}, {"silent", 1, NULL, 's'}, {"settle-ms", 1, NULL, 'w'}, {"stray", 0, NULL,
                                                             'y'},
-        {"whole", 0, NULL, 'o'}, {"bytewise", 0, NULL, 'e'}, {"tcp", 0, NULL, 't'}, {NULL, 0, NULL, 0}};
+        {"whole", 0, NULL, 'o'}, {"bytewise", 0, NULL, 'e'}, {"tcp", 0, NULL, 't'}, {"realtime", 0, NULL, 'p'}, {NULL, 0, NULL, 0}};
     int key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
         long number = optarg ? strtol(optarg, NULL, 10) : 0;
@@ -312,6 +313,7 @@ static void read_options(int argc, char **argv)
         case 'o': options.whole = 1; break;
         case 'e': options.whole = 0; break;
         case 't': options.tcp = 1; break;
+        case 'p': options.realtime = 1; break;
         case 's':
             for (char *at = strtok(optarg, ","); at; at = strtok(NULL, ",")) {
                 number = strtol(at, NULL, 10);
@@ -322,7 +324,8 @@ static void read_options(int argc, char **argv)
         default:
             fprintf(stderr,
                     "usage: paced_line [--baudrate N (0: no waits)] [--bits N] [--drives N] [--registers N]\n"
-                    "       [--delay-us N] [--silent A,B,...] [--settle-ms N] [--stray] [--whole|--bytewise] [--tcp]\n");
+                    "       [--delay-us N] [--silent A,B,...] [--settle-ms N] [--stray] [--whole|--bytewise] [--tcp]\n"
+                    "       [--realtime (keep the pace beside busy programs)]\n");
             exit(2);
         }
     }
@@ -345,6 +348,11 @@ int main(int argc, char **argv)
         delay_ns = options.delay_us * 1000;
     }
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL);
+    struct sched_param priority = {.sched_priority = 10};
+    if (options.realtime && sched_setscheduler(0, SCHED_RR, &priority)) {
+        perror("paced_line: SCHED_RR");
+        return 1;
+    }
     play(options.tcp ? open_tcp() : announce_pty());
     print_report();
     return 0;

@@ -3,6 +3,10 @@
 A minimal master in C with multidrop's silences runs before every measurement; differences and ratios are to
 that master. Figures are medians of all measurements, and counts are sums. A default run takes a quarter of
 an hour.
+
+With `--beside N`, each master runs beside N busy loops, and after multidrop without loops, to which its
+differences and ratios are. The simulated line then has realtime scheduling, which needs root: otherwise the
+line itself would be late.
 """
 
 from __future__ import annotations
@@ -14,36 +18,43 @@ from typing import Any
 from bench.masters import adapter, rivals
 from bench.masters.jobs import Job
 from bench.support import tables
-from bench.support.programs import paced_line
+from bench.support.programs import busy_loops, paced_line
 
 BARE = "bare C"
+QUIET = "multidrop, quiet"  # multidrop without busy loops
 ASLEEP = "bare C, asleep"  # sleeps until 1.5 characters before a reply's end, as multidrop does
-
-COLUMNS = (
-    "baud",
-    "master",
-    "version",
-    "utilisation",
-    "- bare",
-    "requests",
-    "too early",
-    "share",
-    "late us",
-    "CPU us",
-    "/ bare",
-    "failed",
-)
+BESIDE = (BARE, "multidrop", "multidrop, realtime", "pymodbus", "minimalmodbus")
 
 
-def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
+def columns(yard: str) -> tuple[str, ...]:
+    name = "bare" if yard == BARE else "quiet"
+    return (
+        "baud",
+        "master",
+        "version",
+        "utilisation",
+        f"- {name}",
+        "requests",
+        "too early",
+        "share",
+        "late us",
+        "p99",
+        "CPU us",
+        f"/ {name}",
+        "failed",
+    )
+
+
+def measured(master: str, baudrate: int, seconds: float, loops: int = 0) -> dict[str, Any]:
     """Let a master poll for `seconds`; return what the simulated drives and the master measured."""
-    with paced_line(baudrate=baudrate) as line:
+    is_realtime = {"realtime": True} if loops else {}
+    with busy_loops(0 if master == QUIET else loops), paced_line(baudrate=baudrate, **is_realtime) as line:
         job = Job(line.path, baudrate, seconds)
         if master in (BARE, ASLEEP):
             asleep = job.wire - 1.5 * job.character if master == ASLEEP else 0.0
             own = rivals.measure_bare(job, adapter.silence(baudrate), asleep)
         else:
-            own = rivals.measure(master, job)
+            own = rivals.measure("multidrop" if master == QUIET else master, job)
     report = line.report
     asked = max(1, report["answered"] + report["unanswered"])
     return {
@@ -52,6 +63,7 @@ def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
         "requests": report["answered"] + report["unanswered"],
         "early": report["early"],
         "late": report["excess_us"]["p50"],
+        "late p99": report["excess_us"]["p99"],
         "cpu": own["cpu_seconds"] / asked * 1e6,
         "failed": own["failures"],
         "pacing": report["lateness_us"],
@@ -76,6 +88,7 @@ def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dic
         str(total("early")),
         f"{total('early') / max(1, total('requests')):.2%}",
         f"{middle('late'):.0f}",
+        f"{middle('late p99'):.0f}",
         f"{middle('cpu'):.0f}",
         f"{median(each['cpu'] / yard['cpu'] for each, yard in pairs):.2f}",
         str(total("failed")),
@@ -85,39 +98,42 @@ def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dic
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
-    parser.add_argument(
-        "--masters", nargs="+", choices=(*rivals.MASTERS, ASLEEP), default=(*rivals.MASTERS, ASLEEP)
-    )
+    parser.add_argument("--masters", nargs="+", choices=(*rivals.MASTERS, BARE, ASLEEP))
     parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
     parser.add_argument("--slices", type=int, default=5)
+    parser.add_argument("--beside", metavar="N", type=int, default=0, help="number of busy loops")
     arguments = parser.parse_args()
-    rivals.insist_on(arguments.masters)
+    loops, seconds = arguments.beside, arguments.seconds
+    yard = QUIET if loops else BARE
+    masters = arguments.masters or (BESIDE if loops else (*rivals.MASTERS, ASLEEP))
+    rivals.insist_on(masters)
 
+    beside = f" Beside {loops} busy loops." if loops else ""
     tables.heading(
         "A paced line: 16 drives, 10 registers each, 8N1, response delay 2 ms, delivered byte by byte."
+        + beside
     )
     for baudrate in arguments.baudrates:
-        pacing = measured(BARE, baudrate, arguments.seconds)["pacing"]
+        pacing = measured(BARE, baudrate, seconds, loops)["pacing"]
         late = ", ".join(f"{name} {pacing[name]:.1f}" for name in ("p50", "p99", "max"))
         print(f"the line's own lateness per byte at {baudrate}: {late} us")
     print(flush=True)
 
     rows = []
     for baudrate in arguments.baudrates:
-        yards: list[dict[str, Any]] = []
-        for master in arguments.masters:
-            bare, slices = [], []
-            for _ in range(arguments.slices):
-                bare.append(measured(BARE, baudrate, arguments.seconds))
-                slices.append(measured(master, baudrate, arguments.seconds))
-            yards += bare
-            rows.append(row(baudrate, master, slices, bare))
-        rows.append(row(baudrate, BARE, yards, yards))
-    tables.show(COLUMNS, rows)
+        slices: dict[str, list[dict[str, Any]]] = {master: [] for master in masters}
+        yards: dict[str, list[dict[str, Any]]] = {master: [] for master in masters}
+        for master in masters * arguments.slices:
+            yards[master].append(measured(yard, baudrate, seconds, loops))
+            slices[master].append(measured(master, baudrate, seconds, loops))
+        rows += [row(baudrate, master, slices[master], yards[master]) for master in masters]
+        every = [each for master in masters for each in yards[master]]
+        rows.append(row(baudrate, yard, every, every))
+    tables.show(columns(yard), rows)
     print(
         "\nutilisation: ideal bus cycle / measured; over 1 if the silence is not kept."
         "\ntoo early: requests more than 20 us before the silence was over, and their share of all requests."
-        "\nlate: median time from the end of the silence until a request is seen."
+        "\nlate: time from the end of the silence until a request is seen, median and 99th percentile."
         "\nCPU: of the master's process, per exchange; failed: exchanges without the right values."
         f"\n{ASLEEP}: until shortly before the reply's end, and not woken by each byte before that."
     )

@@ -78,6 +78,18 @@ def paced_line(**options: Any) -> Iterator[Talker]:
 
 
 @contextmanager
+def busy_loops(count: int) -> Iterator[None]:
+    """Run this number of programs that compute without pause during the block."""
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+@contextmanager
 def on_processor(number: int) -> Iterator[None]:
     """Restrict programs started within the block to this processor, or to the last one if there are fewer."""
     before = os.sched_getaffinity(0)
