@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -52,7 +53,7 @@ def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
     return len(good), numpy.array(good) * 1e3
 
 
-MASTERS = {
+MASTERS: dict[str, Callable[[Job], tuple[int, numpy.ndarray]]] = {
     "multidrop": of_multidrop,
     "multidrop, realtime": partial(of_multidrop, realtime=True),
     "pymodbus": of_pymodbus,
