@@ -54,6 +54,8 @@ NOT_RUN = {
     ".venv/bin/ruff": "is a step of .ci/run",
     ".ci/run": "runs the tests themselves",
     "tools/wheels": "compiles for six machines: many minutes",
+    "sudo tools/kernel/build": "builds a Debian: .ci/run does it",
+    "MULTIDROP_KERNEL=": "runs the tests themselves",
     "tools/musl": "builds a Python: many minutes",
     "tools/wine": "needs Wine, and downloads a Python for Windows",
     ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",

@@ -42,6 +42,7 @@ MISTAKES = {
     "foreign arm64 none.whl": "foreign: there is no wheel none.whl: make one with `tools/wheels`",
     f"foreign arm64 {LINUX}": f"foreign: {LINUX} is the wrong wheel: use *manylinux*_aarch64.whl",
     "foreign armhf empty": "foreign: empty is not a wheel: its name must end with .whl",
+    "kernel/build": "build: it takes FOLDER, and was given nothing",
     "musl": "musl: it takes make FOLDER WHEEL [PACKAGE]..., or FOLDER WORD..., and was given nothing",
     "musl make new": "musl: make takes FOLDER WHEEL [PACKAGE]..., and was given: new",
     "musl make empty none.whl": "musl: empty exists already: name a new folder",
@@ -92,7 +93,7 @@ def test_mistake_prints_one_sentence_and_starts_nothing(tmp_path: Path, words: s
     assert sorted(tmp_path.rglob("*")) == there
 
 
-@table("tool", ["bare", "booted", "foreign", "musl", "wheels", "wine"])
+@table("tool", ["bare", "booted", "foreign", "kernel/build", "musl", "wheels", "wine"])
 def test_help_is_the_header_of_the_tool(tool: str) -> None:
     ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
     assert f"tools/{tool} " in ran.stdout

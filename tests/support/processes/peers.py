@@ -49,6 +49,14 @@ def require_installed(name: str) -> None:
         _missing(f"the Python module {name} is not installed")
 
 
+def require_built(variable: str, tool: str) -> Path:
+    """Return the folder that an environment variable names and this tool has filled."""
+    folder = os.environ.get(variable)
+    if not folder:
+        _missing(f"{variable} names no folder made by {tool}")
+    return Path(folder).resolve()
+
+
 def _missing(reason: str) -> NoReturn:
     if os.environ.get("CI"):
         pytest.fail(f"{reason}, and CI must have it")

@@ -1,0 +1,184 @@
+"""What every driver must do: settings, RTS, failed transfers, doctor's findings, other users of a port."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import random
+import subprocess
+import threading
+import time
+from collections import Counter
+from typing import Any
+
+import plug
+from common import KINDS, Command, Meter, attempt, kernel_settings, run
+
+import multidrop
+from multidrop import Bus
+from multidrop.errors import BusError
+from multidrop.sim import proof
+
+TIOCEXCL = 0x540C
+NOBODY, DIALOUT = 65534, 20
+
+
+def _values(path: str, baudrate: int, format: str, **options: Any) -> list[float]:
+    with Bus(path, baudrate=baudrate, format=format, **options) as bus:
+        meter = bus.attach(Meter, address=2)
+        return [meter.read(meter.a), meter.read(meter.b)]
+
+
+def settings(kind: str, wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
+    """Return what was read at each of these settings, and the settings of the kernel and of the adapter."""
+    adapter = plug.Adapter(kind, f"set-{kind}")
+    facts = []
+    for baudrate, format in wanted:
+        read = attempt(_values, adapter.path, baudrate, format)
+        state = adapter.state
+        facts.append(
+            {
+                "read": read,
+                "kernel": kernel_settings(adapter.path),
+                "adapter": [state["baudrate"], state["format"]],
+            }
+        )
+    return facts
+
+
+def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
+    """Read with RTS that switches a transceiver; return the adapter's record of RTS."""
+    adapter = plug.Adapter(kind, f"rts-{kind}", sends_with=int(mode == "rts-up"))
+    good = 0
+    with Bus(adapter.path, baudrate=baudrate, format="8N1", rs485=mode) as bus:
+        meter = bus.attach(Meter, address=2)
+        for _ in range(count):
+            good += attempt(meter.read, meter.a) == 0x210
+        utilisation = bus.statistics()
+    state = adapter.state
+    return {
+        "good": good,
+        "missing": state["rts_missing"],
+        "early": state["rts_early"],
+        "sent": sum(event["what"] == "sent" for event in state["log"]),
+        "levels": [event["rts"] for event in state["log"] if event["what"] == "set"],
+        "statistics": repr(utilisation),
+    }
+
+
+def broken_transfers(kind: str) -> Counter[str]:
+    """Read while every fifth transfer to the guest fails with EPROTO, as by noise on a USB cable."""
+    adapter = plug.Adapter(kind, f"broken-{kind}")
+    results: Counter[str] = Counter()
+    with Bus(adapter.path, baudrate=19200, format="8N1") as bus:
+        meter = bus.attach(Meter, address=2)
+        for number in range(30):
+            if number % 5 == 4:
+                adapter.do("break_transfers", 1)
+            results[str(attempt(meter.read, meter.a))] += 1
+    return results
+
+
+def doctor() -> dict[str, dict[str, list[str]]]:
+    """Return the findings of `doctor` about each adapter and about QEMU's UART, by topic."""
+    plug.do("connect", {"serial": "uart"})
+    paths = {kind: plug.Adapter(kind, f"doctor-{kind}").path for kind in KINDS} | {"8250": "/dev/ttyS1"}
+    commands = {kind: Command("doctor", path, "--json") for kind, path in paths.items()}
+    found = {}
+    for kind, command in commands.items():
+        status, text = command.outcome()
+        assert status == 0, f"{kind}: {text}"
+        findings = json.loads(text)["findings"]
+        found[kind] = {finding["topic"]: [finding["what"], finding["advice"]] for finding in findings}
+    return found
+
+
+def refused_ports() -> dict[str, tuple[int, str]]:
+    """Return what commands say about ports that cannot be opened."""
+    adapter = plug.Adapter("ftdi", "busy")
+    read = ("read", adapter.path, "erman-er-g-220", "2", "output_frequency")
+    with Bus(adapter.path, baudrate=9600, format="8N1"):
+        found = {"locked": run(*read), "doctor of locked": run("doctor", adapter.path)}
+    fd = os.open(adapter.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    fcntl.ioctl(fd, TIOCEXCL)
+    found["exclusive"] = run("doctor", adapter.path, user=NOBODY, groups=[DIALOUT])
+    os.close(fd)
+    found["no permission"] = run(*read, user=NOBODY)
+    found["dialout"] = run("doctor", adapter.path, user=NOBODY, groups=[DIALOUT])
+    return found
+
+
+def absent_uart() -> dict[str, tuple[int, str]]:
+    """Return what commands say about a port without a UART, and about a name without a port."""
+    found = {"doctor": run("doctor", "/dev/ttyS3")}
+    for name in ("ttyS3", "ttyS99"):
+        found[name] = run("read", f"/dev/{name}", "erman-er-g-220", "2", "output_frequency")
+    return found
+
+
+def uart(wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
+    """Return what was read from devices at QEMU's UART at each of these settings."""
+    plug.do("connect", {"serial": "uart"})
+    facts = []
+    for baudrate, format in wanted:
+        read = attempt(_values, "/dev/ttyS1", baudrate, format)
+        facts.append({"read": read, "kernel": kernel_settings("/dev/ttyS1")})
+    return facts
+
+
+def uart_modes() -> dict[str, Any]:
+    """Return what was read from QEMU's UART with each way to switch a transceiver."""
+    plug.do("connect", {"serial": "uart"})
+    modes = ("rts-up", "rts-down", "kernel")
+    return {mode: attempt(_values, "/dev/ttyS1", 9600, "8N1", rs485=mode) for mode in modes}
+
+
+def rs485_mode() -> dict[str, Any]:
+    """Read with the RS-485 mode of the driver; return the registers that the UART got in the meantime."""
+    subprocess.run(["modprobe", "rs485_uart"], check=True)
+    plug.do("connect", {"serial": "uart"})
+    before = len(plug.do("registers"))
+    try:
+        _, text = run("doctor", "/dev/ttyS1", "--json")
+        read = attempt(_values, "/dev/ttyS1", 9600, "8N1", rs485="kernel")
+        registers = plug.do("registers")[before:]
+    finally:
+        subprocess.run(["rmmod", "rs485_uart"], check=True)
+    findings = {finding["topic"]: finding["what"] for finding in json.loads(text)["findings"]}
+    return {"doctor": findings["RS-485 mode"], "read": read, "registers": registers}
+
+
+def stalling_family(kind: str, family: str, seconds: float) -> dict[str, Any]:
+    """Read registers of two drives while the adapter stalls and continues; count the results."""
+    adapter = plug.Adapter(kind, "shaken", family=family, addresses=[1, 2], encoded=True)
+    chance = random.Random(1)
+    counts: Counter[str] = Counter()
+    wrong = []
+    is_over = threading.Event()
+
+    def shake() -> None:
+        while not is_over.wait(chance.uniform(0.1, 1.5)):
+            adapter.do("stall", True)
+            is_over.wait(chance.choice((0.02, 0.1, 0.3, 0.5, 1.0, 2.0, 3.0)))
+            adapter.do("stall", False)
+
+    with Bus(adapter.path) as bus:
+        drives = [bus.attach(getattr(multidrop, family), address=address) for address in (1, 2)]
+        registers = list(drives[0].readings())[:8]
+        thread = threading.Thread(target=shake)
+        thread.start()
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            drive, register = chance.choice(drives), chance.choice(registers)
+            try:
+                value = float(drive.read(register))
+            except BusError as failure:
+                counts[type(failure).__name__] += 1
+            else:
+                counts["good"] += 1
+                if abs(value - proof(drive, register)) > 1e-9:
+                    wrong.append(f"{drive.address} {register.name}: {value}, not {proof(drive, register)}")
+        is_over.set()
+        thread.join()
+    return {"counts": counts, "wrong": wrong}

@@ -1,0 +1,131 @@
+"""multidrop with the Linux drivers of USB serial adapters and of a 16550A, in a guest."""
+
+from __future__ import annotations
+
+import pytest
+from rig import Guest
+
+pytestmark = pytest.mark.slow
+
+KINDS = ("ftdi", "cp210x", "ch341", "pl2303", "acm")
+USB = pytest.mark.parametrize("kind", KINDS)
+RIGHT = [0x210, 0x215]  # of device 2: see tools/kernel/far_end.py
+SETTINGS = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (115200, "8N1"), (250000, "8N2")]
+
+
+def is_near(baudrate: int, wanted: int) -> bool:
+    """Return True if receivers tolerate the difference: 2 %."""
+    return abs(baudrate - wanted) <= wanted / 50
+
+
+@USB
+def test_settings_are_those_of_the_drive_at_both_ends(guest: Guest, kind: str) -> None:
+    facts = guest.run("settings", kind=kind, wanted=SETTINGS)
+    for (baudrate, form), fact in zip(SETTINGS, facts, strict=True):
+        assert fact["read"] == RIGHT
+        for speed, taken in (fact["kernel"], fact["adapter"]):
+            assert taken == form
+            assert is_near(speed, baudrate)
+
+
+def test_a_speed_that_the_adapter_does_not_have_is_refused(guest: Guest) -> None:
+    (fact,) = guest.run("settings", kind="cp210x", wanted=[(12345, "8E1")])
+    assert "does not take the baud rate" in fact["read"]
+
+
+@USB
+def test_failed_usb_transfers_lose_no_reply(guest: Guest, kind: str) -> None:
+    assert guest.run("broken_transfers", kind=kind) == {"528.0": 30}
+
+
+# ---- doctor, and ports that cannot be opened ----
+
+
+def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
+    """Only ftdi_sio has a latency timer and needs low latency; none of these drivers has an RS-485 mode."""
+    found = guest.run("doctor")
+    assert found.keys() == {*KINDS, "8250"}
+    for kind, findings in found.items():
+        assert findings["RS-485 mode"][0].startswith("the driver has none"), kind
+        assert findings["RS-485 mode"][1] == ""
+        assert findings["low latency"][1] == "", kind
+        says_needless = "does not delay received bytes" in findings["low latency"][0]
+        assert says_needless == (kind != "ftdi"), kind
+        assert findings["echo"][0].startswith("none at"), kind
+    assert found["ftdi"]["latency timer"] == ["1 ms: the shortest possible", ""]
+    drivers = {kind: findings["adapter"][0].rpartition(" ")[2] for kind, findings in found.items()}
+    assert drivers == {
+        "ftdi": "ftdi_sio",
+        "cp210x": "cp210x",
+        "ch341": "ch341-uart",
+        "pl2303": "pl2303",
+        "acm": "cdc_acm",
+        "8250": "serial",
+    }
+
+
+def test_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
+    found = guest.run("refused_ports") | guest.run("absent_uart")
+    for name, reason in {
+        "locked": "in use by another program",
+        "doctor of locked": "in use by another program",
+        "exclusive": "in use by another program",
+        "no permission": "no permission",
+        "doctor": "there is no UART behind this name",
+        "ttyS3": "there is no UART behind this name",
+        "ttyS99": "there is no such port",
+    }.items():
+        status, said = found[name]
+        assert status != 0, name
+        assert reason in said, name
+        assert "Traceback" not in said, name
+    assert found["dialout"][0] == 0
+
+
+# ---- the 16550A ----
+
+
+def test_a_16550_has_the_settings_of_the_drive(guest: Guest) -> None:
+    wanted = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (115200, "8N1"), (9600, "7E1")]
+    for (baudrate, form), fact in zip(wanted, guest.run("uart", wanted=wanted), strict=True):
+        assert fact == {"read": RIGHT, "kernel": [baudrate, form]}
+    for fact in guest.run("uart", wanted=[(230400, "8N1"), (921600, "8N1")]):
+        assert "does not take the baud rate" in fact["read"]
+
+
+def test_a_16550_switches_rts_and_has_no_mode_of_its_own(guest: Guest) -> None:
+    found = guest.run("uart_modes")
+    assert found["rts-up"] == found["rts-down"] == RIGHT
+    assert "the driver has no RS-485 mode" in found["kernel"]
+
+
+# ---- RTS ----
+
+
+@pytest.mark.parametrize("mode", ["rts-up", "rts-down"])
+@USB
+def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, mode: str) -> None:
+    found = guest.run("rts", kind=kind, mode=mode, baudrate=9600, count=5)
+    assert found["sent"] > 0  # not always five: a busy computer repeats requests, or loses the port
+    assert found["missing"] == 0
+
+
+# ---- stalls ----
+
+
+def check_no_wrong_value(guest: Guest, kind: str, family: str, seconds: float) -> None:
+    found = guest.run("stalling_family", kind=kind, family=family, seconds=seconds)
+    assert found["wrong"] == []
+    assert found["counts"]["good"] > 0
+    assert found["counts"].keys() <= {"good", "NoReply", "LineBusy", "BadReply"}
+
+
+def test_a_stalled_adapter_gives_no_wrong_value(guest: Guest) -> None:
+    check_no_wrong_value(guest, "ftdi", "ErmanERG220", 8.0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("family", ["ErmanERG220", "YD1000", "InvtCHE"])
+@pytest.mark.parametrize("kind", ["ftdi", "acm"])
+def test_no_family_reads_a_wrong_value_from_a_stalled_adapter(guest: Guest, kind: str, family: str) -> None:
+    check_no_wrong_value(guest, kind, family, 18.0)
