@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from rig import Guest
 
@@ -42,7 +44,7 @@ def test_failed_usb_transfers_lose_no_reply(guest: Guest, kind: str) -> None:
 
 
 def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
-    """Only ftdi_sio has a latency timer and needs low latency; none of these drivers has an RS-485 mode."""
+    """Only ftdi_sio has a latency timer and needs low latency. No driver has an RS-485 mode."""
     found = guest.run("doctor")
     assert found.keys() == {*KINDS, "8250"}
     for kind, findings in found.items():
@@ -108,6 +110,32 @@ def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, 
     found = guest.run("rts", kind=kind, mode=mode, baudrate=9600, count=5)
     assert found["sent"] > 0  # not always five: a busy computer repeats requests, or loses the port
     assert found["missing"] == 0
+
+
+@pytest.mark.long
+def test_the_rs485_mode_of_a_driver_raises_rts_for_each_request(guest: Guest) -> None:
+    """The UART's registers show RTS at each byte that is sent, and that it falls between requests."""
+    found = guest.run("rs485_mode")
+    if found is None:
+        pytest.skip("tools/kernel/build found no linux-headers-amd64")
+    assert found["read"] == RIGHT
+    assert found["doctor"].startswith("off; the driver supports it")
+    registers = "\n".join(found["registers"])
+    written = re.findall(r"serial_write write addr 0x0([0-7]) val 0x([0-9a-f]+)", registers)
+    line_control = modem_control = 0
+    levels = ""  # S: a byte was sent with RTS; s: without; -: RTS fell
+    for register, text in written:
+        value = int(text, 16)
+        if register == "3":
+            line_control = value
+        elif register == "4":
+            levels += "-" if modem_control & 2 and not value & 2 else ""
+            modem_control = value
+        elif register == "0" and not line_control & 0x80:
+            levels += "S" if modem_control & 2 else "s"
+    assert "s" not in levels
+    assert [len(request) for request in levels.split("-") if request] == [8] * levels.count("SSSSSSSS")
+    assert levels.count("S") >= 16
 
 
 # ---- stalls ----

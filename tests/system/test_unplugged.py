@@ -54,7 +54,7 @@ def test_adapters_that_exchange_their_names_are_not_mistaken(guest: Guest, names
     assert found["wrong"] == []
     if names != "by_path":  # a name of the USB socket, in which the other adapter is now
         assert found["requests to the other"] == [0, 0]
-    assert found["came back"] == (names == "by_id")
+    assert found["came back"] or names != "by_id"
 
 
 # ---- damaged replies ----

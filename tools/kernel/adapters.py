@@ -41,7 +41,7 @@ class Adapter(USBDevice):
         self.rts_missing = 0  # number of transfers at whose start RTS kept the transceiver from sending
         self.rts_early = 0  # how often RTS cut a transfer off
         self._sends_with = sends_with
-        self._received: deque[int] = deque()  # characters from the line, for the guest
+        self._received: deque[int] = deque()  # characters that the line has sent to the guest
         self._errors = 0  # ERROR_BITS of characters in `_received`
         self._free_at = 0.0  # when the line will have sent all characters
         self._room_at = 0.0  # when the adapter can take the next transfer

@@ -68,7 +68,7 @@ class FarEnd:
 class SimulatedEnd(FarEnd):
     """multidrop's own simulated drives, of a family named by its class, such as "ErmanERG220".
 
-    With `encoded`, the value of each register says which register of which drive it is.
+    With `encoded`, each value identifies its register and its drive.
     """
 
     def __init__(self, addresses: Sequence[int], family: str, *, encoded: bool = False) -> None:

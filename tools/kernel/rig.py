@@ -118,7 +118,7 @@ def _console(folder: Path) -> str:
 
 
 def _qemu(built: Path, folder: Path, ports: str) -> list[str]:
-    """Return the command. KVM is not used: where it exists, it may not run the guest."""
+    """Return the command. It does not use KVM, which may exist without being able to run a guest."""
     words = f"""
     qemu-system-x86_64 -nodefaults -no-user-config -M q35 -accel tcg,thread=multi -smp 2 -m 512 -display none
     -no-reboot -kernel {built}/vmlinuz -initrd {built}/initrd.gz -serial file:{folder}/console

@@ -56,7 +56,7 @@ class Connection(NamedTuple):
 
 
 class USBDevice:
-    """Answers a guest's transfers; a subclass says what the device is and does."""
+    """Answers a guest's transfers; a subclass defines the device."""
 
     vendor, product, release, name = 0, 0, 0x0100, "device"
     device_class = 0

@@ -1,4 +1,4 @@
-"""What the scenarios share: a device, plants, commands and the rows of a recording."""
+"""Shared by the scenarios: a device, plants, commands and the rows of a recording."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def right(address: int, register: int) -> int:
 
 
 def attempt(call: Callable[..., object], *arguments: Any, **options: Any) -> Any:
-    """Return what a call returns, or its error as text."""
+    """Return the result of a call, or its error as text."""
     try:
         return call(*arguments, **options)
     except Exception as failure:
@@ -153,7 +153,7 @@ class Poll:
         self._read = 0  # bytes of the file that are in `_rows`
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows so far. Reads only what is new, because the guest is slow."""
+        """Return the rows so far. Reads only the new ones, because the guest is slow."""
         if self.out.exists():
             with self.out.open("rb") as file:
                 header = file.readline().decode()

@@ -1,4 +1,4 @@
-"""What happens if an adapter stands still: it takes no more bytes, and the driver keeps them."""
+"""Stalled adapters: they take no bytes, and the driver keeps these."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def end_of_stalled_poll(kind: str, signals: list[int]) -> dict[str, Any]:
 
 
 def start_in_stall(kind: str) -> dict[str, Any]:
-    """Call start and stop while the adapter stalls, then close, and let it continue; return what left."""
+    """Call start and stop during a stall, then close; let the adapter continue; return the late frames."""
     adapter = plug.Adapter(kind, f"held-{kind}", family=FAMILY, addresses=[1])
     bus = Bus(adapter.path)
     pump = bus.attach(ErmanERG220, address=1, name="pump")

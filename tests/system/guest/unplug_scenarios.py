@@ -205,7 +205,7 @@ def _get(path: str) -> Any:
 
 
 def gateway() -> dict[str, Any]:
-    """Unplug and replug the adapter of a gateway; return what it says of the line and of a drive."""
+    """Unplug and replug the adapter of a gateway; return its reports about line and drive."""
     adapter = _encoded("ftdi", "served", [1, 2])
     serving = Command("serve", write_plant({"a": (adapter.by_id, [1, 2])}, SERVE))
     facts: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Plug adapters in and out of the guest, and change what they do."""
+"""Plug adapters into the guest, unplug them, and control their faults."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-2.0
-/* Gives the PC's second serial port the RS-485 mode of the 8250 driver's own library, as boards do whose device
- * tree says so. No driver of an emulated PC has that mode otherwise. */
+/* Gives the PC's second serial port the RS-485 mode of the 8250 driver's own library, as the device trees of
+ * some boards do. Without it, no driver of an emulated PC has that mode. */
 #include <linux/module.h>
 #include <linux/serial_8250.h>
 
